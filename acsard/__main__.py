@@ -1,0 +1,7 @@
+"""`python -m acsard` is `acsard`."""
+
+import sys
+
+from acsard.cli import main
+
+sys.exit(main())

@@ -1,0 +1,56 @@
+"""The command line: one verb per file, each with `add` (its options) and `main` (its work).
+
+Verbs import what is heavy inside `main`, so that `acsard --help` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from acsard import __version__
+from acsard.cli import call, check, drive, echo, hz, run, sim, topics
+from acsard.runtime.exits import Exit, ExitError
+
+VERBS = (run, sim, check, topics, echo, hz, drive, call)
+
+_EPILOG = """\
+exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable,
+75 port, bus address or robot id in use, 77 no permission, 78 bad configuration
+
+try:  acsard run                (the robot, on the built-in simulator)
+      acsard drive              (in a second terminal: the keyboard drives it)
+      acsard echo odom -n 1     (in a third: where is it?)
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the `acsard` command; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="acsard",
+        description="The hardware interface of a four-wheel differential-drive robot: serial "
+        "microcontroller below, Zenoh bus above. Without a verb: run.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"acsard {__version__}")
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    for verb in VERBS:
+        verb.add(verbs)
+    words = list(sys.argv[1:] if argv is None else argv)
+    known = {"-h", "--help", "--version"}
+    if not words or (words[0].startswith("-") and words[0] not in known):
+        words.insert(0, "run")
+    args = parser.parse_args(words)
+    try:
+        return int(args.main(args))
+    except ExitError as error:
+        print(f"acsard: {error}", file=sys.stderr)
+        return int(error.code)
+    except BrokenPipeError:
+        # The reader (head, less) has left; writing the rest at exit must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return int(Exit.OK)
+    except KeyboardInterrupt:
+        return 130

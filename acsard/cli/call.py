@@ -1,0 +1,41 @@
+"""`acsard call <service>`: stop, clear, activate, …"""
+
+from __future__ import annotations
+
+import argparse
+
+from acsard.cli.common import add_bus, robot_address
+from acsard.messages.topics import SERVICES
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "call",
+        help="call a service: " + ", ".join(SERVICES),
+        description="Call a service and print its answer; exit 1 when it was refused.",
+    )
+    parser.add_argument("service", choices=SERVICES, metavar="SERVICE", help=", ".join(SERVICES))
+    parser.add_argument(
+        "values", nargs="*", type=float, metavar="X Y YAW", help="for set_pose: m, m, rad"
+    )
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Call and print."""
+    from acsard.client import connect
+    from acsard.messages.encodings import encode
+    from acsard.runtime.exits import Exit, ExitError
+
+    wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
+    if len(args.values) != len(wanted):
+        form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
+        raise ExitError(Exit.USAGE, f"write: {form}")
+    endpoint, robot_id = robot_address(args)
+    with connect(endpoint, robot_id=robot_id) as robot:
+        reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
+    print(encode(reply, "json").decode() if args.json else reply.message)
+    return 0 if reply.success else 1

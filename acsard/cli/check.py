@@ -1,0 +1,57 @@
+"""`acsard check`: the effective configuration, or everything that is wrong with it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from acsard.cli.common import add_config, load
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "check",
+        help="check the configuration and print the effective one",
+        description="Print the configuration in force, defaults filled in; or every problem at "
+        "once, each with its mend, and exit 78.",
+    )
+    add_config(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of TOML")
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Check and print."""
+    import msgspec
+
+    from acsard.config import effective, warnings
+
+    where, config = load(args.config)
+    plain = effective(config)
+    if args.json:
+        print(msgspec.json.encode(plain).decode())
+    else:
+        print(f"# effective configuration from {where}")
+        print("\n".join(toml(plain)))
+    for text in warnings(config):
+        print(f"{where}: warning: {text}", file=sys.stderr)
+    return 0
+
+
+def toml(table: dict[str, object], path: str = "") -> list[str]:
+    """The lines of a TOML document: plain keys first, then tables, then lists of tables."""
+    from acsard.validation import write
+
+    lines: list[str] = []
+    tables: list[str] = []
+    for key, value in table.items():
+        where = f"{path}.{key}" if path else key
+        if isinstance(value, dict):
+            tables += ["", f"[{where}]", *toml(value, where)]
+        elif isinstance(value, list | tuple) and value and isinstance(value[0], dict):
+            for one in value:
+                tables += ["", f"[[{where}]]", *toml(one, where)]
+        else:
+            lines.append(f"{key} = {write(value)}")
+    return lines + tables

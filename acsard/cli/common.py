@@ -1,0 +1,76 @@
+"""What several verbs share: finding the configuration, and the options of the bus tools."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from acsard import config as configuration
+from acsard.config import ConfigError
+from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import Config
+
+PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
+
+Overrides = dict[str, dict[str, object]]
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """The option every verb has."""
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        help="configuration (else $ACSARD_CONFIG, ./acsard.toml, /etc/acsard/acsard.toml, "
+        "or the built-in defaults)",
+    )
+
+
+def add_bus(parser: argparse.ArgumentParser) -> None:
+    """The options of the tools that talk to a running daemon."""
+    add_config(parser)
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="where the daemon listens, e.g. tcp/127.0.0.1:7448"
+    )
+    parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)")
+
+
+def find(path: str | None) -> tuple[str, bytes]:
+    """Where the configuration is and what it holds; ("built-in defaults", b"") without a file."""
+    named = path or os.environ.get("ACSARD_CONFIG")
+    if named:
+        try:
+            return named, Path(named).read_bytes()
+        except OSError as error:
+            raise ExitError(
+                Exit.BAD_CONFIG, f"cannot read {named}: {error.strerror}; correct --config"
+            ) from None
+    for place in PLACES:
+        try:
+            return str(place), place.read_bytes()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise ExitError(Exit.BAD_CONFIG, f"cannot read {place}: {error.strerror}") from None
+    return "built-in defaults", b""
+
+
+def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
+    """Where the configuration is and the configuration; raises `ExitError` with every problem."""
+    where, text = find(path)
+    try:
+        return where, configuration.parse(text, overrides)
+    except ConfigError as error:
+        for problem in error.problems:
+            print(f"{where}: {problem}", file=sys.stderr)
+        count = len(error.problems)
+        raise ExitError(
+            Exit.BAD_CONFIG, f"{count} problem{'s' if count > 1 else ''} in {where}"
+        ) from None
+
+
+def robot_address(args: argparse.Namespace) -> tuple[str, str]:
+    """The endpoint and the id of the robot a tool talks to."""
+    _, config = load(args.config)
+    return args.connect or config.bus.listen[0], args.id or config.robot.id

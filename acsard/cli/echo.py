@@ -1,0 +1,56 @@
+"""`acsard echo <topic>`: what is on a key, as JSON lines."""
+
+from __future__ import annotations
+
+import argparse
+
+from acsard.cli.common import add_bus, robot_address
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "echo",
+        help="print the messages on a key as JSON lines",
+        description="Print each message on a key as one line of JSON, until Ctrl-C. Any key "
+        "below the robot's id works, also `cmd/teleop`.",
+    )
+    parser.add_argument("topic", help="for example odom, state, wheel_states, cmd/teleop")
+    parser.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    parser.add_argument(
+        "--timeout", type=float, metavar="S", help="end after S seconds of silence, with exit 1"
+    )
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print until told otherwise."""
+    from acsard.client import connect
+
+    endpoint, robot_id = robot_address(args)
+    left = args.n
+    with connect(endpoint, robot_id=robot_id) as robot:
+        try:
+            for sample in robot.samples(args.topic, args.timeout):
+                print(json_line(str(sample.encoding), sample.payload.to_bytes()), flush=True)
+                left = None if left is None else left - 1
+                if left == 0:
+                    return 0
+        except KeyboardInterrupt:
+            return 0
+    return 1
+
+
+def json_line(encoding: str, payload: bytes) -> str:
+    """A payload of any encoding as one line of JSON; bytes that are none of ours as a text."""
+    import msgspec
+
+    from acsard.messages.encodings import DecodeError, detect
+
+    try:
+        form = detect(encoding, payload)
+        codec = msgspec.json if form == "json" else msgspec.msgpack
+        return msgspec.json.encode(codec.decode(payload)).decode()
+    except (DecodeError, msgspec.MsgspecError, ValueError):
+        return msgspec.json.encode({"undecodable": repr(payload)}).decode()

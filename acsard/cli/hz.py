@@ -1,0 +1,84 @@
+"""`acsard hz <topic>`: how often messages come, and how evenly."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from acsard.cli.common import add_bus, robot_address
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "hz",
+        help="measure the rate of a key",
+        description="Measure how often messages come on a key and how even the gaps are; one "
+        "line a second until Ctrl-C, each over the last 10 s.",
+    )
+    parser.add_argument("topic", help="for example odom")
+    parser.add_argument("-n", type=int, metavar="N", help="end after N lines")
+    parser.add_argument("--json", action="store_true", help="print JSON lines")
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Measure until told otherwise."""
+    from collections import deque
+
+    import msgspec
+
+    from acsard.client import connect
+
+    endpoint, robot_id = robot_address(args)
+    times: deque[float] = deque(maxlen=10_000)
+    left = args.n
+    with connect(endpoint, robot_id=robot_id) as robot:
+        subscriber = robot.session.declare_subscriber(
+            robot.key(args.topic), lambda _: times.append(time.monotonic())
+        )
+        try:
+            while left is None or left > 0:
+                time.sleep(1.0)
+                now = time.monotonic()
+                while times and now - times[0] > 10.0:
+                    times.popleft()
+                figures = rate(list(times))
+                text = msgspec.json.encode(figures).decode() if args.json else _line(figures)
+                print(text, flush=True)
+                left = None if left is None else left - 1
+        except KeyboardInterrupt:
+            pass
+        subscriber.undeclare()
+    return 0
+
+
+def rate(times: list[float]) -> dict[str, float]:
+    """Rate in Hz and the gaps between arrivals in ms, over arrival times in s."""
+    import numpy as np
+
+    if len(times) < 2:
+        return {"count": len(times), "hz": 0.0}
+    gaps = np.diff(np.asarray(times)) * 1e3
+    p50, p99 = np.percentile(gaps, (50, 99))
+    return {
+        "count": len(times),
+        "hz": round(1e3 / float(gaps.mean()), 2),
+        "gap_min_ms": round(float(gaps.min()), 2),
+        "gap_p50_ms": round(float(p50), 2),
+        "gap_p99_ms": round(float(p99), 2),
+        "gap_max_ms": round(float(gaps.max()), 2),
+        "gap_std_ms": round(float(gaps.std()), 2),
+    }
+
+
+def _line(figures: dict[str, float]) -> str:
+    if "gap_min_ms" not in figures:
+        return "no messages yet"
+    return (
+        f"{figures['hz']:8.2f} Hz   gaps ms: min {figures['gap_min_ms']:.2f}  "
+        f"p50 {figures['gap_p50_ms']:.2f}  p99 {figures['gap_p99_ms']:.2f}  "
+        f"max {figures['gap_max_ms']:.2f}  std {figures['gap_std_ms']:.2f}   "
+        f"n {figures['count']:.0f}"
+    )

@@ -1,0 +1,105 @@
+"""`acsard run`: the daemon."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from acsard.cli.common import Overrides, add_config, load
+from acsard.settings import Config
+
+_BANNER = """\
+acsard {version}: {robot} on {port}
+  bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
+  config  {where}
+  try, in a second terminal:
+    acsard drive              drive it by keyboard
+    acsard echo odom -n 1     where is it?
+    acsard call stop          stop it, and keep it stopped until `acsard call clear`
+"""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "run",
+        help="run the daemon (the default verb)",
+        description="Run the daemon in the foreground until SIGTERM or Ctrl-C, which ramp the "
+        "robot to zero first. Without a configured port it runs the built-in simulator.",
+    )
+    add_config(parser)
+    parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
+    parser.add_argument("--baud-rate", type=int, metavar="N", help="9600 to 115200")
+    parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
+    parser.add_argument("--listen", metavar="ENDPOINT", help="bus address, tcp/127.0.0.1:7448")
+    parser.set_defaults(main=main)
+
+
+def overrides(args: argparse.Namespace) -> Overrides:
+    """The configuration keys given on the command line."""
+    given: Overrides = {}
+    for section, key, value in (
+        ("mcu", "port", args.port),
+        ("mcu", "baud_rate", args.baud_rate),
+        ("robot", "id", args.id),
+        ("bus", "listen", [args.listen] if args.listen else None),
+    ):
+        if value is not None:
+            given.setdefault(section, {})[key] = value
+    return given
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run until a signal."""
+    import asyncio
+
+    from acsard.config import warnings
+    from acsard.runtime import daemon
+    from acsard.runtime.logs import Log
+    from acsard.values import Event
+
+    where, config = load(args.config, overrides(args))
+    log = Log(config.log)
+
+    def announce(device: str) -> None:
+        simulated = config.mcu.port == daemon.SIMULATOR
+        if "INVOCATION_ID" not in os.environ:
+            print(banner(config, where, device, simulated), flush=True)
+        log.info(
+            "started",
+            robot=config.robot.id,
+            port=device,
+            simulated=simulated,
+            rate=config.rate_hz,
+            listen=",".join(config.bus.listen),
+            config=where,
+        )
+        for text in warnings(config):
+            log.event(Event("configuration", text, "warning"))
+
+    try:
+        asyncio.run(daemon.run(config, log, announce))
+    finally:
+        log.info("ended")
+        log.close()
+        sys.stdout.flush()
+    return 0
+
+
+def banner(config: Config, where: str, device: str, simulated: bool) -> str:
+    """What a person sees first."""
+    from acsard import __version__
+    from acsard.messages.topics import ROOT
+
+    port = f"{device} at {config.mcu.baud_rate} baud"
+    if simulated:
+        port = f"the built-in SIMULATOR ({device}); no real robot will move"
+    return _BANNER.format(
+        version=__version__,
+        robot=config.robot.id,
+        port=port,
+        listen=", ".join(config.bus.listen),
+        root=ROOT,
+        where=where,
+    )

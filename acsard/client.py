@@ -1,0 +1,244 @@
+"""Drive and follow a robot from Python.
+
+    from acsard.client import connect
+
+    with connect() as robot:
+        robot.drive(0.5, 0.0, seconds=2.0)
+        print(robot.pose())
+
+`connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
+messages (`acsard.messages.schema`). Commands are stamped and each client opens with a zero, so
+the daemon's staleness and neutral-first rules are met without thinking of them. Errors are
+`ExitError` when no daemon answers, and `DecodeError` when what answers is not one of ours.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any
+
+import msgspec
+import zenoh
+import zenoh.ext
+
+from acsard.messages import schema
+from acsard.messages.encodings import Decoder, encode, encoding_name
+from acsard.messages.topics import by_key, full_key
+from acsard.runtime import clock
+from acsard.runtime.exits import Exit, ExitError
+from acsard.runtime.threads import in_thread
+from acsard.runtime.zenoh_session import client_session
+from acsard.values import Pose
+
+ENDPOINT = "tcp/127.0.0.1:7448"
+SEND_PERIOD_S = 0.05
+"""Commands are repeated at 20 Hz: five times within the default timeout."""
+
+REPLY_TIMEOUT_S = 3.0
+QUEUED = 1000
+"""Messages held for a slow reader; the newest are dropped beyond that."""
+
+
+class Client:
+    """A connection to one robot; make it with `connect`."""
+
+    def __init__(self, session: zenoh.Session, robot_id: str, source: str) -> None:
+        self.session = session
+        self._id, self._source = robot_id, source
+        self._opened = False
+
+    def key(self, name: str) -> str:
+        """The full key of a name of the topic table, for example "odom"."""
+        return full_key(self._id, name)
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving.
+
+        The first call sends a zero in its place, since the daemon wants one before it drives.
+        """
+        if self._opened:
+            self._put(linear, angular)
+        else:
+            self._opened = True
+            self._put(0.0, 0.0)
+
+    def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
+        """Drive for so long, then send a zero. Returns when that is sent."""
+        for pause in _drive(self, linear, angular, seconds):
+            time.sleep(pause)
+
+    def call(self, service: str, **fields: float) -> schema.ServiceReply:
+        """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
+        payload = msgspec.json.encode(fields) if fields else None
+        replies = self._ask(f"srv/{service}", payload)
+        return Decoder(schema.ServiceReply).decode(*replies[0])
+
+    def get(self, name: str) -> Any:
+        """The last value of a published key as its typed message, or of `info`, `topics`, …"""
+        encoding, payload = self._ask(name)[0]
+        return _decoder(name).decode(encoding, payload)
+
+    def pose(self) -> Pose:
+        """Where base_link is in odom now."""
+        state = self.get("state")
+        return Pose(state.x, state.y, state.yaw)
+
+    def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
+        """The typed messages of a published key as they come; ends after `timeout` s of silence."""
+        decoder = _decoder(name)
+        for sample in self.samples(name, timeout):
+            yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+
+    def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
+        """The raw samples of any key below the robot's id."""
+        subscriber = self._subscribe(name)
+        quiet_since = time.monotonic()
+        try:
+            while timeout is None or time.monotonic() - quiet_since < timeout:
+                sample = subscriber.try_recv()
+                if sample is None:
+                    time.sleep(0.001)
+                    continue
+                quiet_since = time.monotonic()
+                yield sample
+        finally:
+            subscriber.undeclare()
+
+    def _subscribe(self, name: str) -> Any:
+        topic = by_key(name)
+        queue: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(QUEUED)
+        if topic is not None and topic.latched:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+            return zenoh.ext.declare_advanced_subscriber(
+                self.session, self.key(name), queue, history=history
+            )
+        return self.session.declare_subscriber(self.key(name), queue)
+
+    def _put(self, linear: float, angular: float) -> None:
+        stamp = schema.Time.from_ns(clock.now().wall_ns)
+        message = schema.TwistStamped(
+            schema.Header(stamp),
+            schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
+        )
+        self.session.put(
+            self.key(f"cmd/{self._source}"),
+            encode(message, "msgpack"),
+            encoding=encoding_name("msgpack", "TwistStamped"),
+            express=True,
+            timestamp=self.session.new_timestamp(),
+        )
+
+    def _ask(self, name: str, payload: bytes | None = None) -> list[tuple[str, bytes]]:
+        found = []
+        for reply in self.session.get(self.key(name), payload=payload, timeout=REPLY_TIMEOUT_S):
+            if reply.ok is not None:
+                found.append((str(reply.ok.encoding), reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                raise ExitError(Exit.FAILURE, f"{name}: {reply.err.payload.to_string()}")
+        if not found:
+            raise ExitError(
+                Exit.UNREACHABLE,
+                f"no answer on {self.key(name)}; is the daemon running with robot.id "
+                f'"{self._id}", and is there such a key? `acsard topics` lists them',
+            )
+        return found
+
+
+class AsyncClient:
+    """The same verbs for asyncio programs; make it with `connect_async`."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
+        self._client.send(linear, angular)
+
+    async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
+        """Drive for so long, then send a zero; cancelling sends the zero at once."""
+        try:
+            for pause in _drive(self._client, linear, angular, seconds):
+                await asyncio.sleep(pause)
+        except asyncio.CancelledError:
+            self._client.send(0.0, 0.0)
+            raise
+
+    async def call(self, service: str, **fields: float) -> schema.ServiceReply:
+        """Call a service, as `Client.call`."""
+        return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
+
+    async def get(self, name: str) -> Any:
+        """The last value of a key, as `Client.get`."""
+        return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
+
+    async def pose(self) -> Pose:
+        """Where base_link is in odom now."""
+        return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
+
+    async def messages(self, name: str) -> AsyncIterator[Any]:
+        """The typed messages of a published key as they come, until the loop over them ends."""
+        decoder = _decoder(name)
+        subscriber = self._client._subscribe(name)
+        try:
+            while True:
+                sample = subscriber.try_recv()
+                if sample is None:
+                    await asyncio.sleep(0.001)
+                    continue
+                yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+        finally:
+            subscriber.undeclare()
+
+
+@contextmanager
+def connect(
+    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app"
+) -> Iterator[Client]:
+    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`)."""
+    session = client_session(endpoint)
+    try:
+        yield Client(session, robot_id, source)
+    finally:
+        session.close()
+
+
+@asynccontextmanager
+async def connect_async(
+    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app"
+) -> AsyncIterator[AsyncClient]:
+    """`connect` for asyncio programs; opening and closing do not hold the event loop."""
+    session = await in_thread(lambda: client_session(endpoint), 10.0)
+    try:
+        yield AsyncClient(Client(session, robot_id, source))
+    finally:
+        await in_thread(session.close, 5.0)
+
+
+def _drive(client: Client, linear: float, angular: float, seconds: float) -> Iterator[float]:
+    """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
+    if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
+        raise ValueError("linear, angular and seconds must be finite numbers")
+    if not client._opened:
+        client.send(0.0, 0.0)
+        # Commands on one key are taken at 1000 Hz at most: the next would be lost behind this.
+        yield SEND_PERIOD_S
+    end = time.monotonic() + seconds
+    try:
+        while (left := end - time.monotonic()) > 0:
+            client.send(linear, angular)
+            yield min(SEND_PERIOD_S, left)
+    finally:
+        # Whatever interrupts the drive, the robot is told to stop.
+        client.send(0.0, 0.0)
+
+
+def _decoder(name: str) -> Decoder[Any]:
+    topic = by_key(name)
+    cls = None if topic is None else schema.MESSAGES.get(topic.type)
+    if cls is None:
+        raise ExitError(Exit.USAGE, f"{name} is not a typed key; `acsard topics` lists them")
+    return Decoder(cls)

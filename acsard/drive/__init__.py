@@ -1,0 +1,1 @@
+"""The base's behaviour, pure: kinematics, odometry, command choice, limits and modes."""

@@ -1,0 +1,164 @@
+"""Many commanders -> one command: priority, age, neutral first.
+
+The rules (SAFETY): the live source of the highest priority is heard; among equals the one who
+came first keeps the robot until it falls silent; a source that may not drive yet holds its place
+with zero, so that nobody below it drives past it. Every refusal has a name to be counted under
+and every waiting source has a sentence.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct
+
+from acsard.settings import CommandsConfig, Source
+from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
+
+FORGET_NS = 10 * NS_PER_S
+"""A sender silent for this long starts with a fresh minimum: its clock may have been set."""
+
+DRIFT = 2e-4
+"""How much faster than the sender's clock ours may run; twice what a bad crystal does."""
+
+MAX_SENDERS = 64
+"""Clocks remembered at once; the one heard longest ago goes first."""
+
+
+class Choice(Struct, frozen=True):
+    """The twist to follow, or None when nobody may drive, and why in words."""
+
+    source: str
+    twist: Twist | None
+    reason: str
+
+
+class Freshness:
+    """Relative age of stamped commands: is this one late compared with the sender's best one?
+
+    d = arrival - stamp holds the unknown clock offset and the delay; d - min(d) is the extra
+    delay alone. No clock has to be synchronised, and a clock step here does not matter because
+    the arrival is monotonic.
+    """
+
+    def __init__(self) -> None:
+        self._senders: dict[str, tuple[float, int]] = {}
+
+    def extra_delay_ns(self, sender: str, stamp_ns: int, arrived_ns: int) -> float:
+        """By how much this command came later than the sender's promptest one, ns."""
+        delay = float(arrived_ns - stamp_ns)
+        least, heard_ns = self._senders.pop(sender, (delay, arrived_ns))
+        silence = arrived_ns - heard_ns
+        least = delay if silence > FORGET_NS else min(delay, least + DRIFT * silence)
+        self._senders[sender] = (least, arrived_ns)
+        if len(self._senders) > MAX_SENDERS:
+            del self._senders[next(iter(self._senders))]
+        return delay - least
+
+
+class _Commander:
+    """What is known of one configured source."""
+
+    def __init__(self, settings: Source) -> None:
+        self.settings = settings
+        self.timeout_ns = int(settings.timeout * NS_PER_S)
+        self.twist = REST
+        self.arrived_ns: int | None = None
+        self.armed = False
+        self.heard_ns: int | None = None
+        """Last command since neutral was last required."""
+
+    def live(self, now_ns: int) -> bool:
+        return self.arrived_ns is not None and now_ns - self.arrived_ns <= self.timeout_ns
+
+
+class Arbiter:
+    """Holds the latest command of each source and chooses whose is followed."""
+
+    def __init__(self, commands: CommandsConfig) -> None:
+        self._neutral_first = commands.neutral_first
+        self._commanders = {s.name: _Commander(s) for s in commands.sources}
+        self._ranking = sorted(self._commanders.values(), key=lambda c: -c.settings.priority)
+        self._holder: _Commander | None = None
+        self._freshness = Freshness()
+
+    def require_neutral(self) -> None:
+        """Forget all commands; each source must be neutral once before it drives again."""
+        for commander in self._ranking:
+            commander.arrived_ns = commander.heard_ns = None
+            commander.armed = not self._neutral_first
+        self._holder = None
+
+    def accept(self, command: Command) -> str:
+        """Take a command; the reason it is refused for, or "" when it counts."""
+        commander = self._commanders.get(command.source)
+        if commander is None:
+            return "unknown_source"
+        twist = command.twist
+        if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
+            return "not_finite"
+        if command.stamp_ns is not None:
+            late = self._freshness.extra_delay_ns(
+                command.sender or command.source, command.stamp_ns, command.arrived_ns
+            )
+            if late > commander.timeout_ns:
+                return "stale"
+        if not commander.armed:
+            heard, now_ns = commander.heard_ns, command.arrived_ns
+            paused = heard is not None and now_ns - heard > commander.timeout_ns
+            commander.armed = paused or twist == REST
+            commander.heard_ns = now_ns
+        commander.twist, commander.arrived_ns = twist, command.arrived_ns
+        return ""
+
+    def choose(self, now_ns: int) -> Choice:
+        """Whose command counts now, and which."""
+        chosen = None
+        for commander in self._ranking:
+            if not commander.live(now_ns):
+                continue
+            if chosen is None:
+                chosen = commander
+            elif commander.settings.priority < chosen.settings.priority:
+                break
+            elif commander is self._holder:
+                chosen = commander
+        self._holder = chosen
+        if chosen is None:
+            return Choice("", None, "no commands: no source has sent one within its timeout")
+        name = chosen.settings.name
+        if not chosen.armed:
+            return Choice(name, None, self._wait(chosen))
+        return Choice(name, chosen.twist, f"commanded by {name}")
+
+    def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
+        """What each source is doing and waiting for, highest priority first."""
+        return tuple(
+            SourceStatus(
+                c.settings.name,
+                c.settings.priority,
+                None if c.arrived_ns is None else (now_ns - c.arrived_ns) / NS_PER_S,
+                self._waits_for(c, now_ns),
+            )
+            for c in self._ranking
+        )
+
+    def _waits_for(self, commander: _Commander, now_ns: int) -> str:
+        holder = self._holder
+        if not commander.live(now_ns):
+            return "a command"
+        if not commander.armed:
+            return self._wait(commander)
+        if holder is None or commander is holder:
+            return ""
+        if holder.settings.priority == commander.settings.priority:
+            return f"{holder.settings.name}, of the same priority, came first: until it is silent"
+        return f"{holder.settings.name} has the higher priority: until it is silent"
+
+    @staticmethod
+    def _wait(commander: _Commander) -> str:
+        settings = commander.settings
+        return (
+            f"neutral first: {settings.name} must send a zero, or pause for "
+            f"{settings.timeout:g} s, before it can drive"
+        )

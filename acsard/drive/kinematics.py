@@ -1,0 +1,50 @@
+"""Body twist <-> four wheel speeds of a four-wheel differential drive (skid-steer) base.
+
+With v, w the linear and angular velocity of base_link, r_l and r_r the wheel radii, and L the
+effective track (wheel separation x its multiplier: skidding wheels turn the robot as if they
+stood further apart than they do):
+
+    (1)  left = (front_left + rear_left) / 2      right = (front_right + rear_right) / 2
+    (2)  v = (r_r right + r_l left) / 2
+    (3)  w = (r_r right - r_l left) / L
+
+and, solved for the wheels of a base that does both exactly,
+
+    front_left = rear_left = (v - w L / 2) / r_l    front_right = rear_right = (v + w L / 2) / r_r
+"""
+
+from __future__ import annotations
+
+from acsard.settings import DriveConfig
+from acsard.values import Twist, WheelSpeeds
+
+
+class Kinematics:
+    """Converts between twist (m/s, rad/s, in base_link) and wheel speeds (rad/s)."""
+
+    def __init__(self, drive: DriveConfig) -> None:
+        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
+        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
+        self._track = drive.wheel_separation * drive.wheel_separation_multiplier
+
+    def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
+        """The wheel speeds that give this twist: equations (1) to (3) solved for them."""
+        half = twist.angular * self._track / 2
+        left = (twist.linear - half) / self._left_radius
+        right = (twist.linear + half) / self._right_radius
+        return WheelSpeeds(right, left, left, right)
+
+    def twist(self, speeds: WheelSpeeds) -> Twist:
+        """The twist these wheel speeds give, equations (1) to (3)."""
+        left = self._left_radius * (speeds.front_left + speeds.rear_left) / 2
+        right = self._right_radius * (speeds.front_right + speeds.rear_right) / 2
+        return Twist((right + left) / 2, (right - left) / self._track)
+
+    def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
+        """The twist scaled down until no wheel exceeds `wheel_speed` rad/s; curvature is kept."""
+        speeds = self.wheel_speeds(twist)
+        fastest = max(abs(speeds.front_right), abs(speeds.front_left))
+        if fastest <= wheel_speed:
+            return twist
+        scale = wheel_speed / fastest
+        return Twist(twist.linear * scale, twist.angular * scale)

@@ -1,0 +1,127 @@
+"""Wished twist -> safe twist: speed, wheel saturation, acceleration, deceleration, jerk.
+
+Two ways to move: `follow` a commander, each axis by its own limits; `coast` to rest without one,
+both axes falling together so that no wheel's speed ever grows on the way down (invariant 2).
+Jerk shapes commanded motion only: what brakes the robot is never later for the sake of comfort.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct
+
+from acsard.drive.kinematics import Kinematics
+from acsard.settings import LimitsConfig
+from acsard.values import REST, Twist
+
+
+class _Axis(Struct, frozen=True):
+    speed: float
+    acceleration: float
+    deceleration: float
+    stop_deceleration: float
+    jerk: float
+
+
+class _State(Struct, frozen=True):
+    twist: Twist
+    linear_slope: float
+    angular_slope: float
+
+
+class Limiter:
+    """Remembers the twist it last allowed and moves it by the limits."""
+
+    def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
+        self._linear = _Axis(
+            limits.linear_speed,
+            limits.linear_acceleration,
+            limits.linear_deceleration,
+            limits.linear_stop_deceleration,
+            limits.linear_jerk,
+        )
+        self._angular = _Axis(
+            limits.angular_speed,
+            limits.angular_acceleration,
+            limits.angular_deceleration,
+            limits.angular_stop_deceleration,
+            limits.angular_jerk,
+        )
+        self._wheel_speed = limits.wheel_speed
+        self._kinematics = kinematics
+        self.state = _State(REST, 0.0, 0.0)
+        """All it remembers; put back to undo a step whose line did not go out."""
+
+    @property
+    def twist(self) -> Twist:
+        """What was allowed last."""
+        return self.state.twist
+
+    def follow(self, wished: Twist, dt: float) -> Twist:
+        """Move towards `wished` (finite) for `dt` s; what may be applied now."""
+        goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
+        now = self.state
+        linear, slope_v = _approach(
+            now.twist.linear, goal.linear, now.linear_slope, dt, self._linear
+        )
+        angular, slope_w = _approach(
+            now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
+        )
+        # The axes move at their own pace, so a corner of the two can ask more of a wheel than
+        # either end does.
+        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
+        self.state = _State(twist, slope_v, slope_w)
+        return twist
+
+    def coast(self, dt: float, stop: bool = False) -> Twist:
+        """Fall towards rest for `dt` s, along the line to it; `stop` brakes by the stop limits."""
+        twist = self.twist
+        seconds = max(
+            abs(twist.linear) / _braking(self._linear, stop),
+            abs(twist.angular) / _braking(self._angular, stop),
+        )
+        share = 1.0 - dt / seconds if seconds > dt else 0.0
+        fallen = Twist(twist.linear * share, twist.angular * share) if share else REST
+        self.state = _State(fallen, 0.0, 0.0)
+        return fallen
+
+    def cut(self) -> Twist:
+        """Rest at once: there is nobody at the other end to ramp."""
+        self.state = _State(REST, 0.0, 0.0)
+        return REST
+
+    def _within_speed(self, wished: Twist) -> Twist:
+        """Both axes scaled together until each is within its limit: curvature is kept."""
+        scale = 1.0
+        if abs(wished.linear) > self._linear.speed:
+            scale = self._linear.speed / abs(wished.linear)
+        if abs(wished.angular) * scale > self._angular.speed:
+            scale = self._angular.speed / abs(wished.angular)
+        return Twist(wished.linear * scale, wished.angular * scale)
+
+
+def _braking(axis: _Axis, stop: bool) -> float:
+    return axis.stop_deceleration if stop else axis.deceleration
+
+
+def _approach(
+    speed: float, goal: float, slope: float, dt: float, axis: _Axis
+) -> tuple[float, float]:
+    """`speed` after `dt` on the way to `goal`, and the slope used, within the axis's limits."""
+    if dt <= 0.0:
+        return speed, slope
+    # Through zero in two parts: what slows the robot is deceleration, what follows is not.
+    target = 0.0 if speed * goal < 0 else goal
+    most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
+    wanted = (target - speed) / dt
+    if axis.jerk:
+        # The steepest slope that jerk can still flatten before the goal, in steps of dt.
+        away, step = abs(target - speed), axis.jerk * dt
+        most = min(most, math.sqrt(step * step / 4 + 2 * axis.jerk * away) - step / 2)
+        bounded = max(-most, min(most, wanted))
+        used = max(slope - step, min(slope + step, bounded))
+    else:
+        used = max(-most, min(most, wanted))
+    # Landing exactly: wanted * dt need not give the difference back in floating point.
+    return (target if used == wanted else speed + used * dt), used

@@ -1,0 +1,118 @@
+"""Wheel speeds over time -> pose, twist and covariance of base_link in odom.
+
+One step of dt, with left and right the mean wheel speeds of a side (kinematics, equation 1):
+
+    (4)  d_left = r_l left dt            (5)  d_right = r_r right dt
+    (6)  d = (d_right + d_left) / 2      (7)  dyaw = (d_right - d_left) / L
+    (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
+    (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
+
+Equations (8) and (9) step along a straight line; the product integrates the exact arc instead:
+the chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along
+yaw + dyaw/2. They agree as dyaw -> 0.
+
+The covariance is propagated by the arc's Jacobian with noise that grows with the distance and the
+angle travelled (Siegwart, Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2).
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.drive.kinematics import Kinematics
+from acsard.mcu.session import Feedback
+from acsard.settings import OdometryConfig
+from acsard.values import REST, STILL, Pose, PoseCovariance, Sample
+
+MAX_VARIANCE = 1e9
+"""m2 or rad2; a pose this uncertain says nothing, and the numbers must stay finite for years."""
+
+
+class Odometry:
+    """Integrates feedback; the only state is pose, its covariance and the wheel angles."""
+
+    def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
+        self._settings = odometry
+        self._kinematics = kinematics
+        self._positions = (0.0, 0.0, 0.0, 0.0)
+        self.twist = REST
+        """Twist of the last feedback."""
+        self.speeds = STILL
+        """Wheel speeds of the last feedback."""
+        self.set_pose(Pose())
+
+    def set_pose(self, pose: Pose) -> None:
+        """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
+        diagonal = self._settings.pose_covariance_diagonal
+        self._pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
+        self._covariance = PoseCovariance(diagonal[0], 0.0, 0.0, diagonal[1], 0.0, diagonal[5])
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of base_link in odom now."""
+        return self._pose
+
+    def fold(self, feedback: Feedback) -> Sample:
+        """Advance by one feedback line; after a gap only the uncertainty advances."""
+        if feedback.gap > 0.0:
+            self._add_gap(feedback.gap)
+        twist = self._kinematics.twist(feedback.speeds)
+        dt = feedback.dt
+        if dt > 0.0:
+            distance, turn = twist.linear * dt, twist.angular * dt
+            self._covariance = self._propagate(distance, turn)
+            self._pose = arc(self._pose, distance, turn)
+            a, b, c, d = self._positions
+            fr, fl, rl, rr = feedback.speeds.as_tuple()
+            self._positions = (a + fr * dt, b + fl * dt, c + rl * dt, d + rr * dt)
+        self.twist, self.speeds = twist, feedback.speeds
+        return Sample(
+            feedback.at, self._pose, twist, self._covariance, self._positions, feedback.speeds
+        )
+
+    def _add_gap(self, gap: float) -> None:
+        """The robot may have gone on as it last moved, or stood: one deviation is all of that."""
+        p = self._covariance
+        along = (self.twist.linear * gap) ** 2
+        turned = (self.twist.angular * gap) ** 2
+        self._covariance = PoseCovariance(
+            min(p.xx + along, MAX_VARIANCE),
+            p.xy,
+            p.xyaw,
+            min(p.yy + along, MAX_VARIANCE),
+            p.yyaw,
+            min(p.yawyaw + turned, MAX_VARIANCE),
+        )
+
+    def _propagate(self, distance: float, turn: float) -> PoseCovariance:
+        """F P F' + noise, with F the Jacobian of the step in (x, y, yaw)."""
+        settings, p = self._settings, self._covariance
+        heading = self._pose.yaw + turn / 2
+        c, s = math.cos(heading), math.sin(heading)
+        fx, fy = -distance * s, distance * c
+        along = settings.distance_variance_per_metre * abs(distance)
+        turned = settings.yaw_variance_per_metre * abs(distance)
+        turned += settings.yaw_variance_per_radian * abs(turn)
+        if p.xx >= MAX_VARIANCE or p.yy >= MAX_VARIANCE or p.yawyaw >= MAX_VARIANCE:
+            return p
+        return PoseCovariance(
+            p.xx + 2 * fx * p.xyaw + fx * fx * p.yawyaw + along * c * c,
+            p.xy + fy * p.xyaw + fx * p.yyaw + fx * fy * p.yawyaw + along * c * s,
+            p.xyaw + fx * p.yawyaw,
+            p.yy + 2 * fy * p.yyaw + fy * fy * p.yawyaw + along * s * s,
+            p.yyaw + fy * p.yawyaw,
+            p.yawyaw + turned,
+        )
+
+
+def arc(pose: Pose, distance: float, turn: float) -> Pose:
+    """`pose` after an arc of length `distance` m through `turn` rad."""
+    half = turn / 2
+    # sin(h)/h loses nothing in doubles down to tiny h; only h = 0 needs its limit.
+    chord = distance * (math.sin(half) / half if half else 1.0)
+    heading = pose.yaw + half
+    return Pose(
+        pose.x + chord * math.cos(heading),
+        pose.y + chord * math.sin(heading),
+        math.remainder(pose.yaw + turn, math.tau),
+    )

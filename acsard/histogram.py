@@ -1,0 +1,42 @@
+"""Percentiles of an endless stream in fixed memory: logarithmic buckets, no growth, no numpy."""
+
+from __future__ import annotations
+
+import math
+
+from acsard.values import Spread
+
+PER_DECADE = 20
+"""Buckets per factor of ten: a percentile is right to 12 %."""
+
+DECADES = 7
+"""From 1 to 10^7 of the unit; what is smaller or larger falls into the end buckets."""
+
+
+class Histogram:
+    """Counts measurements of one quantity."""
+
+    def __init__(self) -> None:
+        self._buckets = [0] * (PER_DECADE * DECADES + 1)
+        self._count = 0
+        self._max = 0.0
+
+    def add(self, value: float) -> None:
+        """Count one measurement."""
+        last = len(self._buckets) - 1
+        index = min(last, math.ceil(PER_DECADE * math.log10(value))) if value > 1.0 else 0
+        self._buckets[index] += 1
+        self._count += 1
+        self._max = max(self._max, value)
+
+    def spread(self) -> Spread:
+        """Median, 99th percentile and maximum so far; a percentile is its bucket's upper end."""
+        return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
+
+    def _percentile(self, share: float) -> float:
+        rank, seen = share * self._count, 0
+        for index, count in enumerate(self._buckets):
+            seen += count
+            if count and seen >= rank:
+                return min(math.pow(10.0, index / PER_DECADE), self._max)
+        return 0.0

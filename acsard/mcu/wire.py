@@ -1,0 +1,63 @@
+"""How long bytes take on the serial wire, and when the next line may go.
+
+Pure arithmetic on nanoseconds. `LineGate` is the rule "we hold no line back to send it later"
+(invariant 3) shared by the real port and by the tests' virtual one.
+"""
+
+from __future__ import annotations
+
+from acsard.values import NS_PER_S
+
+BITS_PER_BYTE = 10
+"""8N1: start bit, eight data bits, stop bit."""
+
+COMMAND_BYTES = 33
+"""`ap12.50,bn08.75,cp15.00,dn10.25` and CR LF; one more with a trailing comma."""
+
+COMFORTABLE_USE = 0.8
+"""Share of the wire above which a line that is a little late already meets the next one. It also
+leaves room for replies with a space after each comma (36 bytes on their own wire, 9 % more)."""
+
+
+def wire_ns(count: int, baud_rate: int) -> int:
+    """Time `count` bytes occupy the wire, in ns."""
+    return count * BITS_PER_BYTE * NS_PER_S // baud_rate
+
+
+def line_bytes(trailing_comma: bool) -> int:
+    """Length of a command in this dialect; a reply in the same shape is as long."""
+    return COMMAND_BYTES + (1 if trailing_comma else 0)
+
+
+def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
+    """Share of the wire that `count` bytes per period take; above 1 they do not fit."""
+    return count * BITS_PER_BYTE * rate_hz / baud_rate
+
+
+def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
+    """The most lines of `count` bytes per second that take no more than `use` of the wire."""
+    return int(use * baud_rate / (count * BITS_PER_BYTE))
+
+
+class LineGate:
+    """Decides whether a line may be offered to the kernel now; it never keeps one."""
+
+    def __init__(self, baud_rate: int) -> None:
+        self._baud_rate = baud_rate
+        self._free_ns = 0
+        self._torn = True
+
+    def may_send(self, now_ns: int, kernel_bytes: int) -> bool:
+        """True when the kernel holds nothing and the previous line has left the wire."""
+        return kernel_bytes == 0 and now_ns >= self._free_ns
+
+    @property
+    def prefix(self) -> bytes:
+        """What must precede the next line: an end of line after a torn line and after opening."""
+        return b"\r\n" if self._torn else b""
+
+    def note_sent(self, now_ns: int, offered: int, taken: int) -> None:
+        """Record that the kernel took `taken` of `offered` bytes; the rest is dropped."""
+        if taken:
+            self._torn = taken < offered
+        self._free_ns = now_ns + wire_ns(taken, self._baud_rate)

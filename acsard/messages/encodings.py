@@ -1,0 +1,75 @@
+"""msgpack and JSON by name, and what an incoming sample is encoded in.
+
+An Encoding that says so is believed; without one the first byte decides: `{` (after white space)
+is JSON, a msgpack map header is msgpack. Decoding raises `DecodeError` and nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import Generic, Literal, TypeVar
+
+import msgspec
+
+from acsard.values import AcsardError
+
+Format = Literal["msgpack", "json"]
+FORMATS: tuple[Format, ...] = ("msgpack", "json")
+
+T = TypeVar("T")
+
+_MIME: dict[Format, str] = {"msgpack": "application/msgpack", "json": "application/json"}
+_pack = msgspec.msgpack.Encoder()
+_text = msgspec.json.Encoder()
+
+
+class DecodeError(AcsardError):
+    """A payload that cannot be used; `reason` is the name it is counted under."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+def encoding_name(form: Format, type_name: str = "") -> str:
+    """The Zenoh Encoding of a payload of ours."""
+    return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
+
+
+def encode(message: object, form: Format) -> bytes:
+    """The message as bytes."""
+    return _pack.encode(message) if form == "msgpack" else _text.encode(message)
+
+
+def detect(encoding: str, payload: bytes) -> Format:
+    """How the payload is encoded; raises `DecodeError` when that cannot be told."""
+    mime = encoding.partition(";")[0]
+    if mime == "application/msgpack":
+        return "msgpack"
+    if mime in ("application/json", "text/json"):
+        return "json"
+    first = payload.lstrip(b" \t\r\n")[:1]
+    if first == b"{":
+        return "json"
+    if first and (0x80 <= first[0] <= 0x8F or first[0] in (0xDE, 0xDF)):
+        return "msgpack"
+    raise DecodeError(
+        "unknown_encoding", f"neither a JSON object nor a msgpack map: {payload[:16]!r}"
+    )
+
+
+class Decoder(Generic[T]):
+    """Decodes payloads of one type from either encoding."""
+
+    def __init__(self, cls: type[T]) -> None:
+        self._pack = msgspec.msgpack.Decoder(cls)
+        self._text = msgspec.json.Decoder(cls)
+
+    def decode(self, encoding: str, payload: bytes) -> T:
+        """The message; raises `DecodeError` for anything that is not one."""
+        form = detect(encoding, payload)
+        try:
+            return self._pack.decode(payload) if form == "msgpack" else self._text.decode(payload)
+        except msgspec.ValidationError as error:
+            raise DecodeError("wrong_shape", str(error)) from None
+        except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
+            raise DecodeError("malformed", str(error)) from None

@@ -1,0 +1,117 @@
+"""A sample from the bus -> a `Command` or a `Request`, or the reason it is refused.
+
+Refused whole, never in part: a command that cannot be decoded, is too big, holds NaN or infinity
+in any field, or came by a wildcard key or a DELETE refreshes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import UNSET, Struct, UnsetType
+
+from acsard.drive.kinematics import Kinematics
+from acsard.messages.encodings import DecodeError, Decoder
+from acsard.messages.schema import Header, JointState, SetPose, Twist, Vector3
+from acsard.settings import JointsConfig
+from acsard.values import Command, Pose, Request, Verb, WheelSpeeds
+from acsard.values import Twist as BodyTwist
+
+MAX_COMMAND_BYTES = 4096
+"""A TwistStamped is under 300 bytes as JSON; more than this is not a command."""
+
+
+class Arrival(Struct, frozen=True):
+    """A sample as the bus shell took it from Zenoh, key below `acsard/<id>/`."""
+
+    key: str
+    put: bool
+    payload: bytes
+    encoding: str
+    arrived_ns: int
+    stamp_ns: int | None
+    """Zenoh's own timestamp, when it is the sender's."""
+    sender: str
+
+
+class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
+    """A Twist or a TwistStamped, told apart by the fields it has."""
+
+    linear: Vector3 | UnsetType = UNSET
+    angular: Vector3 | UnsetType = UNSET
+    header: Header | UnsetType = UNSET
+    twist: Twist | UnsetType = UNSET
+
+
+_twists = Decoder(_TwistPayload)
+_wheels = Decoder(JointState)
+_poses = Decoder(SetPose)
+
+
+class Receiver:
+    """Decodes what commanders send, by the key it came on."""
+
+    def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
+        self._joints = joints.as_tuple()
+        self._kinematics = kinematics
+
+    def command(self, arrival: Arrival) -> Command:
+        """The command in a sample on `cmd/…` or `wheel_cmd/…`; raises `DecodeError`."""
+        kind, _, source = arrival.key.partition("/")
+        if "*" in arrival.key or "/" in source:
+            raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
+        if not arrival.put:
+            raise DecodeError("not_a_put", "a DELETE is not a command")
+        if len(arrival.payload) > MAX_COMMAND_BYTES:
+            raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+        if kind == "cmd":
+            twist, header = self._twist(arrival)
+        else:
+            twist, header = self._wheel_speeds(arrival)
+        stamp_ns, sender = arrival.stamp_ns, arrival.sender or arrival.key
+        if header is not None and header.stamp.to_ns() > 0:
+            stamp_ns = header.stamp.to_ns()
+        return Command(source, twist, arrival.arrived_ns, stamp_ns, sender)
+
+    def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:
+        got = _twists.decode(arrival.encoding, arrival.payload)
+        header = None
+        linear, angular = got.linear, got.angular
+        if not isinstance(got.twist, UnsetType):
+            if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
+                raise DecodeError("wrong_shape", "a twist inside and beside `twist`")
+            linear, angular = got.twist.linear, got.twist.angular
+            header = None if isinstance(got.header, UnsetType) else got.header
+        if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
+            raise DecodeError("wrong_shape", "needs both `linear` and `angular`")
+        axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        if not all(map(math.isfinite, axes)):
+            raise DecodeError("not_finite", "NaN or infinity in the twist")
+        return BodyTwist(linear.x, angular.z), header
+
+    def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:
+        got = _wheels.decode(arrival.encoding, arrival.payload)
+        if sorted(got.name) != sorted(self._joints) or len(got.velocity) != 4:
+            raise DecodeError(
+                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}"
+            )
+        if not all(map(math.isfinite, (*got.velocity, *got.position, *got.effort))):
+            raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
+        speed = dict(zip(got.name, got.velocity, strict=True))
+        twist = self._kinematics.twist(WheelSpeeds(*(speed[joint] for joint in self._joints)))
+        if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
+            raise DecodeError("not_finite", "wheel speeds beyond all numbers")
+        return twist, got.header
+
+    @staticmethod
+    def request(verb: Verb, number: int, encoding: str, payload: bytes) -> Request:
+        """The request in a service query, to be answered as `number`; raises `DecodeError`."""
+        if verb != "set_pose":
+            return Request(verb, number)
+        got = _poses.decode(encoding, payload)
+        if (
+            not all(map(math.isfinite, (got.x, got.y, got.yaw)))
+            or max(abs(got.x), abs(got.y)) > 1e6
+        ):
+            raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
+        return Request(verb, number, Pose(got.x, got.y, got.yaw))

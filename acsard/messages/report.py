@@ -1,0 +1,263 @@
+"""`Outputs` -> messages: what is due now, and the present value of any published key.
+
+Only what somebody listens to is built. All messages of one feedback line carry its stamp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+
+from acsard.mcu.wire import line_bytes, wire_use
+from acsard.messages.schema import (
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    JointState,
+    KeyValue,
+    Message,
+    Odometry,
+    Pose,
+    PoseWithCovariance,
+    Quaternion,
+    RobotState,
+    SourceState,
+    TFMessage,
+    Time,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+    TwistWithCovariance,
+    Vector3,
+)
+from acsard.settings import Config
+from acsard.values import NS_PER_S, Instant, Outputs, Sample, Snapshot
+from acsard.values import Twist as BodyTwist
+
+Look = Callable[[], Snapshot]
+
+
+class _Rate:
+    """Lets something happen at most so often; 0 Hz means always."""
+
+    def __init__(self, hz: float) -> None:
+        self._period_ns = int(NS_PER_S / hz) if hz else 0
+        self._next_ns = 0
+
+    def due(self, now_ns: int, at_once: bool = False) -> bool:
+        # A tenth of the period as grace, or a 10 Hz rate would drop to 9.1 Hz on a 100 Hz grid
+        # whenever a tick comes a microsecond early.
+        if not at_once and now_ns < self._next_ns - self._period_ns // 10:
+            return False
+        behind = at_once or now_ns - self._next_ns > self._period_ns
+        self._next_ns = (now_ns if behind else self._next_ns) + self._period_ns
+        return True
+
+
+class Report:
+    """Builds messages from outputs; remembers only the last sample and the last outputs."""
+
+    def __init__(self, config: Config, start: Instant) -> None:
+        self._config = config
+        self._names = list(config.joints.as_tuple())
+        self._start = start
+        self._sample: Sample | None = None
+        self._outputs: Outputs | None = None
+        rates = config.rates
+        self._rates = {
+            "odom": _Rate(rates.odom),
+            "wheel_states": _Rate(rates.wheel_states),
+            "cmd_vel_out": _Rate(rates.cmd_vel_out),
+            "state": _Rate(rates.state),
+            "diagnostics": _Rate(rates.diagnostics),
+        }
+        diagonal = config.odometry.twist_covariance_diagonal
+        self._twist_covariance = [0.0] * 36
+        self._twist_covariance[::7] = diagonal
+
+    def due(
+        self, outputs: Outputs, wanted: Collection[str], look: Look
+    ) -> list[tuple[str, Message]]:
+        """The (key, message) pairs to publish after this step, of the keys in `wanted`."""
+        self._outputs = outputs
+        found: list[tuple[str, Message]] = []
+        for sample in outputs.samples:
+            self._sample = sample
+            if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(sample.at.mono_ns):
+                if "odom" in wanted:
+                    found.append(("odom", self._odom(sample)))
+                if "tf" in wanted and self._config.odometry.publish_tf:
+                    found.append(("tf", self._tf(sample)))
+            if "wheel_states" in wanted and self._rates["wheel_states"].due(sample.at.mono_ns):
+                found.append(("wheel_states", self._wheel_states(sample)))
+        now_ns = outputs.now.mono_ns
+        if outputs.tick and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
+            found.append(("cmd_vel_out", self._cmd_vel_out(outputs)))
+        for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
+            if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
+                found.append((key, build(outputs, look())))
+        return found
+
+    def current(self, key: str, look: Look) -> Message | None:
+        """The present value of a published key; None when there has been none yet."""
+        sample, outputs = self._sample, self._outputs
+        match key:
+            case "tf_static":
+                return self.tf_static()
+            case "odom":
+                return self._odom(sample) if sample else None
+            case "tf":
+                return self._tf(sample) if sample and self._config.odometry.publish_tf else None
+            case "wheel_states":
+                return self._wheel_states(sample) if sample else None
+            case "cmd_vel_out":
+                return self._cmd_vel_out(outputs) if outputs else None
+            case "state":
+                return self._state(outputs, look()) if outputs else None
+            case "diagnostics":
+                return self._diagnostics(outputs, look()) if outputs else None
+            case _:
+                return None
+
+    def tf_static(self) -> TFMessage:
+        """The transforms that never change, all in one message; those switched off are left out."""
+        base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
+        lidar, footprint = self._config.lidar, self._config.footprint
+        transforms = []
+        if lidar.publish_tf:
+            place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset, lidar.lidar_z_offset)
+            turn = from_rpy(lidar.lidar_roll, lidar.lidar_pitch, lidar.lidar_yaw)
+            transforms.append(TransformStamped(base, lidar.lidar_frame, Transform(place, turn)))
+        if footprint.publish_tf:
+            place = Vector3(z=footprint.footprint_z_offset)
+            transforms.append(
+                TransformStamped(base, footprint.footprint_frame, Transform(place, Quaternion()))
+            )
+        return TFMessage(transforms)
+
+    def _odom(self, sample: Sample) -> Odometry:
+        frames, pose, p = self._config.odometry, sample.pose, sample.covariance
+        d = frames.pose_covariance_diagonal
+        # fmt: off
+        covariance = [
+            p.xx,    p.xy,   0.0,  0.0,  0.0,  p.xyaw,
+            p.xy,    p.yy,   0.0,  0.0,  0.0,  p.yyaw,
+            0.0,     0.0,    d[2], 0.0,  0.0,  0.0,
+            0.0,     0.0,    0.0,  d[3], 0.0,  0.0,
+            0.0,     0.0,    0.0,  0.0,  d[4], 0.0,
+            p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,  p.yawyaw,
+        ]
+        # fmt: on
+        return Odometry(
+            Header(Time.from_ns(sample.at.wall_ns), frames.odom_frame),
+            frames.base_frame,
+            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), covariance),
+            TwistWithCovariance(_twist(sample.twist), self._twist_covariance),
+        )
+
+    def _tf(self, sample: Sample) -> TFMessage:
+        frames, pose = self._config.odometry, sample.pose
+        header = Header(Time.from_ns(sample.at.wall_ns), frames.odom_frame)
+        where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
+        return TFMessage([TransformStamped(header, frames.base_frame, where)])
+
+    def _wheel_states(self, sample: Sample) -> JointState:
+        return JointState(
+            header=Header(Time.from_ns(sample.at.wall_ns)),
+            name=self._names,
+            position=list(sample.positions),
+            velocity=list(sample.speeds.as_tuple()),
+        )
+
+    def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
+        header = Header(Time.from_ns(outputs.now.wall_ns), self._config.odometry.base_frame)
+        return TwistStamped(header, _twist(outputs.applied))
+
+    def _state(self, outputs: Outputs, snapshot: Snapshot) -> RobotState:
+        return RobotState(
+            stamp=Time.from_ns(outputs.now.wall_ns),
+            mode=outputs.mode,
+            reason=outputs.reason,
+            x=snapshot.pose.x,
+            y=snapshot.pose.y,
+            yaw=snapshot.pose.yaw,
+            linear=snapshot.measured.linear,
+            angular=snapshot.measured.angular,
+            wheels=list(snapshot.speeds.as_tuple()),
+            link=outputs.link,
+            source=outputs.source,
+            sources=[
+                SourceState(s.name, s.priority, s.age_s, s.waits_for) for s in snapshot.sources
+            ],
+            counters=snapshot.counters,
+        )
+
+    def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
+        config, counters, late = self._config, snapshot.counters, snapshot.lateness_us
+        ok, warning, error = 0, 1, 2
+        use = wire_use(config.rate_hz, config.mcu.baud_rate, line_bytes(config.mcu.trailing_comma))
+        missed, periods = counters.get("missed_periods", 0), max(1, late.count)
+        mode_level = error if outputs.mode == "fault" else ok
+        statuses = (
+            ("mode", mode_level, outputs.reason, {"mode": outputs.mode, "source": outputs.source}),
+            (
+                "serial link",
+                ok if outputs.link == "up" else error,
+                outputs.link,
+                {"port": config.mcu.port, "wire_use": f"{use:.2f}"}
+                | {k: str(v) for k, v in counters.items() if k.startswith("line")},
+            ),
+            (
+                "control loop",
+                warning if missed > 0.01 * periods else ok,
+                f"{missed} of {periods} periods missed",
+                {
+                    "lateness_p50_us": f"{late.p50:.0f}",
+                    "lateness_p99_us": f"{late.p99:.0f}",
+                    "lateness_max_us": f"{late.max:.0f}",
+                },
+            ),
+            (
+                "commands",
+                ok,
+                f"commanded by {outputs.source}" if outputs.source else "no commands",
+                {s.name: s.waits_for or "driving" for s in snapshot.sources}
+                | {k: str(v) for k, v in counters.items() if k.startswith("command")},
+            ),
+        )
+        return DiagnosticArray(
+            Header(Time.from_ns(outputs.now.wall_ns)),
+            [
+                DiagnosticStatus(
+                    level,
+                    f"acsard: {name}",
+                    message,
+                    config.robot.id,
+                    [KeyValue(key, value) for key, value in values.items()],
+                )
+                for name, level, message, values in statuses
+            ],
+        )
+
+
+def _twist(twist: BodyTwist) -> Twist:
+    return Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+
+
+def from_yaw(yaw: float) -> Quaternion:
+    """The rotation by `yaw` rad about z."""
+    return Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+
+
+def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """The rotation by roll, then pitch, then yaw about the fixed axes x, y, z (REP-103), rad."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return Quaternion(
+        x=sr * cp * cy - cr * sp * sy,
+        y=cr * sp * cy + sr * cp * sy,
+        z=cr * cp * sy - sr * sp * cy,
+        w=cr * cp * cy + sr * sp * sy,
+    )

@@ -1,0 +1,265 @@
+"""The published structs, shaped and named like their ROS 2 messages, a unit beside each field.
+
+One schema, several encodings: a field means the same thing as msgpack and as JSON. Incoming
+structs refuse unknown fields, so a misspelt axis is an error and not a standstill.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.values import NS_PER_S
+
+
+class Message(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of every struct on the bus."""
+
+
+class Time(Message, frozen=True):
+    """Wall-clock time since 1970-01-01 UTC."""
+
+    sec: int = 0
+    nanosec: int = 0
+
+    @classmethod
+    def from_ns(cls, wall_ns: int) -> Time:
+        """The time `wall_ns` nanoseconds after 1970."""
+        return cls(*divmod(wall_ns, NS_PER_S))
+
+    def to_ns(self) -> int:
+        """Nanoseconds since 1970."""
+        return self.sec * NS_PER_S + self.nanosec
+
+
+class Header(Message, frozen=True):
+    """When the data was sampled and in which frame it is."""
+
+    stamp: Time = Time()
+    frame_id: str = ""
+
+
+class Vector3(Message, frozen=True):
+    """Three components; the unit is that of the field it fills."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class Quaternion(Message, frozen=True):
+    """A rotation as unit quaternion."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 1.0
+
+
+class Twist(Message, frozen=True):
+    """Velocity: `linear` m/s, `angular` rad/s. A planar base follows linear.x and angular.z."""
+
+    linear: Vector3
+    angular: Vector3
+
+
+class TwistStamped(Message, frozen=True):
+    """A twist with the time it was meant at."""
+
+    header: Header
+    twist: Twist
+
+
+class Pose(Message, frozen=True):
+    """`position` m and `orientation`."""
+
+    position: Vector3
+    orientation: Quaternion
+
+
+class PoseWithCovariance(Message, frozen=True):
+    """A pose and its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
+
+    pose: Pose
+    covariance: list[float]
+
+
+class TwistWithCovariance(Message, frozen=True):
+    """A twist and its 6x6 covariance, row major, m/s and rad/s."""
+
+    twist: Twist
+    covariance: list[float]
+
+
+class Odometry(Message, frozen=True):
+    """Pose of `child_frame_id` in `header.frame_id`, twist in `child_frame_id`."""
+
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+
+class Transform(Message, frozen=True):
+    """`translation` m and `rotation`."""
+
+    translation: Vector3
+    rotation: Quaternion
+
+
+class TransformStamped(Message, frozen=True):
+    """Where `child_frame_id` is in `header.frame_id`."""
+
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+class TFMessage(Message, frozen=True):
+    """A list of transforms."""
+
+    transforms: list[TransformStamped]
+
+
+class JointState(Message, frozen=True):
+    """Per joint `name`: `position` rad (continuous), `velocity` rad/s, `effort` N m (unused)."""
+
+    header: Header = Header()
+    name: list[str] = []
+    position: list[float] = []
+    velocity: list[float] = []
+    effort: list[float] = []
+
+
+class SourceState(Message, frozen=True):
+    """One commander: seconds since its last accepted command (null: none) and what it waits for."""
+
+    name: str
+    priority: int
+    age: float | None
+    waits_for: str
+
+
+class RobotState(Message, frozen=True):
+    """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s)."""
+
+    stamp: Time
+    mode: str
+    reason: str
+    x: float
+    y: float
+    yaw: float
+    linear: float
+    angular: float
+    wheels: list[float]
+    """Measured speeds in the order front right, front left, rear left, rear right."""
+    link: str
+    source: str
+    sources: list[SourceState]
+    counters: dict[str, int]
+
+
+class KeyValue(Message, frozen=True):
+    """One diagnostic figure, as text."""
+
+    key: str
+    value: str
+
+
+class DiagnosticStatus(Message, frozen=True):
+    """`level` 0 ok, 1 warning, 2 error, 3 stale."""
+
+    level: int
+    name: str
+    message: str
+    hardware_id: str
+    values: list[KeyValue]
+
+
+class DiagnosticArray(Message, frozen=True):
+    """The state of every part of the robot at one time."""
+
+    header: Header
+    status: list[DiagnosticStatus]
+
+
+class ServiceReply(Message, frozen=True):
+    """Did the service do it, and what happened or what to do instead."""
+
+    success: bool
+    message: str
+
+
+class SetPose(Message, frozen=True):
+    """Where base_link is to be in odom: m, m, rad."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+class Info(Message, frozen=True):
+    """Who is this daemon."""
+
+    id: str
+    version: str
+    pid: int
+    port: str
+    simulated: bool
+    rate: float
+    """Control rate, Hz."""
+    listen: list[str]
+    connect: list[str]
+
+
+class HardwareInterface(Message, frozen=True):
+    """One line of `ros2 control list_hardware_interfaces`."""
+
+    name: str
+    kind: str
+    """"command" or "state"."""
+    unit: str
+    available: bool
+    claimed: bool
+    """A command interface is claimed while a source drives."""
+
+
+class Interfaces(Message, frozen=True):
+    """The command and state interfaces of the base."""
+
+    interfaces: list[HardwareInterface]
+
+
+class TopicInfo(Message, frozen=True):
+    """One row of the topic table."""
+
+    key: str
+    direction: str
+    type: str
+    rate: str
+    note: str
+
+
+class Topics(Message, frozen=True):
+    """The topic table of this daemon, with its full keys."""
+
+    topics: list[TopicInfo]
+
+
+MESSAGES: dict[str, type[Message]] = {
+    cls.__name__: cls
+    for cls in (
+        Odometry,
+        TFMessage,
+        JointState,
+        Twist,
+        TwistStamped,
+        RobotState,
+        DiagnosticArray,
+        ServiceReply,
+        SetPose,
+        Info,
+        Interfaces,
+        Topics,
+    )
+}
+"""Every type that crosses the bus by itself, by name: what `schema/<Type>` answers for."""

@@ -1,0 +1,80 @@
+"""**The** table: every key below `acsard/<id>/`, its direction, type, rate and meaning.
+
+The bus declares from it, the command line and the README list it, `topics` answers with it. A key
+that is not here does not exist.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from msgspec import Struct
+
+from acsard.values import Verb
+
+ROOT = "acsard"
+
+Direction = Literal["out", "in", "query"]
+
+
+class Topic(Struct, frozen=True):
+    """One row. `key` may hold `<source>` or `<Type>` where a name goes."""
+
+    key: str
+    direction: Direction
+    type: str
+    rate: str
+    note: str
+    latched: bool = False
+
+    @property
+    def pattern(self) -> str:
+        """The key with each placeholder as a Zenoh wildcard."""
+        return self.key.replace("<source>", "*").replace("<Type>", "*")
+
+
+SERVICES: tuple[str, ...] = get_args(Verb)
+
+_SERVICE_NOTES = {
+    "stop": "stop and stay stopped until clear",
+    "clear": "release a stop or a fault",
+    "activate": "switch on; commands count",
+    "deactivate": "switch off; ramps to zero, commands do not count",
+    "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
+    "set_pose": "the pose becomes the payload {x, y, yaw}",
+}
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("odom", "out", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
+    Topic("tf", "out", "TFMessage", "with odom", "transform odom -> base"),
+    Topic("tf_static", "out", "TFMessage", "latched", "transform base -> lidar", latched=True),
+    Topic("wheel_states", "out", "JointState", "every feedback", "wheel angles and speeds"),
+    Topic("cmd_vel_out", "out", "TwistStamped", "every command", "the twist applied after limits"),
+    Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
+    Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
+    Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
+    Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
+    Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
+    *(Topic(f"srv/{s}", "query", "ServiceReply", "", _SERVICE_NOTES[s]) for s in SERVICES),
+    Topic("info", "query", "Info", "", "who is this daemon"),
+    Topic("config", "query", "configuration", "", "the configuration in force"),
+    Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
+    Topic("topics", "query", "Topics", "", "this table"),
+    Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a type"),
+    Topic("alive", "out", "liveliness token", "", "present while the daemon runs"),
+)
+
+PUBLISHED: tuple[Topic, ...] = tuple(
+    topic for topic in TOPICS if topic.direction == "out" and topic.key != "alive"
+)
+"""The topics with a payload; each also answers queries with its last value."""
+
+
+def full_key(robot_id: str, key: str) -> str:
+    """The key on the bus."""
+    return f"{ROOT}/{robot_id}/{key}"
+
+
+def by_key(key: str) -> Topic | None:
+    """The row of this key as written in the table, or None."""
+    return next((topic for topic in TOPICS if topic.key == key), None)

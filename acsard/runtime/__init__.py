@@ -1,0 +1,1 @@
+"""The shells: clock, period, serial port, Zenoh bus, logs, the loop that joins them."""

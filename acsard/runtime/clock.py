@@ -1,0 +1,12 @@
+"""The only place that reads a clock."""
+
+from __future__ import annotations
+
+import time
+
+from acsard.values import Instant
+
+
+def now() -> Instant:
+    """Both clocks, read together."""
+    return Instant(time.monotonic_ns(), time.time_ns())

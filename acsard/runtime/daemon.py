@@ -1,0 +1,154 @@
+"""The daemon from start to end; reads top to bottom.
+
+Entering order is simulator, port, bus; leaving in reverse is the shutdown: ramp to zero, STOP,
+port closed, bus closed. A bug in any task ends the process the same way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+
+from acsard import __version__
+from acsard.mcu.frames import Codec
+from acsard.messages.schema import Info
+from acsard.runtime import clock
+from acsard.runtime.control_loop import ControlLoop
+from acsard.runtime.logs import Log
+from acsard.runtime.serial_port import SerialPort
+from acsard.runtime.sim_pty import SimPty
+from acsard.runtime.ticker import Ticker
+from acsard.runtime.zenoh_bus import ZenohBus
+from acsard.runtime.zenoh_session import log_from_environment
+from acsard.settings import Config
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import NS_PER_S
+
+EXIT_RAMP_S = 0.6
+"""Bound on the ramp to zero on the way down; then STOP whatever the speed."""
+
+LATCHED_PERIOD_S = 5.0
+"""How often latched messages are sent again, for subscribers that cannot ask for history."""
+
+SIMULATOR = "sim"
+
+
+class _Wakeup:
+    """Wakes the control task; many calls before it runs are one."""
+
+    def __init__(self) -> None:
+        self._event = asyncio.Event()
+
+    def __call__(self) -> None:
+        self._event.set()
+
+    async def wait(self) -> None:
+        """Until somebody calls."""
+        await self._event.wait()
+        self._event.clear()
+
+
+class _Departure:
+    """Signals -> the way down: the first begins it, a second cuts the ramp."""
+
+    def __init__(self, log: Log, wake: Callable[[], None]) -> None:
+        self._log, self._wake = log, wake
+        self.begun_ns: int | None = None
+        self.hurried = False
+
+    def watch(self) -> None:
+        """Take over SIGTERM and SIGINT."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._signal, number)
+
+    def _signal(self, number: signal.Signals) -> None:
+        self.hurried = self.begun_ns is not None
+        if self.begun_ns is None:
+            self.begun_ns = clock.now().mono_ns
+        self._log.info("signal", signal=number.name, hurried=self.hurried)
+        self._wake()
+
+    def over(self, now_ns: int, at_rest: bool) -> bool:
+        """The ramp has ended, been cut, or had its time."""
+        if self.begun_ns is None:
+            return False
+        return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
+
+
+async def run(config: Config, log: Log, announce: Callable[[str], None]) -> None:
+    """Run until a signal; raises `ExitError` when it cannot start.
+
+    `announce` is called once with the serial device when everything is up.
+    """
+    wake = _Wakeup()
+    departure = _Departure(log, wake)
+    departure.watch()
+    log_from_environment()
+    async with AsyncExitStack() as stack:
+        path = config.mcu.port
+        if path == SIMULATOR:
+            mcu = FakeMcu(config, clock.now().mono_ns)
+            path = stack.enter_context(SimPty(mcu)).path
+        sources = tuple(source.name for source in config.commands.sources)
+        bus = ZenohBus(config.bus, config.robot.id, sources)
+        port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
+        # The bus first: an id or address in use must end us before the first byte to the MCU.
+        await stack.enter_async_context(bus)
+        await stack.enter_async_context(port)
+        control = ControlLoop(config, _info(config, path), port, bus, clock.now(), log.event)
+        announce(path)
+        async with asyncio.TaskGroup() as tasks:
+            helpers = [
+                tasks.create_task(port.keep_open()),
+                tasks.create_task(_repeat_latched(bus, control)),
+            ]
+            await _control(config, control, departure, wake)
+            for helper in helpers:
+                helper.cancel()
+
+
+async def _control(
+    config: Config, control: ControlLoop, departure: _Departure, wake: _Wakeup
+) -> None:
+    """The control task: a step every period, and one for feedback in hand."""
+    gc.collect()
+    gc.freeze()  # what lives now lives to the end; later collections need not look at it
+    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
+        ticker.start(clock.now().mono_ns)
+        while True:
+            await wake.wait()
+            now = clock.now()
+            period = ticker.take()
+            control.leaving = departure.begun_ns is not None
+            late_ns = now.mono_ns - period.due_ns
+            control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
+            if departure.over(now.mono_ns, control.at_rest):
+                return
+
+
+async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:
+    while True:
+        bus.publish("tf_static", control.report.tf_static())
+        await asyncio.sleep(LATCHED_PERIOD_S)
+
+
+def _stop_line(config: Config) -> bytes:
+    return Codec(config.mcu.wheels, config.mcu.trailing_comma).stop
+
+
+def _info(config: Config, path: str) -> Info:
+    return Info(
+        id=config.robot.id,
+        version=__version__,
+        pid=os.getpid(),
+        port=path,
+        simulated=config.mcu.port == SIMULATOR,
+        rate=config.rate_hz,
+        listen=list(config.bus.listen),
+        connect=list(config.bus.connect),
+    )

@@ -1,0 +1,26 @@
+"""Why acsard ends, as exit codes after sysexits.h, and the error that carries one."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from acsard.values import AcsardError
+
+
+class Exit(IntEnum):
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    NO_PORT = 66
+    UNREACHABLE = 69
+    IN_USE = 75
+    NO_PERMISSION = 77
+    BAD_CONFIG = 78
+
+
+class ExitError(AcsardError):
+    """Ends the program with `code`; the text says what was wrong and what to do."""
+
+    def __init__(self, code: Exit, text: str) -> None:
+        super().__init__(text)
+        self.code = code

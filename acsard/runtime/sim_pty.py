@@ -1,0 +1,74 @@
+"""The fake MCU behind a real pty, paced by the real clock, so that the real serial code is used."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import pty
+import tty
+from types import TracebackType
+
+from acsard.runtime import clock
+from acsard.runtime.timerfd import TimerFd
+from acsard.sim.fake_mcu import FakeMcu
+
+
+class SimPty:
+    """Enter it to get a serial device at `path` with the fake MCU at its other end."""
+
+    def __init__(self, mcu: FakeMcu) -> None:
+        self.mcu = mcu
+        self.path = ""
+        self._master = self._slave = -1
+        self._timer = TimerFd()
+
+    def __enter__(self) -> SimPty:
+        self._master, self._slave = pty.openpty()
+        # Held open here, or the master would see a hang-up whenever no host is connected.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._master, self._read)
+        loop.add_reader(self._timer.fileno(), self._advance)
+        self._arm()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._master)
+        loop.remove_reader(self._timer.fileno())
+        self._timer.close()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def _read(self) -> None:
+        try:
+            data = os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return
+            raise
+        self.mcu.receive(clock.now().mono_ns, data)
+        self._arm()
+
+    def _advance(self) -> None:
+        self._timer.expirations()
+        data = self.mcu.advance(clock.now().mono_ns)
+        if data:
+            try:
+                os.write(self._master, data)
+            except BlockingIOError:
+                pass  # nobody reads; a real wire would lose the bytes too
+        self._arm()
+
+    def _arm(self) -> None:
+        due_ns = self.mcu.next_ns()
+        if due_ns is not None:
+            self._timer.set(due_ns)

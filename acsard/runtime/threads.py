@@ -1,0 +1,55 @@
+"""Blocking calls off the event loop, bounded in time.
+
+Daemon threads of our own instead of the default executor: a call that never returns (a driver
+that hangs in close, a router that does not answer) must not keep the process from ending.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+async def in_thread(
+    call: Callable[[], T], timeout: float, late: Callable[[T], None] | None = None
+) -> T:
+    """The result of `call`, or `TimeoutError` after `timeout` s.
+
+    `late` gets (in the thread) a result that nobody waits for any more, to give it back.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+    lock = threading.Lock()
+    abandoned = False
+
+    def settle(result: T | None, error: BaseException | None) -> None:
+        if future.done():
+            return
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]
+
+    def work() -> None:
+        result, problem = None, None
+        try:
+            result = call()
+        except BaseException as error:  # noqa: BLE001 - carried to the caller, whatever it is
+            problem = error
+        with lock:
+            if not abandoned:
+                loop.call_soon_threadsafe(settle, result, problem)
+                return
+        if problem is None and late is not None:
+            late(result)  # type: ignore[arg-type]
+
+    threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True).start()
+    try:
+        return await asyncio.wait_for(future, timeout)
+    finally:
+        with lock:
+            abandoned = not future.done() or future.cancelled()

@@ -1,0 +1,62 @@
+"""A kernel timer the event loop can wait on, precise where asyncio's own rounds to milliseconds.
+
+asyncio on epoll rounds every wait up; a timerfd wakes it on time and counts what was missed.
+Python has the calls from 3.13 on; the C library's serve every version.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import sys
+from typing import Final
+
+from acsard.values import NS_PER_S
+
+CLOCK_MONOTONIC: Final = 1
+_ABSTIME: Final = 1
+_FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = [("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long)]
+
+
+class _Itimerspec(ctypes.Structure):
+    _fields_ = [("it_interval", _Timespec), ("it_value", _Timespec)]
+
+
+class TimerFd:
+    """One timer on the monotonic clock; `fileno` becomes readable when it expires."""
+
+    def __init__(self) -> None:
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._fd = self._libc.timerfd_create(CLOCK_MONOTONIC, _FLAGS)
+        if self._fd < 0:
+            raise OSError(ctypes.get_errno(), "timerfd_create failed")
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return int(self._fd)
+
+    def set(self, at_ns: int, period_ns: int = 0) -> None:
+        """Expire at monotonic `at_ns`, then every `period_ns` if that is not 0."""
+        spec = _Itimerspec(
+            _Timespec(*divmod(period_ns, NS_PER_S)), _Timespec(*divmod(max(1, at_ns), NS_PER_S))
+        )
+        if self._libc.timerfd_settime(self._fd, _ABSTIME, ctypes.byref(spec), None) < 0:
+            raise OSError(ctypes.get_errno(), "timerfd_settime failed")
+
+    def expirations(self) -> int:
+        """How often it expired since the last call; 0 when it has not."""
+        try:
+            return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EINTR):
+                return 0
+            raise
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        os.close(self._fd)

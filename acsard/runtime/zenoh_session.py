@@ -1,0 +1,119 @@
+"""Zenoh sessions as acsard opens them: the daemon's, and the tools' clients.
+
+What lives here: the session settings with the reason for each. What must not: keys or messages.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+
+import zenoh
+
+from acsard.messages.topics import full_key
+from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import BusConfig
+
+COMMAND_RATE_HZ = 1000.0
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
+
+MESSAGE_BYTES = 65536
+"""Largest message taken from a link; commands are held to far less in code."""
+
+
+def daemon_session(bus: BusConfig, robot_id: str, sources: tuple[str, ...]) -> zenoh.Session:
+    """The daemon's session: a peer that listens where it is told, finds nobody by itself.
+
+    Raises `ExitError` when the address is taken. Blocks; call it in a thread.
+    """
+    settings = _base("peer") | {
+        "listen/endpoints": list(bus.listen),
+        "connect/endpoints": list(bus.connect),
+        # Peers behind a router find each other by gossip only; without a router there is nobody.
+        "scouting/gossip/enabled": bool(bus.connect),
+        "timestamping/enabled": True,
+        # A stopped subscriber must not hold a put: by default each waits 1 ms for room.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+        "transport/link/rx/max_message_size": MESSAGE_BYTES,
+        "transport/unicast/accept_timeout": 1000,
+        "transport/unicast/accept_pending": 32,
+        "transport/unicast/max_sessions": 32,
+        "transport/link/tx/lease": 2000,
+        "queries_default_timeout": 3000,
+        "downsampling": [_command_limits(robot_id, sources)],
+    }
+    if bus.connect:
+        settings |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        where = ", ".join(bus.listen)
+        raise ExitError(
+            Exit.IN_USE,
+            f"cannot listen on {where}: {_first_line(error)}; another daemon or router may have "
+            "it: stop that, or give this one its own bus.listen",
+        ) from error
+
+
+def client_session(endpoint: str) -> zenoh.Session:
+    """A client of the daemon (or a router) at `endpoint`; raises `ExitError` when nobody answers.
+
+    A client, because peers behind one hub do not reach each other.
+    """
+    settings = _base("client") | {
+        "connect/endpoints": [endpoint],
+        "timestamping/enabled": True,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+    }
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        raise ExitError(
+            Exit.UNREACHABLE,
+            f"no daemon answers at {endpoint} ({_first_line(error)}); "
+            "is `acsard run` running, and is this its bus.listen?",
+        ) from error
+
+
+def _base(mode: str) -> dict[str, object]:
+    return {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        # Its parts cannot be set alone. Without it a router that comes back waits seconds for us.
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 1.5,
+        },
+    }
+
+
+def _command_limits(robot_id: str, sources: tuple[str, ...]) -> dict[str, object]:
+    """A limit per listed source, so that none uses up another's; one more for all unlisted."""
+    names = [*sources, "*"]
+    keys = [full_key(robot_id, f"{kind}/{n}") for kind in ("cmd", "wheel_cmd") for n in names]
+    return {
+        "id": "commands",
+        "messages": ["put", "delete"],
+        "flows": ["ingress"],
+        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
+    }
+
+
+def _config(settings: dict[str, object]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+
+
+def log_from_environment() -> None:
+    """Zenoh's own log, only when RUST_LOG asks for it: it goes to standard output."""
+    if "RUST_LOG" in os.environ:
+        zenoh.try_init_log_from_env()

@@ -1,0 +1,1 @@
+"""The simulated robot, pure: a vehicle and the microcontroller that runs it."""

@@ -1,0 +1,54 @@
+"""Four motors with lag on a base that moves: what the encoders and the floor would see.
+
+Motors follow their set points as first-order systems. The base moves by the wheels' real speeds;
+`turn_slip` makes skidding wheels turn it less than they roll, `load` makes the motors give less
+than they are asked. Motor order is the MCU's a, b, c, d: front right, front left, rear left,
+rear right.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.drive.odometry import arc
+from acsard.settings import DriveConfig, SimConfig
+from acsard.values import Pose
+
+
+class Vehicle:
+    """The true state: speeds rad/s, angles rad, pose m and rad."""
+
+    def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
+        self._lag = sim.motor_time_constant
+        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
+        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
+        self._track = drive.wheel_separation * drive.wheel_separation_multiplier
+        self.set_points = [0.0] * 4
+        self.speeds = [0.0] * 4
+        self.angles = [0.0] * 4
+        self.pose = Pose()
+        self.turn_slip = 0.0
+        """Share of every turn that is lost to skidding, 0 to 1."""
+        self.load = 0.0
+        """Share of every set point the motors fall short by, 0 to 1."""
+
+    def advance(self, dt: float) -> None:
+        """Let `dt` s pass under the present set points."""
+        if dt <= 0.0:
+            return
+        if not (any(self.set_points) or any(self.speeds)):
+            return
+        rest = math.exp(-dt / self._lag) if self._lag else 0.0
+        turned = [0.0] * 4
+        for i in range(4):
+            goal = self.set_points[i] * (1.0 - self.load)
+            error = self.speeds[i] - goal
+            # The integral of an exponential approach, so that any dt gives the same path.
+            turned[i] = goal * dt + error * self._lag * (1.0 - rest)
+            speed = goal + error * rest
+            self.speeds[i] = speed if abs(speed) > 1e-9 else 0.0
+            self.angles[i] += turned[i]
+        left = self._left_radius * (turned[1] + turned[2]) / 2
+        right = self._right_radius * (turned[0] + turned[3]) / 2
+        turn = (right - left) / self._track * (1.0 - self.turn_slip)
+        self.pose = arc(self.pose, (left + right) / 2, turn)

@@ -1,0 +1,209 @@
+"""The nouns of acsard, in SI units; every other module speaks in these.
+
+What lives here: frozen values without behaviour beyond simple arithmetic on themselves.
+What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere in the host.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import Struct
+
+WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
+"""The order of every four-wheel value, index 0 to 3."""
+
+NS_PER_S = 1_000_000_000
+
+
+class AcsardError(Exception):
+    """Base of the errors acsard raises on purpose; anything else that is raised is a bug."""
+
+
+class Instant(Struct, frozen=True):
+    """One reading of both clocks: ages and periods use `mono_ns`, published stamps `wall_ns`."""
+
+    mono_ns: int
+    wall_ns: int
+
+
+class Twist(Struct, frozen=True):
+    """Velocity of base_link in base_link: `linear` m/s along x, `angular` rad/s, left is +."""
+
+    linear: float = 0.0
+    angular: float = 0.0
+
+
+class Pose(Struct, frozen=True):
+    """Planar pose of base_link in odom: `x`, `y` in m, `yaw` in rad within [-pi, pi]."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+
+
+class WheelSpeeds(Struct, frozen=True):
+    """Angular velocity of each wheel in rad/s, positive when it drives the robot forward."""
+
+    front_right: float = 0.0
+    front_left: float = 0.0
+    rear_left: float = 0.0
+    rear_right: float = 0.0
+
+    def as_tuple(self) -> tuple[float, float, float, float]:
+        """The four speeds in `WHEELS` order."""
+        return self.front_right, self.front_left, self.rear_left, self.rear_right
+
+
+REST = Twist()
+STILL = WheelSpeeds()
+
+
+class PoseCovariance(Struct, frozen=True):
+    """Upper triangle of the covariance of (x, y, yaw) in odom: m2, m rad and rad2."""
+
+    xx: float
+    xy: float
+    xyaw: float
+    yy: float
+    yyaw: float
+    yawyaw: float
+
+
+class Received(Struct, frozen=True):
+    """Bytes as one read of the serial port gave them, and when."""
+
+    at: Instant
+    data: bytes
+
+
+class Command(Struct, frozen=True):
+    """A velocity wish of one commander.
+
+    `arrived_ns` is the monotonic time of arrival and alone decides the age. `stamp_ns` is the
+    sender's own wall clock, if it gave one; `sender` tells whose clock that is.
+    """
+
+    source: str
+    twist: Twist
+    arrived_ns: int
+    stamp_ns: int | None = None
+    sender: str = ""
+
+
+Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose"]
+
+
+class Request(Struct, frozen=True):
+    """A service call or a stop; `id` finds the caller again, 0 when nobody waits for an answer."""
+
+    verb: Verb
+    id: int = 0
+    pose: Pose | None = None
+
+
+class Answer(Struct, frozen=True):
+    """What became of the `Request` with the same `id`."""
+
+    id: int
+    success: bool
+    message: str
+
+
+class Event(Struct, frozen=True):
+    """Something worth a log line: `name` is from a closed set, `text` is for people."""
+
+    name: str
+    text: str
+    level: Literal["info", "warning", "error"] = "info"
+
+
+class Sample(Struct, frozen=True):
+    """One feedback line folded into odometry; all its parts share the stamp `at`."""
+
+    at: Instant
+    pose: Pose
+    twist: Twist
+    covariance: PoseCovariance
+    positions: tuple[float, float, float, float]
+    """Wheel angles in rad since start, continuous, in `WHEELS` order."""
+    speeds: WheelSpeeds
+
+
+class SourceStatus(Struct, frozen=True):
+    """What one commander is doing: `age_s` since its last accepted command, None if never heard."""
+
+    name: str
+    priority: int
+    age_s: float | None
+    waits_for: str
+
+
+class Inputs(Struct, frozen=True):
+    """Everything one step may know.
+
+    `tick` says that a line may go out with this step; without it only feedback is folded.
+    `opened` counts how often the port has been opened: a new number is a new session with the MCU.
+    """
+
+    now: Instant
+    tick: bool
+    port_open: bool
+    opened: int = 0
+    received: tuple[Received, ...] = ()
+    commands: tuple[Command, ...] = ()
+    requests: tuple[Request, ...] = ()
+    rejects: tuple[str, ...] = ()
+    """Reasons of the bus messages refused before they became a `Command`."""
+    guard_trip: str = ""
+    """Why the guard replaced the previous line with STOP; latches a fault."""
+    superseded: bool = False
+    """The line of the previous tick did not go out: what it said never happened."""
+    leaving: bool = False
+    """The daemon is going down: ramp to zero and stay there."""
+
+
+class Outputs(Struct, frozen=True):
+    """Everything one step decided."""
+
+    now: Instant
+    tick: bool
+    line: bytes | None
+    """The line for the MCU, or None when none is due."""
+    speeds: WheelSpeeds
+    applied: Twist
+    grow_allowed: bool
+    """A fresh command, a live link and mode DRIVING agreed in this step (invariant 2)."""
+    linked: bool
+    samples: tuple[Sample, ...]
+    mode: str
+    reason: str
+    """Why it moves or does not, in words."""
+    link: str
+    source: str
+    """Whose command counts, "" when nobody's does."""
+    status_changed: bool
+    """One of the four above differs from the step before."""
+    events: tuple[Event, ...] = ()
+    answers: tuple[Answer, ...] = ()
+
+
+class Spread(Struct, frozen=True):
+    """Median, 99th percentile and maximum of `count` measurements, in one unit."""
+
+    count: int = 0
+    p50: float = 0.0
+    p99: float = 0.0
+    max: float = 0.0
+
+
+class Snapshot(Struct, frozen=True):
+    """What `state` and `diagnostics` show beyond one step's outputs."""
+
+    pose: Pose
+    measured: Twist
+    speeds: WheelSpeeds
+    sources: tuple[SourceStatus, ...]
+    counters: dict[str, int]
+    lateness_us: Spread
+    """How late the control periods began, us."""

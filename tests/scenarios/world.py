@@ -1,0 +1,233 @@
+"""The whole daemon in virtual time: control loop, fake MCU and an in-memory bus, no real clock.
+
+`World.run` jumps from one thing that happens to the next, so an hour costs seconds. The port here
+applies the same gate as the real one; the wire's pace is the fake MCU's.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import msgspec
+
+from acsard.mcu.wire import LineGate
+from acsard.messages.encodings import encode
+from acsard.messages.incoming import Arrival
+from acsard.messages.queries import Query, Reply
+from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
+from acsard.messages.topics import PUBLISHED
+from acsard.runtime.control_loop import BusInput, ControlLoop, Offered
+from acsard.settings import Config
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
+
+START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
+
+
+class VirtualPort:
+    """A serial port to the fake MCU that can be unplugged and blocked."""
+
+    def __init__(self, baud_rate: int) -> None:
+        self.is_open = False
+        self.opened = 0
+        self.blocked = False
+        self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
+        self.mcu: FakeMcu | None = None
+        self._baud_rate = baud_rate
+        self._gate = LineGate(baud_rate)
+        self._received: list[Received] = []
+
+    def plug(self, mcu: FakeMcu) -> None:
+        self.mcu, self.is_open = mcu, True
+        self.opened += 1
+        self._gate = LineGate(self._baud_rate)
+
+    def unplug(self) -> None:
+        self.mcu, self.is_open = None, False
+        self._received.clear()
+
+    def feed(self, received: Received) -> None:
+        self._received.append(received)
+
+    def take(self) -> tuple[Received, ...]:
+        got = tuple(self._received)
+        self._received.clear()
+        return got
+
+    def offer(self, line: bytes, now: Instant) -> Offered:
+        if self.mcu is None:
+            return "down"
+        if self.blocked or not self._gate.may_send(now.mono_ns, 0):
+            return "superseded"
+        data = self._gate.prefix + line
+        self.mcu.receive(now.mono_ns, data)
+        self._gate.note_sent(now.mono_ns, len(data), len(data))
+        self.sent.append((now.mono_ns, line))
+        return "sent"
+
+
+class MemoryBus:
+    """Collects what is published; hands in what the test sends."""
+
+    def __init__(self) -> None:
+        self.wanted = {topic.key for topic in PUBLISHED if not topic.latched}
+        self.published: dict[str, deque[Message]] = {}
+        self.replies: dict[int, list[Reply]] = {}
+        self.finished: set[int] = set()
+        self.arrivals: list[Arrival] = []
+        self.queries: list[Query] = []
+
+    def take(self, queries: int) -> BusInput:
+        got = BusInput(tuple(self.arrivals), tuple(self.queries[:queries]))
+        self.arrivals.clear()
+        del self.queries[:queries]
+        return got
+
+    def publish(self, key: str, message: Message) -> None:
+        self.published.setdefault(key, deque(maxlen=100_000)).append(message)
+
+    def reply(self, reply: Reply) -> None:
+        self.replies.setdefault(reply.number, []).append(reply)
+
+    def done(self, number: int) -> None:
+        self.finished.add(number)
+
+
+class World:
+    """A robot on a bench that exists only in numbers."""
+
+    def __init__(self, config: Config | None = None, *, plugged: bool = True) -> None:
+        self.config = config or Config()
+        self.now_ns = START.mono_ns
+        self.wall_offset_ns = START.wall_ns - START.mono_ns
+        self.period_ns = int(NS_PER_S / self.config.rate_hz)
+        self.next_tick_ns = self.now_ns
+        self.mcu = FakeMcu(self.config, self.now_ns)
+        self.port = VirtualPort(self.config.mcu.baud_rate)
+        if plugged:
+            self.port.plug(self.mcu)
+        self.bus = MemoryBus()
+        self.events: list[Event] = []
+        self.outputs: list[Outputs] = []
+        self.watch: Callable[[Outputs], None] = lambda outputs: None
+        info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
+        self.loop = ControlLoop(
+            self.config, info, self.port, self.bus, self.instant, self.events.append
+        )
+        self._queries = 0
+
+    @property
+    def instant(self) -> Instant:
+        return Instant(self.now_ns, self.now_ns + self.wall_offset_ns)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass: bytes arrive when they do, a tick comes every period."""
+        end_ns = self.now_ns + int(seconds * NS_PER_S)
+        while True:
+            mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
+            tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
+            at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
+            if at_ns > end_ns:
+                self.now_ns = end_ns
+                return
+            self.now_ns = at_ns
+            if tick:
+                self.next_tick_ns += self.period_ns
+                self._wake(tick=True)
+            elif self.port.mcu is not None:
+                data = self.port.mcu.advance(at_ns)
+                if data:
+                    self.port.feed(Received(self.instant, data))
+                    self._wake(tick=False)
+
+    def stall(self, seconds: float) -> None:
+        """The loop does not run, the world goes on."""
+        self.now_ns += int(seconds * NS_PER_S)
+        if self.port.mcu is not None:
+            data = self.port.mcu.advance(self.now_ns)
+            if data:
+                self.port.feed(Received(self.instant, data))
+        missed, self.next_tick_ns = divmod(self.now_ns - self.next_tick_ns, self.period_ns)
+        self.next_tick_ns = self.now_ns
+
+    def _wake(self, tick: bool) -> None:
+        outputs = self.loop.wake(self.instant, tick)
+        self.watch(outputs)
+
+    # what people do
+
+    def send(
+        self, linear: float, angular: float = 0.0, source: str = "app", stamp_ns: int | None = None
+    ) -> None:
+        """One Twist as JSON, as any client would put it."""
+        payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
+        self.put(f"cmd/{source}", payload, stamp_ns=stamp_ns)
+
+    def put(self, key: str, payload: bytes, put: bool = True, stamp_ns: int | None = None) -> None:
+        self.bus.arrivals.append(
+            Arrival(key, put, payload, "", self.now_ns, stamp_ns, "peer" if stamp_ns else "")
+        )
+
+    def drive(
+        self,
+        linear: float,
+        angular: float = 0.0,
+        seconds: float = 1.0,
+        source: str = "app",
+        hz: float = 20.0,
+    ) -> None:
+        """Open with a zero, then send the twist at `hz` for so long."""
+        self.send(0.0, 0.0, source)
+        self.run(1 / hz)
+        self.hold(linear, angular, seconds, source, hz)
+
+    def hold(
+        self,
+        linear: float,
+        angular: float = 0.0,
+        seconds: float = 1.0,
+        source: str = "app",
+        hz: float = 20.0,
+    ) -> None:
+        """Send the twist at `hz` for so long, without a zero first."""
+        for _ in range(round(seconds * hz)):
+            self.send(linear, angular, source)
+            self.run(1 / hz)
+
+    def ask(
+        self, key: str, asked: str | None = None, fmt: str = "", payload: bytes = b""
+    ) -> list[Reply]:
+        """The replies to a query after one period."""
+        self._queries += 1
+        query = Query(self._queries, key, key if asked is None else asked, fmt, payload, "")
+        self.bus.queries.append(query)
+        self.run(2 / self.config.rate_hz)
+        return self.bus.replies.get(query.number, [])
+
+    def call(self, service: str, payload: bytes = b"") -> ServiceReply:
+        """A service's answer."""
+        (reply,) = self.ask(f"srv/{service}", payload=payload)
+        return msgspec.json.decode(reply.payload, type=ServiceReply)
+
+    # what people see
+
+    @property
+    def state(self) -> RobotState:
+        message = self.loop.report.current("state", self.loop._look)
+        assert isinstance(message, RobotState)
+        return message
+
+    @property
+    def odom(self) -> Odometry:
+        message = self.bus.published["odom"][-1]
+        assert isinstance(message, Odometry)
+        return message
+
+    def lines(self) -> list[bytes]:
+        """The lines the MCU heard, oldest first, bare line ends left out."""
+        return [line for _, line in self.mcu.heard if line != b"\r\n"]
+
+
+def json(message: Message) -> bytes:
+    return encode(message, "json")
