@@ -1,3 +1,38 @@
-"""acsard: the hardware interface daemon of a four-wheel differential-drive robot."""
+"""acsard: the hardware interface daemon of a four-wheel differential-drive robot.
+
+One process, one asyncio event loop: a serial microcontroller below, a Zenoh bus above, a control
+step every 10 ms between.
+
+            one task, every 10 ms (earlier when feedback is in hand)
+
+ serial -> received bytes ---+                          +-> report -> encode -> bus
+                             +-> robot.step(inputs) ----+
+ bus -> decode -> commands --+         (pure)           +-> line -> guard -> serial
+
+Inside `Robot.step`, top to bottom: fold the feedback into odometry, choose one command, gate by
+mode, limit, invert the kinematics, report. Nothing else decides anything.
+
+Where to look, in the order the modules may import each other:
+
+    values.py         the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
+    settings.py       the keys of acsard.toml; validation.py, config.py: file -> Config, or why not
+    mcu/              wire time, lines, frames (the protocol), session (is the MCU there?)
+    drive/            kinematics, odometry, arbiter (who commands?), limits, modes (the table)
+    messages/         schema (the published structs), topics (**the** key table), encodings,
+                      incoming (sample -> command), report (outputs -> messages), queries
+    robot.py          the order; guard.py: the last look at every outgoing line
+    sim/              the vehicle and the fake microcontroller
+    runtime/          clock, ticker, serial port, Zenoh bus, logs, control loop, daemon
+    client.py         drive and follow a robot from Python
+    cli/              one verb per file
+
+Three invariants, each tested:
+
+1. Only runtime/, cli/ and client.py do I/O; only runtime/clock.py reads a clock for the daemon.
+2. No wheel speed grows unless a fresh command, a live link and mode driving agree in the same
+   step; otherwise it only falls, and without a link the command is zero at once. The guard checks
+   exactly this, with code of its own.
+3. No line is held back to be sent later: one that cannot go now is superseded by the next.
+"""
 
 __version__ = "0.1.0"

@@ -78,7 +78,7 @@ class Client:
         return Decoder(schema.ServiceReply).decode(*replies[0])
 
     def get(self, name: str) -> Any:
-        """The last value of a published key as its typed message, or of `info`, `topics`, …"""
+        """The last value of a published key as its typed message, or of `info`, `config`, …"""
         encoding, payload = self._ask(name)[0]
         return _decoder(name).decode(encoding, payload)
 
@@ -237,8 +237,7 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
 
 
 def _decoder(name: str) -> Decoder[Any]:
+    """The decoder of a key's type; plain dictionaries where it has none (config, schema/…)."""
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)
-    if cls is None:
-        raise ExitError(Exit.USAGE, f"{name} is not a typed key; `acsard topics` lists them")
-    return Decoder(cls)
+    return Decoder(cls or dict)

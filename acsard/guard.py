@@ -9,6 +9,7 @@ latches a fault.
 
 from __future__ import annotations
 
+from acsard.settings import Source
 from acsard.values import Outputs
 
 _ZERO = (0, 0, 0, 0)
@@ -17,10 +18,11 @@ _ZERO = (0, 0, 0, 0)
 class Guard:
     """Passes a line on or replaces it with `stop`; `trip` says why it did."""
 
-    def __init__(self, stop: bytes, wheel_speed: float) -> None:
+    def __init__(self, stop: bytes, wheel_speed: float, sources: tuple[Source, ...]) -> None:
         self._stop = stop
         self._length = len(stop)
         self._most = int(wheel_speed * 100 + 1)
+        self._timeouts = {source.name: source.timeout * 1e9 for source in sources}
         self._sent = _ZERO
         self._passed = _ZERO
         self.trip = ""
@@ -53,12 +55,20 @@ class Guard:
             return "a wheel is over limits.wheel_speed"
         if not outputs.linked:
             return "it moves a wheel without a link"
-        if not outputs.grow_allowed and any(
+        grows = any(
             abs(new) > abs(old) or new * old < 0
             for new, old in zip(wheels, self._sent, strict=True)
-        ):
+        )
+        if grows and not self._commanded(outputs):
             return "a wheel grows without a fresh command in mode driving"
         return ""
+
+    def _commanded(self, outputs: Outputs) -> bool:
+        timeout, arrived = self._timeouts.get(outputs.source), outputs.command_ns
+        if outputs.mode != "driving" or timeout is None or arrived is None:
+            return False
+        # A command may arrive on Zenoh's thread just after this step's clock was read.
+        return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _read(self, line: bytes) -> tuple[int, int, int, int] | None:
         """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""

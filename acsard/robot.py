@@ -54,6 +54,7 @@ class Robot:
         self._mode = Mode.INACTIVE
         self._latch = ""
         self._choice = Choice("", None, "")
+        self._speeds = STILL
         self._limited_ns = 0
         self._before = (self._limiter.state, 0)
         """The limiter and its time before the last line: restored when that line did not go."""
@@ -93,15 +94,15 @@ class Robot:
             now=inputs.now,
             tick=inputs.tick,
             line=line,
-            speeds=self._kinematics.wheel_speeds(applied),
+            speeds=self._speeds,
             applied=applied,
-            grow_allowed=self._may_grow(),
             linked=self.session.link == "up",
             samples=samples,
             mode=status[0],
             reason=status[1],
             link=status[2],
             source=status[3],
+            command_ns=self._choice.arrived_ns,
             status_changed=changed,
             events=tuple(events),
             answers=answers,
@@ -120,6 +121,7 @@ class Robot:
         if link != "up":
             # Nobody can be ramped at the other end, and what was wished then is old now.
             self._limiter.cut()
+            self._speeds = STILL
             self._fire(Trigger.LINK_LOST)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral()
@@ -219,25 +221,18 @@ class Robot:
             limiter.follow(twist, min(since, MAX_DT))
         else:
             limiter.coast(since, stop=self._mode in (Mode.STOPPED, Mode.FAULT, Mode.LEAVING))
+        self._speeds = self._kinematics.wheel_speeds(limiter.twist)
         return self._line(now_ns)
 
     def _line(self, now_ns: int) -> bytes | None:
         codec = self.session.codec
         if not self.session.silent(now_ns):
             self._line_ns = now_ns
-            speeds = self._kinematics.wheel_speeds(self._limiter.twist)
-            return codec.stop if speeds == STILL else codec.encode(speeds)
+            return codec.stop if self._speeds == STILL else codec.encode(self._speeds)
         if now_ns - self._line_ns < BLIND_PERIOD_NS:
             return None
         self._line_ns = now_ns
         return codec.stop
-
-    def _may_grow(self) -> bool:
-        return (
-            self._mode is Mode.DRIVING
-            and self.session.link == "up"
-            and self._choice.twist is not None
-        )
 
     # report
 

@@ -172,8 +172,6 @@ class Outputs(Struct, frozen=True):
     """The line for the MCU, or None when none is due."""
     speeds: WheelSpeeds
     applied: Twist
-    grow_allowed: bool
-    """A fresh command, a live link and mode DRIVING agreed in this step (invariant 2)."""
     linked: bool
     samples: tuple[Sample, ...]
     mode: str
@@ -182,6 +180,8 @@ class Outputs(Struct, frozen=True):
     link: str
     source: str
     """Whose command counts, "" when nobody's does."""
+    command_ns: int | None
+    """When the command that is followed arrived, monotonic; None when none is."""
     status_changed: bool
     """One of the four above differs from the step before."""
     events: tuple[Event, ...] = ()

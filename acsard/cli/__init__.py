@@ -16,8 +16,8 @@ from acsard.runtime.exits import Exit, ExitError
 VERBS = (run, sim, check, topics, echo, hz, drive, call)
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable,
-75 port, bus address or robot id in use, 77 no permission, 78 bad configuration
+exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address
+or robot id in use, 77 no permission, 78 bad configuration
 
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)

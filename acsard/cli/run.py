@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 
 from acsard.cli.common import Overrides, add_config, load
 from acsard.settings import Config
@@ -64,8 +63,11 @@ def main(args: argparse.Namespace) -> int:
 
     def announce(device: str) -> None:
         simulated = config.mcu.port == daemon.SIMULATOR
-        if "INVOCATION_ID" not in os.environ:
-            print(banner(config, where, device, simulated), flush=True)
+        if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
+            try:
+                print(banner(config, where, device, simulated), flush=True)
+            except OSError:
+                pass  # standard output is closed or full; nobody needs the banner there
         log.info(
             "started",
             robot=config.robot.id,
@@ -83,7 +85,6 @@ def main(args: argparse.Namespace) -> int:
     finally:
         log.info("ended")
         log.close()
-        sys.stdout.flush()
     return 0
 
 

@@ -31,6 +31,7 @@ class Choice(Struct, frozen=True):
     source: str
     twist: Twist | None
     reason: str
+    arrived_ns: int | None = None
 
 
 class Freshness:
@@ -129,7 +130,7 @@ class Arbiter:
         name = chosen.settings.name
         if not chosen.armed:
             return Choice(name, None, self._wait(chosen))
-        return Choice(name, chosen.twist, f"commanded by {name}")
+        return Choice(name, chosen.twist, f"commanded by {name}", chosen.arrived_ns)
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
         """What each source is doing and waiting for, highest priority first."""
@@ -137,7 +138,7 @@ class Arbiter:
             SourceStatus(
                 c.settings.name,
                 c.settings.priority,
-                None if c.arrived_ns is None else (now_ns - c.arrived_ns) / NS_PER_S,
+                None if c.arrived_ns is None else max(0, now_ns - c.arrived_ns) / NS_PER_S,
                 self._waits_for(c, now_ns),
             )
             for c in self._ranking

@@ -87,7 +87,9 @@ class ControlLoop:
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
-        self._guard = Guard(self.robot.session.codec.stop, config.limits.wheel_speed)
+        self._guard = Guard(
+            self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
+        )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._port, self._bus, self._log = port, bus, log

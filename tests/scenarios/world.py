@@ -12,7 +12,6 @@ from collections.abc import Callable
 import msgspec
 
 from acsard.mcu.wire import LineGate
-from acsard.messages.encodings import encode
 from acsard.messages.incoming import Arrival
 from acsard.messages.queries import Query, Reply
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
@@ -109,13 +108,14 @@ class World:
             self.port.plug(self.mcu)
         self.bus = MemoryBus()
         self.events: list[Event] = []
-        self.outputs: list[Outputs] = []
         self.watch: Callable[[Outputs], None] = lambda outputs: None
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
         self.loop = ControlLoop(
             self.config, info, self.port, self.bus, self.instant, self.events.append
         )
         self._queries = 0
+        self._missed = 0
+        self._due_ns = self.now_ns
 
     @property
     def instant(self) -> Instant:
@@ -129,10 +129,11 @@ class World:
             tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
             at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
             if at_ns > end_ns:
-                self.now_ns = end_ns
+                self.now_ns = max(self.now_ns, end_ns)
                 return
-            self.now_ns = at_ns
+            self.now_ns = max(self.now_ns, at_ns)
             if tick:
+                self._due_ns = self.next_tick_ns
                 self.next_tick_ns += self.period_ns
                 self._wake(tick=True)
             elif self.port.mcu is not None:
@@ -148,11 +149,13 @@ class World:
             data = self.port.mcu.advance(self.now_ns)
             if data:
                 self.port.feed(Received(self.instant, data))
-        missed, self.next_tick_ns = divmod(self.now_ns - self.next_tick_ns, self.period_ns)
-        self.next_tick_ns = self.now_ns
+        self._missed = max(0, (self.now_ns - self.next_tick_ns) // self.period_ns)
+        self.next_tick_ns += self._missed * self.period_ns
 
     def _wake(self, tick: bool) -> None:
-        outputs = self.loop.wake(self.instant, tick)
+        missed = self._missed if tick else 0
+        self._missed -= missed
+        outputs = self.loop.wake(self.instant, tick, missed, self.now_ns - self._due_ns)
         self.watch(outputs)
 
     # what people do
@@ -227,7 +230,3 @@ class World:
     def lines(self) -> list[bytes]:
         """The lines the MCU heard, oldest first, bare line ends left out."""
         return [line for _, line in self.mcu.heard if line != b"\r\n"]
-
-
-def json(message: Message) -> bytes:
-    return encode(message, "json")

@@ -1,0 +1,242 @@
+"""Who commands, who waits, and what is refused; `state` always says why."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from acsard.settings import CommandsConfig, Config, Source
+from tests.scenarios.world import World
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def test_a_source_that_never_sent_a_zero_does_not_move_the_robot(world: World) -> None:
+    world.hold(0.5, seconds=2.0)
+    assert world.state.x == 0.0
+    assert "neutral first" in world.state.reason
+    assert "app" in world.state.reason
+
+
+def test_a_source_that_paused_for_its_timeout_may_drive(world: World) -> None:
+    world.hold(0.5, seconds=0.5)
+    world.run(0.3)
+    world.hold(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_the_higher_priority_takes_the_robot_and_gives_it_back(world: World) -> None:
+    world.send(0.0, source="nav")
+    world.send(0.0, source="teleop")
+    world.run(0.05)
+    for _ in range(20):
+        world.send(0.2, source="nav")
+        world.send(-0.2, source="teleop")
+        world.run(0.05)
+    assert world.state.source == "teleop"
+    assert world.state.linear < 0
+    waiting = {s.name: s.waits_for for s in world.state.sources}
+    assert "teleop has the higher priority" in waiting["nav"]
+    world.hold(0.2, seconds=1.0, source="nav")
+    assert world.state.source == "nav"
+    assert world.state.linear > 0
+
+
+def test_a_person_who_holds_the_stick_through_a_clear_masks_the_planner(world: World) -> None:
+    world.drive(0.3, seconds=0.5, source="teleop")
+    world.call("stop")
+    world.call("clear")
+    world.send(0.0, source="nav")
+    for _ in range(10):
+        world.send(0.3, source="teleop")
+        world.send(0.3, source="nav")
+        world.run(0.05)
+    assert world.state.source == "teleop"
+    assert world.state.mode == "ready"
+    assert "teleop must send a zero" in world.state.reason
+
+
+def test_at_equal_priority_the_first_keeps_the_robot() -> None:
+    pair = (Source("left", 50), Source("right", 50))
+    world = World(Config(commands=CommandsConfig(sources=pair)))
+    world.run(0.2)
+    world.drive(0.3, seconds=0.2, source="right")
+    world.send(0.0, source="left")
+    for _ in range(10):
+        world.send(-0.3, source="left")
+        world.send(0.3, source="right")
+        world.run(0.05)
+    assert world.state.source == "right"
+    assert "came first" in {s.name: s.waits_for for s in world.state.sources}["left"]
+
+
+def test_a_stop_latches_until_clear_and_then_wants_neutral(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    assert world.call("stop").success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "stopped"
+    assert "srv/clear" in world.state.reason
+    assert world.state.linear == 0.0
+    assert world.call("clear").success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "ready"
+    world.drive(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_a_stop_brakes_harder_than_a_timeout(world: World) -> None:
+    world.drive(0.9, seconds=2.0)
+    world.put("stop", b"")
+    world.run(0.4)
+    assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+
+def test_any_put_on_stop_stops_whatever_it_holds(world: World) -> None:
+    for payload in (b"", b"\x00", b"{}", b"please"):
+        world.put("stop", payload)
+        world.run(0.02)
+        assert world.state.mode == "stopped"
+        world.call("clear")
+
+
+def test_a_delete_on_stop_is_not_a_stop(world: World) -> None:
+    world.put("stop", b"", put=False)
+    world.run(0.02)
+    assert world.state.mode == "ready"
+
+
+def test_a_deactivated_robot_ramps_down_and_ignores_commands(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    assert world.call("deactivate").success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "inactive"
+    assert world.state.linear == 0.0
+
+
+def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) -> None:
+    world.call("deactivate")
+    world.call("stop")
+    world.call("clear")
+    assert world.state.mode == "inactive"
+
+
+@pytest.mark.parametrize(
+    ("key", "payload", "put", "reason"),
+    [
+        ("cmd/app", b"{", True, "malformed"),
+        ("cmd/app", b"hello", True, "unknown_encoding"),
+        ("cmd/app", b"", True, "unknown_encoding"),
+        ("cmd/app", b'{"linear":{"x":0.5}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{"x":"fast"},"angular":{}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{"speed":1},"angular":{}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{},"angular":{}}' + b" " * 5000, True, "too_big"),
+        ("cmd/app", b'{"linear":{"x":0.5},"angular":{}}', False, "not_a_put"),
+        ("cmd/*", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
+        ("**", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
+        ("cmd/stranger", b'{"linear":{"x":0.5},"angular":{}}', True, "unknown_source"),
+        ("wheel_cmd/app", b'{"name":["a"],"velocity":[1]}', True, "wrong_wheels"),
+        (
+            "cmd/app",
+            msgspec.msgpack.encode({"linear": {"x": float("nan")}, "angular": {}}),
+            True,
+            "not_finite",
+        ),
+        (
+            "cmd/app",
+            msgspec.msgpack.encode({"linear": {"y": float("inf")}, "angular": {}}),
+            True,
+            "not_finite",
+        ),
+    ],
+)
+def test_a_bad_command_is_refused_whole_and_counted(
+    world: World, key: str, payload: bytes, put: bool, reason: str
+) -> None:
+    world.drive(0.3, seconds=0.5)
+    world.run(0.2)
+    world.put(key, payload, put)
+    world.run(0.06)
+    assert world.state.counters[f"command_{reason}"] == 1
+    assert world.state.mode == "ready"  # it refreshed nothing: the timeout has passed
+
+
+def test_a_backlog_of_stamped_commands_is_not_obeyed(world: World) -> None:
+    world.send(0.0, stamp_ns=world.now_ns)
+    world.run(0.05)
+    stamps = []
+    for _ in range(20):
+        stamps.append(world.now_ns)
+        world.send(0.3, stamp_ns=world.now_ns)
+        world.run(0.05)
+    world.run(2.0)
+    obeyed = world.state.counters["commands"]
+    for stamp in stamps:  # what the network held back for two seconds pours in at once
+        world.send(0.3, stamp_ns=stamp)
+    world.run(0.05)
+    assert world.state.counters["commands"] == obeyed
+    assert world.state.counters["command_stale"] == len(stamps)
+    assert world.state.mode == "ready"
+
+
+def test_a_sender_whose_clock_is_a_day_off_drives_all_the_same(world: World) -> None:
+    day_ns = 86_400_000_000_000
+    world.send(0.0, stamp_ns=world.now_ns + day_ns)
+    world.run(0.05)
+    for _ in range(10):
+        world.send(0.3, stamp_ns=world.now_ns + day_ns)
+        world.run(0.05)
+    assert world.state.mode == "driving"
+
+
+def test_the_wall_clock_may_step_without_changing_the_path() -> None:
+    worlds = World(), World()
+    for i, world in enumerate(worlds):
+        world.run(0.2)
+        world.drive(0.5, 0.5, seconds=1.0)
+        world.wall_offset_ns += i * 86_400_000_000_000
+        world.hold(0.5, 0.5, seconds=1.0)
+    assert worlds[0].state.x == worlds[1].state.x
+    assert worlds[0].lines() == worlds[1].lines()
+
+
+def test_set_pose_and_reset_odometry_move_the_pose_and_not_the_robot(world: World) -> None:
+    reply = world.call("set_pose", msgspec.json.encode({"x": 1.0, "y": -2.0, "yaw": 4.0}))
+    assert reply.success
+    state = world.state
+    assert (state.x, state.y) == (1.0, -2.0)
+    assert state.yaw == pytest.approx(4.0 - 2 * 3.141592653589793)
+    assert world.call("reset_odometry").success
+    assert (world.state.x, world.state.y, world.state.yaw) == (0.0, 0.0, 0.0)
+    assert not world.call("set_pose", b'{"x": 1}').success
+
+
+def test_a_get_on_everything_stops_nothing(world: World) -> None:
+    for service in ("stop", "clear", "deactivate"):
+        assert world.ask(f"srv/{service}", asked="**") == []
+    assert world.state.mode == "ready"
+
+
+def test_state_is_published_ten_times_a_second_and_at_once_on_change(world: World) -> None:
+    published = world.bus.published["state"]
+    world.run(0.5)
+    before = len(published)
+    world.run(5.0)
+    assert len(published) - before == 50
+    before = len(published)
+    world.put("stop", b"")
+    world.run(0.012)
+    assert len(published) - before >= 1
+
+
+def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
+    world.drive(0.9, seconds=2.0)
+    world.loop.leaving = True
+    world.hold(0.9, seconds=0.35)
+    assert world.loop.at_rest
+    assert world.state.mode == "leaving"
+    assert not world.call("activate").success

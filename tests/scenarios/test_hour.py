@@ -1,0 +1,101 @@
+"""An hour in the life of a robot, in virtual time, ends the same way every time.
+
+The trace covers every line the MCU heard and everything the bus said at the end. It changes only
+when the behaviour does; then look at why, and write it anew with
+
+    python -m tests.scenarios.test_hour
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+import zlib
+from pathlib import Path
+
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import Outputs
+from tests.scenarios.world import World
+
+GOLDEN = Path(__file__).parent.parent / "vectors" / "golden_hour.json"
+MINUTES = 60
+
+
+def live(minutes: int) -> dict[str, object]:
+    """Drive, turn, stop, unplug, reset, stutter: a different minute each minute, no chance."""
+    world = World()
+    dice = random.Random(2026)
+    trace = 0
+
+    def watch(outputs: Outputs) -> None:
+        nonlocal trace
+        if outputs.line is not None:
+            trace = zlib.crc32(outputs.line, trace)
+        for sample in outputs.samples:
+            trace = zlib.crc32(b"%.6f" % sample.pose.x, trace)
+
+    world.watch = watch
+    for minute in range(minutes):
+        start_ns = world.now_ns
+        _drive_about(world, dice)
+        _trouble(world, minute % 6)
+        world.run(60.0 - (world.now_ns - start_ns) / 1e9)
+    state = world.state
+    return {
+        "trace": trace,
+        "valid_lines": world.mcu.valid_lines,
+        "mode": state.mode,
+        "reason": state.reason,
+        "x": round(state.x, 6),
+        "y": round(state.y, 6),
+        "yaw": round(state.yaw, 6),
+        "counters": state.counters,
+        "events": len(world.events),
+    }
+
+
+def _drive_about(world: World, dice: random.Random) -> None:
+    for source in ("nav", "app", "teleop"):
+        world.drive(
+            dice.uniform(-1.5, 1.5), dice.uniform(-3, 3), dice.uniform(1, 8), source, hz=10.0
+        )
+    world.send(0.0, source="teleop")
+    world.run(1.0)
+
+
+def _trouble(world: World, kind: int) -> None:
+    match kind:
+        case 0:
+            world.call("stop")
+            world.hold(0.5, seconds=1.0)
+            world.call("clear")
+        case 1:
+            world.port.unplug()
+            world.hold(0.5, seconds=2.0)
+            world.mcu = FakeMcu(world.config, world.now_ns)
+            world.port.plug(world.mcu)
+        case 2:
+            world.mcu.reset(world.now_ns)
+            world.hold(0.5, seconds=4.0)
+        case 3:
+            with world.mcu.noise():
+                world.hold(0.5, seconds=2.0)
+        case 4:
+            world.put("cmd/app", b'{"linear": {"x": 0.5}}')
+            world.stall(0.3)
+        case 5:
+            with world.mcu.mute():
+                world.hold(0.5, seconds=0.7)
+
+
+def test_an_hour_ends_as_it_always_did() -> None:
+    began = time.perf_counter()
+    ended = live(MINUTES)
+    print(f"\none hour in virtual time: {time.perf_counter() - began:.1f} s")
+    assert ended == json.loads(GOLDEN.read_text())
+
+
+if __name__ == "__main__":
+    GOLDEN.write_text(json.dumps(live(MINUTES), indent=2) + "\n")
+    print(GOLDEN.read_text())

@@ -1,0 +1,233 @@
+"""The serial line fails in every way it can; the robot stops, says why, and comes back."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+
+import pytest
+
+from acsard.settings import Config, ControlConfig, McuConfig
+from acsard.sim.fake_mcu import FakeMcu
+from tests.scenarios.world import World
+
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def moving(lines: list[bytes]) -> list[bytes]:
+    return [line for line in lines if line not in (ZERO, b"\r\n")]
+
+
+def test_unplugging_is_told_at_once_and_wishes_nothing(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.port.unplug()
+    world.run(0.01)
+    state = world.state
+    assert (state.mode, state.link) == ("waiting", "down")
+    assert "reopened" in state.reason
+    outputs = world.loop.outputs
+    assert outputs is not None
+    assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_after_replugging_nothing_moves_before_a_zero(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.port.unplug()
+    world.hold(0.5, seconds=1.0)
+    fresh = FakeMcu(world.config, world.now_ns)
+    world.mcu = fresh
+    world.port.plug(fresh)
+    world.hold(0.5, seconds=2.0)
+    assert fresh.heard[0][1] == b"\r\n"
+    assert not moving(world.lines())
+    assert "neutral first" in world.state.reason
+    world.drive(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_odometry_goes_on_without_a_jump_after_replugging(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.port.unplug()
+    world.run(3.0)
+    before = world.state.x
+    world.mcu = FakeMcu(world.config, world.now_ns)
+    world.port.plug(world.mcu)
+    world.run(1.0)
+    assert world.state.x == pytest.approx(before, abs=1e-9)
+
+
+def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.hold(0.5, seconds=0.2)
+        assert world.state.link == "stale"
+        sent = len(world.port.sent)
+        world.hold(0.5, seconds=2.0)
+    lines = [line for _, line in list(world.port.sent)[sent:]]
+    assert 19 <= len(lines) <= 21
+    assert set(lines) == {ZERO}
+
+
+def test_odometry_stands_while_the_mcu_is_silent_and_grows_less_certain(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.2)
+        x, known = world.state.x, world.odom.pose.covariance[0]
+        world.run(2.0)
+        assert world.state.x == x
+    world.run(0.5)
+    assert world.odom.pose.covariance[0] > known
+
+
+def test_a_short_silence_only_ramps_up_again(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.hold(0.5, seconds=0.5)
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+def test_a_long_silence_wants_neutral_again(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.hold(0.5, seconds=1.5)
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "ready"
+    assert "neutral first" in world.state.reason
+
+
+def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    x = world.state.x
+    world.mcu.reset(world.now_ns)
+    heard = world.mcu.valid_lines
+    world.hold(0.5, seconds=4.0)
+    assert world.mcu.valid_lines > heard
+    assert world.state.mode == "ready"
+    assert world.mcu.vehicle.set_points == [0.0] * 4
+    assert world.state.x == pytest.approx(x, abs=0.1)
+    assert world.state.counters["line_malformed"] >= 1
+
+
+@pytest.mark.parametrize("fault", ["spaces", "trailing_comma", "slow_reply"])
+def test_a_lenient_form_of_reply_changes_nothing(world: World, fault: str) -> None:
+    with getattr(world.mcu, fault)():
+        world.drive(0.5, seconds=2.0)
+        world.send(0.0)
+        world.run(1.0)
+    assert world.state.x == pytest.approx(1.0, rel=0.02)
+    assert not [name for name in world.state.counters if name.startswith("line_")]
+
+
+@pytest.mark.parametrize("fault", ["noise", "partial_line"])
+def test_a_damaged_reply_is_no_feedback(world: World, fault: str) -> None:
+    world.drive(0.5, seconds=1.0)
+    with getattr(world.mcu, fault)():
+        world.hold(0.5, seconds=0.5)
+        assert world.state.link == "stale"
+        assert world.lines()[-1] == ZERO
+    world.hold(0.5, seconds=1.0)
+    assert world.state.link == "up"
+    assert sum(n for k, n in world.state.counters.items() if k.startswith("line_")) >= 1
+
+
+def test_noise_costs_at_most_the_line_it_hits(world: World) -> None:
+    before = world.state.counters["lines"]
+    with world.mcu.noise(b"\x00\xff~\n"):
+        world.run(1.0)
+    assert world.state.link == "up"
+    assert world.state.counters["lines"] - before >= 98
+
+
+def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
+    world = World(Config(mcu=McuConfig(reply_period=0.1)))
+    with world.mcu.unprompted(0.1):
+        world.run(1.0)
+        assert world.state.link == "up"
+        world.drive(0.5, seconds=4.0)
+        world.send(0.0)
+        world.run(1.5)
+    assert world.state.x == pytest.approx(2.0, rel=0.03)
+
+
+def test_a_comma_latched_mcu_keeps_its_last_wheel_without_the_trailing_comma(
+    world: World,
+) -> None:
+    with world.mcu.comma_latched():
+        world.drive(0.5, seconds=1.0)
+        assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 0.0]
+
+
+def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu() -> None:
+    world = World(Config(mcu=McuConfig(trailing_comma=True)))
+    latched: AbstractContextManager[None] = world.mcu.comma_latched()
+    with latched:
+        world.run(0.2)
+        world.drive(0.5, seconds=1.0)
+        assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 10.0]
+        world.run(2.0)
+        assert world.mcu.vehicle.set_points == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.port.blocked = True
+    world.hold(0.5, seconds=0.2)
+    # After `quiet` without an answer only the 10 Hz zeros are tried.
+    assert 10 <= world.state.counters["lines_superseded"] <= 12
+    heard = len(world.mcu.heard)
+    world.port.blocked = False
+    world.run(0.02)
+    assert len(world.mcu.heard) - heard <= 2
+
+
+def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.port.blocked = True
+    with world.mcu.unprompted(0.05):
+        world.hold(0.5, seconds=0.5)
+        sent = len(world.port.sent)
+        world.port.blocked = False
+        world.hold(0.5, seconds=0.05)
+    first = list(world.port.sent)[sent][1]
+    assert first == ZERO
+
+
+def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:
+    world = World(Config(mcu=McuConfig(baud_rate=9600), control=ControlConfig(rate="auto")))
+    assert world.config.rate_hz == 23
+    world.run(1.0)
+    world.drive(0.5, seconds=2.0)
+    world.send(0.0)
+    world.run(1.5)
+    assert world.state.x == pytest.approx(1.0, rel=0.05)
+    assert world.state.counters.get("lines_superseded", 0) == 0
+
+
+def test_a_stall_of_the_loop_bunches_nothing_and_loses_no_distance(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    sent = len(world.port.sent)
+    world.send(0.5)
+    world.stall(0.08)
+    world.hold(0.5, seconds=0.5)
+    assert len(world.port.sent) - sent <= 52
+    world.send(0.0)
+    world.run(1.5)
+    assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
+
+
+def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:
+    world.drive(0.5, seconds=5.0)
+    assert world.mcu.watchdog_trips == 0
+
+
+def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.mcu.advance(world.now_ns + 400_000_000)
+    assert world.mcu.vehicle.set_points == [0.0] * 4

@@ -1,0 +1,40 @@
+"""The README is true: its key table is the topic table, its commands and examples exist.
+
+Write the table anew with `python -m tests.test_readme`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from acsard.cli import VERBS
+from acsard.messages.topics import TOPICS
+
+README = Path(__file__).parent.parent / "README.md"
+TABLE = re.compile(r"(<!-- keys: acsard topics -->\n).*?(<!-- end of keys -->)", re.S)
+
+
+def table() -> str:
+    rows = ["| key | direction | type | rate | meaning |", "|---|---|---|---|---|"]
+    for t in TOPICS:
+        cells = (f"`{t.key}`", t.direction, t.type, t.rate, t.note)
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def test_the_key_table_is_the_topic_table() -> None:
+    match = TABLE.search(README.read_text())
+    assert match is not None
+    assert match[0].split("-->\n", 1)[1].rsplit("<!--", 1)[0] == table()
+
+
+def test_every_verb_named_in_the_readme_exists() -> None:
+    verbs = {verb.__name__.rpartition(".")[2] for verb in VERBS}
+    named = set(re.findall(r"^\$ acsard ([a-z]+)|`acsard ([a-z]+)[ `]", README.read_text(), re.M))
+    assert {a or b for a, b in named} <= verbs
+
+
+if __name__ == "__main__":
+    text = README.read_text()
+    README.write_text(TABLE.sub(lambda m: m[1] + table() + m[2], text))
