@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acsard.drive.arbiter import Arbiter, Choice
+from acsard.drive.arbiter import REASONS, Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger, next_mode
@@ -24,6 +24,7 @@ from acsard.values import (
     Inputs,
     Outputs,
     Pose,
+    Refusal,
     Request,
     Sample,
     Snapshot,
@@ -63,6 +64,7 @@ class Robot:
         self.counters: Counter[str] = Counter()
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (superseded lines, missed periods)."""
+        self._refused = ""
         self._arbiter.require_neutral()
         self._resume()
 
@@ -77,6 +79,7 @@ class Robot:
             speeds=self._odometry.speeds,
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
+            refused=self._refused,
             lateness_us=lateness_us,
         )
 
@@ -140,11 +143,14 @@ class Robot:
         return tuple([self._answer(request, events) for request in inputs.requests])
 
     def _answer(self, request: Request, events: list[Event]) -> Answer:
+        before = self._mode
         try:
             message = self._obey(request)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
-        events.append(Event(request.verb, message))
+        if request.verb != "stop" or self._mode is not before:
+            # A stop that is repeated as fast as it can be sent is still one line of log.
+            events.append(Event(request.verb, message))
         return Answer(request.id, True, message)
 
     def _obey(self, request: Request) -> str:
@@ -185,6 +191,9 @@ class Robot:
                 self._fire(Trigger.LINK_UP)
 
     def _fault(self, why: str, events: list[Event]) -> None:
+        self._limiter.cut()  # STOP went out in the line's place
+        if self._mode in (Mode.FAULT, Mode.LEAVING):
+            return
         self._fire(Trigger.FAULT)
         self._latch = why
         self._arbiter.require_neutral()
@@ -196,11 +205,18 @@ class Robot:
     # commands
 
     def _hear(self, inputs: Inputs) -> None:
-        for reason in inputs.rejects:
-            self.counters[f"command_{reason}"] += 1
+        for refusal in inputs.refusals:
+            self._refuse(refusal)
         for command in inputs.commands:
-            refused = self._arbiter.accept(command)
-            self.counters[f"command_{refused}" if refused else "commands"] += 1
+            reason = self._arbiter.accept(command)
+            if reason:
+                self._refuse(Refusal(reason, f"source {command.source}: {REASONS[reason]}"))
+            else:
+                self.counters["commands"] += 1
+
+    def _refuse(self, refusal: Refusal) -> None:
+        self.counters[f"command_{refusal.reason}"] += 1
+        self._refused = refusal.text
 
     # choose, gate, limit, invert
 
@@ -212,10 +228,12 @@ class Robot:
         limiter = self._limiter
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
+        if self.session.link != "up":
+            limiter.cut()  # also what was just restored
         self._before = (limiter.state, self._limited_ns)
         since = (now_ns - self._limited_ns) / NS_PER_S
         self._limited_ns = now_ns
-        if self.session.link != "up" or since > UNHEARD_S:
+        if since > UNHEARD_S:
             limiter.cut()
         elif self._mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, MAX_DT))

@@ -110,6 +110,13 @@ class Answer(Struct, frozen=True):
     message: str
 
 
+class Refusal(Struct, frozen=True):
+    """A command that does not count: `reason` is what it is counted under, `text` is for people."""
+
+    reason: str
+    text: str
+
+
 class Event(Struct, frozen=True):
     """Something worth a log line: `name` is from a closed set, `text` is for people."""
 
@@ -153,8 +160,8 @@ class Inputs(Struct, frozen=True):
     received: tuple[Received, ...] = ()
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()
-    rejects: tuple[str, ...] = ()
-    """Reasons of the bus messages refused before they became a `Command`."""
+    refusals: tuple[Refusal, ...] = ()
+    """The bus messages refused before they became a `Command`."""
     guard_trip: str = ""
     """Why the guard replaced the previous line with STOP; latches a fault."""
     superseded: bool = False
@@ -205,5 +212,7 @@ class Snapshot(Struct, frozen=True):
     speeds: WheelSpeeds
     sources: tuple[SourceStatus, ...]
     counters: dict[str, int]
+    refused: str
+    """The last command that was refused and why, "" when none was."""
     lateness_us: Spread
     """How late the control periods began, us."""

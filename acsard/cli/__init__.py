@@ -27,6 +27,7 @@ try:  acsard run                (the robot, on the built-in simulator)
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `acsard` command; returns the exit code."""
+    _fill_closed_streams()
     parser = argparse.ArgumentParser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
@@ -54,3 +55,16 @@ def main(argv: list[str] | None = None) -> int:
         return int(Exit.OK)
     except KeyboardInterrupt:
         return 130
+
+
+def _fill_closed_streams() -> None:
+    """Open /dev/null where a standard stream is closed, or the serial port would take its number.
+
+    Then whatever prints would write to the motors.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number, which is this one
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))

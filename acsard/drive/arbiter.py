@@ -25,6 +25,14 @@ MAX_SENDERS = 64
 """Clocks remembered at once; the one heard longest ago goes first."""
 
 
+REASONS = {
+    "unknown_source": "not one of commands.sources",
+    "not_finite": "NaN or infinity",
+    "stale": "held up on the way for longer than the source's timeout",
+}
+"""What `accept` refuses for, in words."""
+
+
 class Choice(Struct, frozen=True):
     """The twist to follow, or None when nobody may drive, and why in words."""
 
@@ -65,6 +73,8 @@ class _Commander:
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.twist = REST
         self.arrived_ns: int | None = None
+        self.came_ns = 0
+        """First command since it was last silent: who came first among equals."""
         self.armed = False
         self.heard_ns: int | None = None
         """Last command since neutral was last required."""
@@ -91,7 +101,7 @@ class Arbiter:
         self._holder = None
 
     def accept(self, command: Command) -> str:
-        """Take a command; the reason it is refused for, or "" when it counts."""
+        """Take a command; the key in `REASONS` it is refused for, or "" when it counts."""
         commander = self._commanders.get(command.source)
         if commander is None:
             return "unknown_source"
@@ -109,21 +119,15 @@ class Arbiter:
             paused = heard is not None and now_ns - heard > commander.timeout_ns
             commander.armed = paused or twist == REST
             commander.heard_ns = now_ns
+        if not commander.live(command.arrived_ns):
+            commander.came_ns = command.arrived_ns
         commander.twist, commander.arrived_ns = twist, command.arrived_ns
         return ""
 
     def choose(self, now_ns: int) -> Choice:
         """Whose command counts now, and which."""
-        chosen = None
-        for commander in self._ranking:
-            if not commander.live(now_ns):
-                continue
-            if chosen is None:
-                chosen = commander
-            elif commander.settings.priority < chosen.settings.priority:
-                break
-            elif commander is self._holder:
-                chosen = commander
+        live = [commander for commander in self._ranking if commander.live(now_ns)]
+        chosen = min(live, key=lambda c: (-c.settings.priority, c.came_ns), default=None)
         self._holder = chosen
         if chosen is None:
             return Choice("", None, "no commands: no source has sent one within its timeout")

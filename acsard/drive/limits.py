@@ -116,12 +116,21 @@ def _approach(
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
     if axis.jerk:
-        # The steepest slope that jerk can still flatten before the goal, in steps of dt.
-        away, step = abs(target - speed), axis.jerk * dt
-        most = min(most, math.sqrt(step * step / 4 + 2 * axis.jerk * away) - step / 2)
-        bounded = max(-most, min(most, wanted))
-        used = max(slope - step, min(slope + step, bounded))
-    else:
-        used = max(-most, min(most, wanted))
+        # A slope the other way is dropped at once: turning a push into braking never waits.
+        slope = slope if slope * wanted > 0 else 0.0
+        step = axis.jerk * dt
+        most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
+        # The slope may not fall faster than jerk either, as far as the goal is not passed.
+        most = max(most, abs(slope) - step)
+    used = max(-most, min(most, wanted))
     # Landing exactly: wanted * dt need not give the difference back in floating point.
     return (target if used == wanted else speed + used * dt), used
+
+
+def _flattenable(away: float, step: float, dt: float) -> float:
+    """The steepest slope from which falling by `step` every `dt` ends within `away`.
+
+    Slopes s, s - step, ... over n more periods add up to dt ((n + 1) s - step n (n + 1) / 2).
+    """
+    n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
+    return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

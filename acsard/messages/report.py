@@ -190,6 +190,7 @@ class Report:
             sources=[
                 SourceState(s.name, s.priority, s.age_s, s.waits_for) for s in snapshot.sources
             ],
+            refused=snapshot.refused,
             counters=snapshot.counters,
         )
 

@@ -155,6 +155,8 @@ class RobotState(Message, frozen=True):
     link: str
     source: str
     sources: list[SourceState]
+    refused: str
+    """The last command that was refused and why; empty when none was."""
     counters: dict[str, int]
 
 

@@ -20,7 +20,17 @@ from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
 from acsard.robot import Robot
 from acsard.settings import Config
-from acsard.values import Command, Event, Inputs, Instant, Outputs, Received, Request, Snapshot
+from acsard.values import (
+    Command,
+    Event,
+    Inputs,
+    Instant,
+    Outputs,
+    Received,
+    Refusal,
+    Request,
+    Snapshot,
+)
 
 Offered = Literal["sent", "superseded", "down"]
 
@@ -109,7 +119,7 @@ class ControlLoop:
             self.lateness_us.add(late_ns / 1000)
             if missed:
                 counters["missed_periods"] += missed
-        commands, rejects, requests = self._from_bus(now)
+        commands, refusals, requests = self._from_bus(now)
         port = self._port
         inputs = Inputs(
             now=now,
@@ -119,7 +129,7 @@ class ControlLoop:
             received=port.take(),
             commands=commands,
             requests=requests,
-            rejects=rejects,
+            refusals=refusals,
             guard_trip=self._trip,
             superseded=self._superseded,
             leaving=self.leaving,
@@ -132,9 +142,10 @@ class ControlLoop:
 
     def _from_bus(
         self, now: Instant
-    ) -> tuple[tuple[Command, ...], tuple[str, ...], tuple[Request, ...]]:
-        got = self._bus.take(QUERIES_PER_STEP)
-        commands, rejects, requests = [], [], []
+    ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
+        # Before the first step there is nothing to answer with.
+        got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        commands, refusals, requests = [], [], []
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         for arrival in got.arrivals:
@@ -144,7 +155,7 @@ class ControlLoop:
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
-                rejects.append(error.reason)
+                refusals.append(Refusal(error.reason, f"{arrival.key}: {error}"[:200]))
         for query in got.queries:
             served = self._queries.serve(query, self._current, self.outputs)
             if isinstance(served, Request):
@@ -153,7 +164,7 @@ class ControlLoop:
             for reply in served:
                 self._bus.reply(reply)
             self._bus.done(query.number)
-        return tuple(commands), tuple(rejects), tuple(requests)
+        return tuple(commands), tuple(refusals), tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant) -> None:
         line = self._guard.check(outputs)

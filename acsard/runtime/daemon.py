@@ -116,6 +116,7 @@ async def _control(
     config: Config, control: ControlLoop, departure: _Departure, wake: _Wakeup
 ) -> None:
     """The control task: a step every period, and one for feedback in hand."""
+    await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
     gc.collect()
     gc.freeze()  # what lives now lives to the end; later collections need not look at it
     with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:

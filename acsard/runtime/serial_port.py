@@ -173,10 +173,12 @@ class SerialPort:
         self.is_open = False
         transport, self._transport = self._transport, None
         if transport is not None and transport.serial is not None:
-            try:
-                transport.serial.reset_output_buffer()
-            except (OSError, termios.error):
-                pass  # the device is gone, and with it what was queued
+            if error is not None or self._kernel_bytes():
+                # Only what is stuck: on a pty a flush throws away a STOP that is already through.
+                try:
+                    transport.serial.reset_output_buffer()
+                except (OSError, termios.error):
+                    pass  # the device is gone, and with it what was queued
             transport.abort()
         if error is not None:
             self._log(Event("port_lost", f"{self._path}: {error}; reopening", "warning"))
@@ -249,15 +251,19 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
 
 
 def port_owner(path: str) -> int | None:
-    """The process (other than this one) that has the port open, where we may see it."""
-    device = os.path.realpath(path)
+    """The process that holds the port's lock, else one that has it open, where we may see it."""
+    device, found = os.path.realpath(path), None
     for entry in Path("/proc").glob("[0-9]*/fd/*"):
+        process = entry.parents[1]
         try:
-            if str(entry.readlink()) == device and int(entry.parts[2]) != os.getpid():
-                return int(entry.parts[2])
+            if str(entry.readlink()) != device or process.name == str(os.getpid()):
+                continue
+            found = int(process.name)
+            if "lock:" in (process / "fdinfo" / entry.name).read_text():
+                return found
         except OSError:
-            continue
-    return None
+            continue  # it has ended, or is not ours to look at
+    return found
 
 
 def _in_use(path: str) -> str:

@@ -49,7 +49,9 @@ async def in_thread(
 
     threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True).start()
     try:
-        return await asyncio.wait_for(future, timeout)
+        # Not wait_for: before Python 3.12 it swallows a cancel that meets the result.
+        async with asyncio.timeout(timeout):
+            return await future
     finally:
         with lock:
             abandoned = not future.done() or future.cancelled()
