@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import ipaddress
 import tomllib
-from collections import Counter
 
 from msgspec import convert, to_builtins
 
 from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes, wire_ns, wire_use
 from acsard.settings import BusConfig, Config
 from acsard.validation import build, show
-from acsard.values import AcsardError
+from acsard.values import WHEELS, AcsardError
+
+MAX_BYTES = 65536
+"""The reference file is a tenth of this."""
 
 
 class ConfigError(AcsardError):
@@ -31,18 +33,25 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
     `overrides` are values from the command line, by table and key; they win over the file.
     """
+    if len(text) > MAX_BYTES:
+        raise ConfigError([f"{len(text)} bytes: not a configuration; at most {MAX_BYTES}"])
     try:
         table = tomllib.loads(text.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError([f"not TOML: {error}; texts need quotes, true/false none"]) from None
+    except (ValueError, RecursionError):  # numbers and nesting beyond what Python takes
+        raise ConfigError(["not TOML: a number too long or lists too deep; mend it"]) from None
     for section, values in (overrides or {}).items():
         inner = table.setdefault(section, {})
         if isinstance(inner, dict):
             inner.update(values)
     problems: list[str] = []
-    config = build(Config, table, "", problems)
+    try:
+        config = build(Config, table, "", problems)
+    except RecursionError:
+        raise ConfigError(["lists or tables nested too deep; no key needs that"]) from None
     if config is not None:
         problems += _contradictions(config)
     if config is None or problems:
@@ -83,6 +92,12 @@ def warnings(config: Config) -> list[str]:
         )
     if config.bus.insecure:
         found.append("bus.insecure = true: everyone who reaches the bus can drive this robot")
+    hosts = [_host(endpoint) for endpoint in (*config.bus.listen, *config.bus.connect)]
+    if config.robot.id == Config().robot.id and not all(_is_loopback(h) for h in hosts if h):
+        found.append(
+            f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
+            "a second robot there would share its keys; give each its own id"
+        )
     return found
 
 
@@ -112,25 +127,32 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _name_problems(config: Config) -> list[str]:
-    wheels = config.mcu.wheels
-    motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
-    frames = [config.odometry.odom_frame, config.odometry.base_frame]
+    motors, joints = config.mcu.wheels, config.joints
+    frames = {
+        "odometry.odom_frame": config.odometry.odom_frame,
+        "odometry.base_frame": config.odometry.base_frame,
+    }
     if config.lidar.publish_tf:
-        frames.append(config.lidar.lidar_frame)
+        frames["lidar.lidar_frame"] = config.lidar.lidar_frame
     if config.footprint.publish_tf:
-        frames.append(config.footprint.footprint_frame)
-    groups = (
-        ("mcu.wheels", "motor letter", [motor[1] for motor in motors]),
-        ("joints", "joint name", list(config.joints.as_tuple())),
-        ("commands.sources", "source name", [s.name for s in config.commands.sources]),
-        ("odometry, lidar, footprint", "frame", frames),
-    )
+        frames["footprint.footprint_frame"] = config.footprint.footprint_frame
+    sources = {f"commands.sources[{i}].name": s.name for i, s in enumerate(config.commands.sources)}
     return [
-        f"{where} = {show(name)}: the same {noun} {count} times; give each its own"
-        for where, noun, names in groups
-        for name, count in Counter(names).items()
-        if count > 1
+        *_repeated("motor", {f"mcu.wheels.{w}": getattr(motors, w)[1] for w in WHEELS}),
+        *_repeated("joint name", {f"joints.{w}": getattr(joints, w) for w in WHEELS}),
+        *_repeated("source name", sources),
+        *_repeated("frame", frames),
     ]
+
+
+def _repeated(noun: str, names: dict[str, str]) -> list[str]:
+    first: dict[str, str] = {}
+    found = []
+    for key, name in names.items():
+        if name in first:
+            found.append(f"{key} = {show(name)}: {first[name]} is the same {noun}; write another")
+        first.setdefault(name, key)
+    return found
 
 
 def _limit_problems(config: Config) -> list[str]:
@@ -156,6 +178,8 @@ def _limit_problems(config: Config) -> list[str]:
 
 def _bus_problems(bus: BusConfig) -> list[str]:
     found = []
+    if not bus.listen:
+        found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
     for key, endpoints in (("listen", bus.listen), ("connect", bus.connect)):
         for endpoint in endpoints:
             where = f"bus.{key} = {show(endpoint)}"

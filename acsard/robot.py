@@ -125,6 +125,7 @@ class Robot:
             # Nobody can be ramped at the other end, and what was wished then is old now.
             self._limiter.cut()
             self._speeds = STILL
+            self._before = (self._limiter.state, inputs.now.mono_ns)
             self._fire(Trigger.LINK_LOST)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral()
@@ -228,12 +229,10 @@ class Robot:
         limiter = self._limiter
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
-        if self.session.link != "up":
-            limiter.cut()  # also what was just restored
         self._before = (limiter.state, self._limited_ns)
         since = (now_ns - self._limited_ns) / NS_PER_S
         self._limited_ns = now_ns
-        if since > UNHEARD_S:
+        if self.session.link != "up" or since > UNHEARD_S:
             limiter.cut()
         elif self._mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, MAX_DT))

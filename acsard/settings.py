@@ -15,14 +15,14 @@ from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes
 Name = Annotated[
     str,
     Meta(
-        pattern=r"^[A-Za-z0-9_-]{1,32}$",
+        pattern=r"^[A-Za-z0-9_-]{1,32}\Z",
         extra={"unit": "1 to 32 of A-Z a-z 0-9 _ -", "example": "app"},
     ),
 ]
 Frame = Annotated[
     str,
     Meta(
-        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}$",
+        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}\Z",
         extra={"unit": "a frame or joint name: 1 to 64 of A-Z a-z 0-9 _ /, no leading slash"},
     ),
 ]

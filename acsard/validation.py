@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -16,6 +17,8 @@ from msgspec.structs import FieldInfo, fields
 
 T = TypeVar("T", bound=msgspec.Struct)
 
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
+
 
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
     """Decode `table` into `cls`; append a line per problem to `problems` and return None then.
@@ -23,13 +26,14 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
     `path` is the dotted name of the table, "" at the root.
     """
     if not isinstance(table, Mapping):
-        problems.append(f"{path} = {show(table)}: expected a table; write it as [{path}]")
+        header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
+        problems.append(f"{path} = {show(table)}: expected a table; write it as {header}")
         return None
     known = {field.encode_name: field for field in fields(cls)}
     before = len(problems)
     for key in table:
         if key not in known:
-            problems.append(_unknown(str(key), table[key], path, list(known)))
+            problems.append(_unknown(key, table[key], path, list(known)))
     values: dict[str, Any] = {}
     for name, field in known.items():
         where = f"{path}.{name}" if path else name
@@ -70,7 +74,8 @@ def _finite(raw: object) -> bool:
 
 
 def _unknown(key: str, value: object, path: str, known: list[str]) -> str:
-    where = f"{path}.{key}" if path else key
+    name = key if _BARE_KEY.fullmatch(key) else show(key)
+    where = f"{path}.{name}" if path else name
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
     return f"{where} = {show(value)}: unknown key; {hint}"
@@ -127,10 +132,14 @@ def write(value: object) -> str:
         case bool():
             return "true" if value else "false"
         case str():
-            return msgspec.json.encode(value).decode()
+            # JSON's escapes are TOML's, but for DEL, which TOML wants escaped too.
+            return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
         case list() | tuple():
             return "[" + ", ".join(write(item) for item in value) + "]"
         case Mapping():
             return "{" + ", ".join(f"{key} = {write(item)}" for key, item in value.items()) + "}"
         case _:
-            return str(value)
+            try:
+                return str(value)
+            except ValueError:
+                return "a number of thousands of digits"

@@ -52,5 +52,5 @@ def json_line(encoding: str, payload: bytes) -> str:
         form = detect(encoding, payload)
         codec = msgspec.json if form == "json" else msgspec.msgpack
         return msgspec.json.encode(codec.decode(payload)).decode()
-    except (DecodeError, msgspec.MsgspecError, ValueError):
+    except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):
         return msgspec.json.encode({"undecodable": repr(payload)}).decode()

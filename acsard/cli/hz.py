@@ -58,7 +58,7 @@ def rate(times: list[float]) -> dict[str, float]:
     """Rate in Hz and the gaps between arrivals in ms, over arrival times in s."""
     import numpy as np
 
-    if len(times) < 2:
+    if len(times) < 2 or times[-1] <= times[0]:
         return {"count": len(times), "hz": 0.0}
     gaps = np.diff(np.asarray(times)) * 1e3
     p50, p99 = np.percentile(gaps, (50, 99))

@@ -82,6 +82,8 @@ class Receiver:
                 raise DecodeError("wrong_shape", "a twist inside and beside `twist`")
             linear, angular = got.twist.linear, got.twist.angular
             header = None if isinstance(got.header, UnsetType) else got.header
+        elif not isinstance(got.header, UnsetType):
+            raise DecodeError("wrong_shape", "a header without `twist`: put the twist inside it")
         if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
             raise DecodeError("wrong_shape", "needs both `linear` and `angular`")
         axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)

@@ -43,12 +43,12 @@ class _Rate:
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
-        self._next_ns = 0
+        self._next_ns = -2 * self._period_ns
 
     def due(self, now_ns: int, at_once: bool = False) -> bool:
-        # A tenth of the period as grace, or a 10 Hz rate would drop to 9.1 Hz on a 100 Hz grid
-        # whenever a tick comes a microsecond early.
-        if not at_once and now_ns < self._next_ns - self._period_ns // 10:
+        # A twentieth of the period as grace, or a tick a microsecond early would wait for the
+        # next one.
+        if not at_once and now_ns < self._next_ns - self._period_ns // 20:
             return False
         behind = at_once or now_ns - self._next_ns > self._period_ns
         self._next_ns = (now_ns if behind else self._next_ns) + self._period_ns

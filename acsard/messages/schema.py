@@ -6,9 +6,14 @@ structs refuse unknown fields, so a misspelt axis is an error and not a standsti
 
 from __future__ import annotations
 
-from msgspec import Struct
+from typing import Annotated
+
+from msgspec import Meta, Struct
 
 from acsard.values import NS_PER_S
+
+Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
+Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S)]
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True):
@@ -16,10 +21,10 @@ class Message(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Time(Message, frozen=True):
-    """Wall-clock time since 1970-01-01 UTC."""
+    """Wall-clock time since 1970-01-01 UTC; `sec` is an int32 as in ROS."""
 
-    sec: int = 0
-    nanosec: int = 0
+    sec: Seconds = 0
+    nanosec: Nanoseconds = 0
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:

@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, contextmanager
 from itertools import count, cycle
 
 from acsard.mcu.wire import wire_ns
-from acsard.settings import Config
+from acsard.settings import Config, WheelMap
 from acsard.sim.vehicle import Vehicle
 from acsard.values import NS_PER_S
 
@@ -45,6 +45,7 @@ class FakeMcu:
         self.vehicle = Vehicle(config.sim, config.drive)
         self._baud_rate = config.mcu.baud_rate
         self._counts = config.sim.encoder_counts
+        self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = now_ns
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
@@ -69,6 +70,7 @@ class FakeMcu:
         self.ending = "\r\n"
         self.unpadded = False
         self.unprompted_ns = 0
+        self._clock = b""
         self.latches_on_comma = False
         self.watchdog = True
 
@@ -105,9 +107,10 @@ class FakeMcu:
                     self._schedule(due_ns + delay, "act", data)
             elif what == "act":
                 self._act(due_ns, data)
-            elif what == "report" and self.unprompted_ns:
-                self._reply(due_ns)
-                self._schedule(due_ns + self.unprompted_ns, "report", b"")
+            elif what == "report" and data == self._clock:
+                if due_ns >= self._boot_until_ns:
+                    self._reply(due_ns)
+                self._schedule(due_ns + self.unprompted_ns, "report", data)
         self._pass(now_ns)
         return out
 
@@ -119,17 +122,19 @@ class FakeMcu:
         self.vehicle.set_points[:] = [0.0] * 4
         self._boot_until_ns = now_ns + RESET_NS
         self._schedule(now_ns + RESET_NS // 2, "sent", b"\x00\xf8\xff~boot\r\n")
+        if self._clock:
+            self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
 
     def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _pass(self, now_ns: int) -> None:
         """Move the vehicle; the watchdog trips at its own time on the way."""
-        deadline = self._fed_ns + WATCHDOG_NS
-        if self.watchdog and self._now_ns < deadline <= now_ns:
+        deadline = max(self._fed_ns + WATCHDOG_NS, self._now_ns)
+        if self.watchdog and deadline <= now_ns and any(self.vehicle.set_points):
             self.vehicle.advance((deadline - self._now_ns) / NS_PER_S)
             self._now_ns = deadline
-            self.watchdog_trips += any(self.vehicle.set_points)
+            self.watchdog_trips += 1
             self.vehicle.set_points[:] = [0.0] * 4
         if now_ns > self._now_ns:
             self.vehicle.advance((now_ns - self._now_ns) / NS_PER_S)
@@ -144,7 +149,8 @@ class FakeMcu:
             values = self._whole_line(line)
             if values is None:
                 return
-            self.vehicle.set_points[:] = values
+            for (wheel, forward), value in zip(self._wiring, values, strict=True):
+                self.vehicle.set_points[wheel] = forward * value
         self.valid_lines += 1
         self._fed_ns = now_ns
         if not self.unprompted_ns:
@@ -158,9 +164,9 @@ class FakeMcu:
         values = []
         for token in tokens:
             whole, point, part = token[2:].partition(b".")
-            if token[1:2] not in (b"p", b"n") or point != b"." or len(token) != 7:
+            if token[1:2] not in (b"p", b"n") or point != b".":
                 return None
-            if not (whole.isdigit() and part.isdigit()):
+            if len(whole) != 2 or len(part) != 2 or not (whole + part).isdigit():
                 return None
             values.append((int(whole) + int(part) / 100) * (1 if token[1:2] == b"p" else -1))
         return values
@@ -174,7 +180,9 @@ class FakeMcu:
                     value = float(token[2:])
                 except ValueError:
                     continue
-                self.vehicle.set_points[b"abcd".index(motor)] = value if sign == b"p" else -value
+                if math.isfinite(value):
+                    wheel, forward = self._wiring[b"abcd".index(motor)]
+                    self.vehicle.set_points[wheel] = forward * (value if sign == b"p" else -value)
 
     def _reply(self, now_ns: int) -> None:
         if self.muted:
@@ -193,7 +201,9 @@ class FakeMcu:
         return f"{min(value, 99.99):.2f}" if self.unpadded else f"{min(value, 99.99):05.2f}"
 
     def _encoders(self) -> list[int]:
-        return [math.floor(a / math.tau * self._counts + 0.5) for a in self.vehicle.angles]
+        """Counts of motors a to d."""
+        angles = self.vehicle.angles
+        return [math.floor(f * angles[w] / math.tau * self._counts + 0.5) for w, f in self._wiring]
 
     def _speeds(self, now_ns: int) -> list[float]:
         """What the encoders say: whole counts over the time since they were last read."""
@@ -265,9 +275,17 @@ class FakeMcu:
     def unprompted(self, period_s: float = 0.1) -> Iterator[None]:
         """Reports by its own clock instead of answering: unpadded, with a trailing comma."""
         period_ns = int(period_s * NS_PER_S)
-        self._schedule(self._now_ns + period_ns, "report", b"")
-        with self._with(unprompted_ns=period_ns, unpadded=True, ending=",\r\n"):
+        clock = b"clock %d" % next(self._order)  # a new one: an older one's events go unheeded
+        self._schedule(self._now_ns + period_ns, "report", clock)
+        with self._with(unprompted_ns=period_ns, _clock=clock, unpadded=True, ending=",\r\n"):
             yield
+
+
+def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
+    """For motors a to d the wheel (`values.WHEELS` order) and 1 or -1: as the host believes."""
+    motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
+    place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
+    return [place[letter] for letter in "abcd"]
 
 
 FAULTS = (

@@ -2,8 +2,7 @@
 
 Motors follow their set points as first-order systems. The base moves by the wheels' real speeds;
 `turn_slip` makes skidding wheels turn it less than they roll, `load` makes the motors give less
-than they are asked. Motor order is the MCU's a, b, c, d: front right, front left, rear left,
-rear right.
+than they are asked. Wheels are in `values.WHEELS` order.
 """
 
 from __future__ import annotations
