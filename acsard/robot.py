@@ -32,7 +32,8 @@ from acsard.values import (
 )
 
 MAX_DT = 0.05
-"""s; the longest step towards a command: after a stall the robot must not leap."""
+"""s; the longest step towards a command, or 1.5 periods if that is longer: after a stall the robot
+must not leap."""
 
 UNHEARD_S = 0.25
 """s without a line that left: by its contract the MCU stops by itself soon after, so start over
@@ -51,6 +52,7 @@ class Robot:
         self._odometry = Odometry(config.odometry, self._kinematics)
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
+        self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._active = config.control.auto_activate
         self._mode = Mode.INACTIVE
         self._latch = ""
@@ -158,8 +160,11 @@ class Robot:
         match request.verb:
             case "stop":
                 self._mode = next_mode(self._mode, Trigger.STOP)
-                if self._mode is Mode.STOPPED:
-                    self._latch = "stopped by request"
+                if self._mode is Mode.LEAVING:
+                    return "the daemon is going down: ramping to zero"
+                if self._mode is Mode.FAULT:
+                    return "in fault, which holds the robot already; srv/clear releases it"
+                self._latch = "stopped by request"
                 return "stopped and latched; srv/clear releases it"
             case "clear":
                 self._mode = next_mode(self._mode, Trigger.CLEAR)
@@ -172,6 +177,8 @@ class Robot:
                 if not self._active:
                     self._arbiter.require_neutral()
                 self._active = True
+                if self.session.link == "up":
+                    self._fire(Trigger.LINK_UP)
                 return "active"
             case "deactivate":
                 self._mode = next_mode(self._mode, Trigger.DEACTIVATE)
@@ -235,7 +242,7 @@ class Robot:
         if self.session.link != "up" or since > UNHEARD_S:
             limiter.cut()
         elif self._mode is Mode.DRIVING and twist is not None:
-            limiter.follow(twist, min(since, MAX_DT))
+            limiter.follow(twist, min(since, self._max_dt))
         else:
             limiter.coast(since, stop=self._mode in (Mode.STOPPED, Mode.FAULT, Mode.LEAVING))
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)

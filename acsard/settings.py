@@ -69,7 +69,7 @@ class McuConfig(Struct, frozen=True):
 
 
 class ControlConfig(Struct, frozen=True):
-    rate: Annotated[float, Meta(ge=1.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
+    rate: Annotated[float, Meta(ge=5.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
     auto_activate: bool = True
 
 

@@ -21,14 +21,15 @@ FORGET_NS = 10 * NS_PER_S
 DRIFT = 2e-4
 """How much faster than the sender's clock ours may run; twice what a bad crystal does."""
 
-MAX_SENDERS = 64
+MAX_SENDERS = 1024
 """Clocks remembered at once; the one heard longest ago goes first."""
 
 
 REASONS = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
-    "stale": "held up on the way for longer than the source's timeout",
+    "stale": "held up on the way for longer than the source's timeout (or the sender's clock was "
+    "set back: let it pause for 10 s)",
 }
 """What `accept` refuses for, in words."""
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
+from acsard.values import AcsardError
+
 
 class Mode(StrEnum):
     INACTIVE = "inactive"
@@ -125,7 +127,7 @@ REFUSALS: dict[tuple[Mode, Trigger], str] = {
 """Why an absent entry is refused, for the person who asked."""
 
 
-class RefusedError(Exception):
+class RefusedError(AcsardError):
     """The table has no entry for this; the text is for the person who asked."""
 
 

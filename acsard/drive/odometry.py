@@ -73,6 +73,8 @@ class Odometry:
     def _add_gap(self, gap: float) -> None:
         """The robot may have gone on as it last moved, or stood: one deviation is all of that."""
         p = self._covariance
+        if _over(p):
+            return
         along = (self.twist.linear * gap) ** 2
         turned = (self.twist.angular * gap) ** 2
         self._covariance = PoseCovariance(
@@ -87,14 +89,14 @@ class Odometry:
     def _propagate(self, distance: float, turn: float) -> PoseCovariance:
         """F P F' + noise, with F the Jacobian of the step in (x, y, yaw)."""
         settings, p = self._settings, self._covariance
+        if _over(p):
+            return p
         heading = self._pose.yaw + turn / 2
         c, s = math.cos(heading), math.sin(heading)
         fx, fy = -distance * s, distance * c
         along = settings.distance_variance_per_metre * abs(distance)
         turned = settings.yaw_variance_per_metre * abs(distance)
         turned += settings.yaw_variance_per_radian * abs(turn)
-        if p.xx >= MAX_VARIANCE or p.yy >= MAX_VARIANCE or p.yawyaw >= MAX_VARIANCE:
-            return p
         return PoseCovariance(
             p.xx + 2 * fx * p.xyaw + fx * fx * p.yawyaw + along * c * c,
             p.xy + fy * p.xyaw + fx * p.yyaw + fx * fy * p.yawyaw + along * c * s,
@@ -103,6 +105,10 @@ class Odometry:
             p.yyaw + fy * p.yawyaw,
             p.yawyaw + turned,
         )
+
+
+def _over(p: PoseCovariance) -> bool:
+    return max(p.xx, p.yy, p.yawyaw) >= MAX_VARIANCE
 
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:

@@ -81,7 +81,9 @@ class McuSession:
                 got = self._line(line, piece.at, following)
                 if got is not None:
                     feedback.append(got)
-        self.rejects["too_long"] = self._lines.too_long
+        if self._lines.too_long > self.rejects["too_long"]:
+            self.rejects["too_long"] = self._lines.too_long
+            self._miss()
         self._judge(now)
         return feedback
 
@@ -104,13 +106,20 @@ class McuSession:
         elif self.link in ("booting", "stale") and self._good_in_row >= GOOD_LINES:
             self.link = "up"
 
+    def _miss(self) -> None:
+        """What came, or did not, is no reason to trust the link; a link that is up stays so."""
+        if self.link != "up":
+            self._good_in_row = 0
+
     def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
         try:
             speeds = self.codec.decode(line)
         except FrameError as error:
             self.rejects[error.reason] += 1
-            self._good_in_row = 0 if self.link != "up" else self._good_in_row
+            self._miss()
             return None
+        if self.silent(read_at.mono_ns):
+            self._miss()
         self.good_lines += 1
         self._good_in_row += 1
         # Bytes that followed in the same read were on the wire after this line was complete.

@@ -162,6 +162,7 @@ def test_a_bad_command_is_refused_whole_and_counted(
     world.put(key, payload, put)
     world.run(0.06)
     assert world.state.counters[f"command_{reason}"] == 1
+    assert world.state.refused
     assert world.state.mode == "ready"  # it refreshed nothing: the timeout has passed
 
 

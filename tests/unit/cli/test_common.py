@@ -1,0 +1,149 @@
+"""Where the configuration is looked for, in which order, and what a bad one says."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from acsard.cli import common
+from acsard.cli.common import PLACES, find, load, robot_address
+from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import Config
+
+
+class Places:
+    """The four places, each an empty slot in a temporary directory."""
+
+    def __init__(self, root: Path) -> None:
+        self.option = root / "option.toml"
+        self.variable = root / "variable.toml"
+        self.here = root / "here" / "acsard.toml"
+        self.etc = root / "etc.toml"
+
+    def fill(self) -> None:
+        for place in (self.option, self.variable, self.here, self.etc):
+            place.write_text(f'[robot]\nid = "{place.parent.name[:4]}-{place.stem}"\n')
+
+
+@pytest.fixture(name="places")
+def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
+    """An empty machine: nothing named, nothing here, nothing in /etc."""
+    places = Places(tmp_path)
+    places.here.parent.mkdir()
+    monkeypatch.chdir(places.here.parent)
+    monkeypatch.delenv("ACSARD_CONFIG", raising=False)
+    monkeypatch.setattr(common, "PLACES", (PLACES[0], places.etc))
+    return places
+
+
+def test_the_places_are_here_and_etc() -> None:
+    assert [str(place) for place in PLACES] == ["acsard.toml", "/etc/acsard/acsard.toml"]
+
+
+def test_the_option_wins_over_all_others(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+    places.fill()
+    monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
+    assert find(str(places.option)) == (str(places.option), places.option.read_bytes())
+
+
+def test_the_variable_wins_over_the_places(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+    places.fill()
+    monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
+    assert find(None) == (str(places.variable), places.variable.read_bytes())
+
+
+def test_the_file_here_wins_over_etc(places: Places) -> None:
+    places.fill()
+    assert find(None) == ("acsard.toml", places.here.read_bytes())
+
+
+def test_etc_comes_last(places: Places) -> None:
+    places.fill()
+    places.here.unlink()
+    assert find(None) == (str(places.etc), places.etc.read_bytes())
+
+
+@pytest.mark.usefixtures("places")
+def test_without_a_file_there_are_the_defaults() -> None:
+    assert find(None) == ("built-in defaults", b"")
+    assert load(None) == ("built-in defaults", Config())
+
+
+def test_an_empty_variable_names_nothing(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+    places.fill()
+    monkeypatch.setenv("ACSARD_CONFIG", "")
+    assert find(None)[0] == "acsard.toml"
+
+
+def test_a_named_file_that_is_missing_is_an_error_and_never_replaced(
+    places: Places, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places.fill()
+    places.variable.unlink()
+    with pytest.raises(ExitError, match=r"cannot read /nowhere/x\.toml: No such file") as caught:
+        find("/nowhere/x.toml")
+    assert caught.value.code == Exit.BAD_CONFIG
+    monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
+    with pytest.raises(ExitError, match="cannot read"):
+        find(None)
+
+
+def test_a_file_here_that_cannot_be_read_is_an_error_and_not_passed_over(places: Places) -> None:
+    places.fill()
+    places.here.unlink()
+    places.here.mkdir()
+    with pytest.raises(ExitError, match=r"cannot read acsard\.toml: Is a directory") as caught:
+        find(None)
+    assert caught.value.code == Exit.BAD_CONFIG
+
+
+def test_a_good_file_is_decoded_with_the_command_line_on_top(places: Places) -> None:
+    places.option.write_text('[robot]\nid = "r1"\n[mcu]\nport = "/dev/a"\n')
+    where, config = load(str(places.option), {"robot": {"id": "r2"}})
+    assert where == str(places.option)
+    assert (config.robot.id, config.mcu.port) == ("r2", "/dev/a")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("a = 1\n", "1 problem in "), ("a = 1\nb = 2\n", "2 problems in ")]
+)
+def test_every_problem_is_printed_with_the_file_it_is_in(
+    places: Places, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    places.option.write_text(text)
+    with pytest.raises(ExitError, match=words) as caught:
+        load(str(places.option))
+    assert int(caught.value.code) == 78
+    out, err = capsys.readouterr()
+    assert out == ""
+    lines = err.splitlines()
+    assert len(lines) == text.count("\n")
+    assert all(line.startswith(f"{places.option}: ") for line in lines)
+    assert lines[0].startswith(f"{places.option}: a = 1: unknown key")
+
+
+def asked(config: Path, connect: str | None = None, robot_id: str | None = None) -> tuple[str, str]:
+    return robot_address(argparse.Namespace(config=str(config), connect=connect, id=robot_id))
+
+
+def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
+    places.option.write_text(
+        '[robot]\nid = "r7"\n[bus]\nlisten = ["tcp/[::1]:9", "tcp/127.0.0.1:8"]\n'
+    )
+    assert asked(places.option) == ("tcp/[::1]:9", "r7")
+
+
+def test_its_options_win_over_the_configuration(places: Places) -> None:
+    places.fill()
+    assert asked(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8")
+    assert asked(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8")
+
+
+def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("[bus]\nlisten = []\n")
+    with pytest.raises(ExitError) as caught:
+        robot_address(argparse.Namespace(config=str(file), connect=None, id=None))
+    assert caught.value.code is Exit.BAD_CONFIG

@@ -1,0 +1,136 @@
+"""What the keys ask of the robot: a press drives for a while, then zeros, then silence."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.cli.drive import HOLD_S, ZEROS, Teleop, split
+from acsard.values import REST, Twist
+
+UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
+
+MOVES = [
+    ("i", 1, 0), ("o", 1, -1), ("u", 1, 1), ("j", 0, 1), ("l", 0, -1),
+    (",", -1, 0), (".", -1, 1), ("m", -1, -1),
+    (UP, 1, 0), (DOWN, -1, 0), (LEFT, 0, 1), (RIGHT, 0, -1),
+]  # fmt: skip
+"""As teleop_twist_keyboard has them (moveBindings: x and th), and the arrows as one expects."""
+
+SPEEDS = [
+    ("q", 1.1, 1.1), ("z", 0.9, 0.9), ("w", 1.1, 1.0), ("x", 0.9, 1.0), ("e", 1.0, 1.1),
+    ("c", 1.0, 0.9),
+]  # fmt: skip
+
+
+def silent() -> Teleop:
+    """A teleop that has sent its opening zeros, at 0.5 m/s and 2 rad/s."""
+    teleop = Teleop(0.5, 2.0)
+    while teleop.send(0.0) is not None:
+        pass
+    return teleop
+
+
+def test_it_opens_with_three_zeros_and_falls_silent() -> None:
+    teleop = Teleop(0.5, 2.0)
+    assert [teleop.send(n / 20) for n in range(6)] == [REST] * 3 + [None] * 3
+    assert ZEROS == 3
+
+
+@pytest.mark.parametrize(("key", "linear", "angular"), MOVES)
+def test_each_key_drives_its_way(key: str, linear: int, angular: int) -> None:
+    teleop = silent()
+    teleop.press(key, 10.0)
+    assert teleop.send(10.0) == Twist(0.5 * linear, 2.0 * angular)
+
+
+def test_a_press_drives_for_its_hold_then_come_three_zeros_then_silence() -> None:
+    teleop = silent()
+    teleop.press("i", 10.0)
+    assert teleop.send(10.0 + HOLD_S - 0.001) == Twist(0.5, 0.0)
+    assert [teleop.send(10.0 + HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
+
+
+def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_second() -> None:
+    assert 0.5 < HOLD_S <= 1.0
+
+
+def test_a_repeated_press_extends_the_hold() -> None:
+    teleop = silent()
+    for n in range(20):
+        teleop.press("i", 10.0 + n * 0.5)
+        assert teleop.send(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
+    assert teleop.send(19.5 + HOLD_S) == REST
+
+
+def test_another_key_changes_the_way_at_once() -> None:
+    teleop = silent()
+    teleop.press("i", 10.0)
+    teleop.press("j", 10.1)
+    assert teleop.send(10.1) == Twist(0.0, 2.0)
+    assert teleop.send(10.0 + HOLD_S) == Twist(0.0, 2.0)
+
+
+@pytest.mark.parametrize("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
+def test_any_other_key_stops_at_once(key: str) -> None:
+    teleop = silent()
+    teleop.press("i", 10.0)
+    teleop.press(key, 10.1)
+    assert [teleop.send(10.1) for _ in range(4)] == [REST] * 3 + [None]
+
+
+def test_a_stop_at_rest_sends_its_zeros_too() -> None:
+    teleop = silent()
+    teleop.press(" ", 10.0)
+    assert [teleop.send(10.0) for _ in range(4)] == [REST] * 3 + [None]
+
+
+@pytest.mark.parametrize(("key", "linear", "angular"), SPEEDS)
+def test_speed_keys_change_ten_percent_and_do_not_move(
+    key: str, linear: float, angular: float
+) -> None:
+    teleop = silent()
+    teleop.press(key, 10.0)
+    assert (teleop.linear, teleop.angular) == pytest.approx((0.5 * linear, 2.0 * angular))
+    assert teleop.send(10.0) is None
+
+
+def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> None:
+    teleop = silent()
+    teleop.press("u", 10.0)
+    teleop.press("w", 10.5)
+    assert teleop.send(10.5) == Twist(0.5 * 1.1, 2.0)
+    assert teleop.send(10.0 + HOLD_S) == REST
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("", []),
+        ("i", ["i"]),
+        ("iii", ["i", "i", "i"]),
+        (UP, [UP]),
+        (UP + UP, [UP, UP]),
+        ("i" + LEFT + "k", ["i", LEFT, "k"]),
+        ("\x1b", ["\x1b"]),
+        ("\x1bi", ["\x1b", "i"]),
+        ("\x1b[", ["\x1b["]),
+        ("\x1b" + RIGHT, ["\x1b", RIGHT]),
+        ("�,", ["�", ","]),
+    ],
+)
+def test_what_a_terminal_gives_is_cut_into_keys(text: str, keys: list[str]) -> None:
+    assert split(text) == keys
+
+
+@given(st.text(alphabet="i,k\x1b[ABé", max_size=40))
+def test_cutting_loses_nothing(text: str) -> None:
+    keys = split(text)
+    assert "".join(keys) == text
+    assert all(len(key) == 1 or key.startswith("\x1b[") for key in keys)
+
+
+@given(st.lists(st.sampled_from([*"io,k ", UP, DOWN, LEFT, RIGHT])))
+def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
+    assert split("".join(keys)) == keys

@@ -1,0 +1,77 @@
+"""A payload as one line of JSON, whatever it is encoded in."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+
+from acsard.cli.echo import json_line
+from acsard.messages.encodings import FORMATS, Format, encode, encoding_name
+from tests.unit.messages.examples import OUTPUTS
+
+BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("named", [True, False])
+def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
+    line = json_line(encoding_name(form, "State") if named else "", encode(BODY, form))
+    assert msgspec.json.decode(line) == BODY
+    assert "\n" not in line
+
+
+def test_a_whole_message_is_shown_in_full() -> None:
+    line = json_line("", encode(OUTPUTS, "msgpack"))
+    assert msgspec.json.decode(line) == msgspec.json.decode(encode(OUTPUTS, "json"))
+
+
+def test_white_space_between_is_dropped() -> None:
+    assert json_line("", b' {"a" : 1,\n "b": [1, 2]}\n') == '{"a":1,"b":[1,2]}'
+
+
+def test_an_encoding_may_name_json_that_is_no_object() -> None:
+    assert json_line("application/json", b"[1, 2]") == "[1,2]"
+
+
+def test_a_number_that_is_not_finite_is_null() -> None:
+    assert json_line("", msgspec.msgpack.encode({"a": math.nan, "b": math.inf})) == (
+        '{"a":null,"b":null}'
+    )
+
+
+@pytest.mark.parametrize(
+    ("encoding", "payload"),
+    [
+        ("", b""),
+        ("", b"stop"),
+        ("", b"[1]"),
+        ("", b'{"a":'),
+        ("", b'{"a":1} x'),
+        ("", b'{"a":"\xff"}'),
+        ("", b"\x81\xa1a"),
+        ("", b"\x81\xa1a\xa1\xff"),
+        ("", b"\x00\x01\x00\x00"),
+        ("application/json", b"\x80"),
+        ("application/msgpack", b"\xc1"),
+        ("application/msgpack", b"{}"),
+    ],
+)
+def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, payload: bytes) -> None:
+    assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        msgspec.msgpack.encode({None: 1}),
+        msgspec.msgpack.encode({(1, 2): 1}),
+        msgspec.msgpack.encode({"a": msgspec.msgpack.Ext(5, b"x")}),
+        b'{"a":' + b"[" * 3000 + b"]" * 3000 + b"}",
+        b"\x81\xa1a" + b"\x91" * 3000 + b"\xc0",
+    ],
+    ids=["none-key", "list-key", "ext", "deep-json", "deep-msgpack"],
+)
+def test_echo_survives_any_payload(payload: bytes) -> None:
+    assert json_line("", payload).isprintable()

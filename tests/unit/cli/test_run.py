@@ -1,0 +1,52 @@
+"""The configuration keys that the command line of `run` can give."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from acsard.cli import run
+from acsard.config import parse
+from acsard.settings import Config
+
+
+def given_by(*words: str) -> dict[str, dict[str, object]]:
+    parser = argparse.ArgumentParser()
+    run.add(parser.add_subparsers())
+    return run.overrides(parser.parse_args(["run", *words]))
+
+
+def test_without_options_nothing_is_overridden() -> None:
+    assert given_by() == {}
+
+
+def test_the_options_are_the_keys_of_the_configuration() -> None:
+    given = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7",
+                     "--listen", "tcp/127.0.0.1:1")  # fmt: skip
+    config = parse(b"", given)
+    assert (config.mcu.port, config.mcu.baud_rate) == ("/dev/x", 57600)
+    assert config.robot.id == "r7"
+    assert config.bus.listen == ("tcp/127.0.0.1:1",)
+
+
+@pytest.mark.parametrize(
+    ("words", "table"),
+    [(["--port", "x"], "mcu"), (["--id", "x"], "robot"), (["--listen", "tcp/[::1]:1"], "bus")],
+)
+def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> None:
+    given = given_by(*words)
+    assert list(given) == [table]
+    config, default = parse(b"", given), Config()
+    changed = [n for n in Config.__struct_fields__ if getattr(config, n) != getattr(default, n)]
+    assert changed == [table]
+
+
+def test_the_banner_tells_a_simulator_from_a_robot() -> None:
+    simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3", True)
+    real = run.banner(Config(), "acsard.toml", "/dev/ttyUSB0", False)
+    assert "SIMULATOR" in simulated
+    assert "no real robot will move" in simulated
+    assert "SIMULATOR" not in real
+    assert "/dev/ttyUSB0 at 115200 baud" in real
+    assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))

@@ -1,0 +1,613 @@
+"""Who drives: priority, timeouts, neutral first, and the age of stamped commands."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.drive.arbiter import (
+    DRIFT,
+    FORGET_NS,
+    MAX_SENDERS,
+    Arbiter,
+    Choice,
+    Freshness,
+)
+from acsard.settings import CommandsConfig, Source
+from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
+
+MS = 1_000_000
+HOUR_NS = 3600 * NS_PER_S
+GO = Twist(0.5, 0.2)
+BACK = Twist(-0.3, 0.0)
+
+HIGH = Source("high", 100)
+SLOW = Source("slow", 100, timeout=1.0)
+LEFT = Source("left", 50)
+RIGHT = Source("right", 50)
+LOW = Source("low", 10)
+
+
+class Bench:
+    """An arbiter and its time; `offset_ns` is how far the senders' clocks are ahead."""
+
+    def __init__(self, *sources: Source, neutral_first: bool = True, armed: bool = True) -> None:
+        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources))
+        self.arbiter.require_neutral()
+        self.now_ns = 10 * NS_PER_S
+        self.offset_ns = 1_800_000_000 * NS_PER_S
+        if armed:
+            for source in sources:
+                self.send(source, REST)
+            self.wait(5000)
+
+    def wait(self, ms: float) -> Bench:
+        self.now_ns += int(ms * MS)
+        return self
+
+    def send(self, source: Source | str, twist: Twist = GO) -> str:
+        name = source if isinstance(source, str) else source.name
+        return self.arbiter.accept(Command(name, twist, self.now_ns))
+
+    def stamped(self, source: Source, late_ms: float = 0.0, sender: str = "") -> str:
+        """Send a command that was stamped `late_ms` ago by the sender's clock."""
+        stamp_ns = self.now_ns + self.offset_ns - int(late_ms * MS)
+        return self.arbiter.accept(Command(source.name, GO, self.now_ns, stamp_ns, sender))
+
+    def choice(self) -> Choice:
+        return self.arbiter.choose(self.now_ns)
+
+    def driver(self) -> str:
+        """Whose command is followed now, "" if nobody's."""
+        choice = self.choice()
+        return "" if choice.twist is None else choice.source
+
+    def status(self, source: Source) -> SourceStatus:
+        (status,) = (s for s in self.arbiter.sources(self.now_ns) if s.name == source.name)
+        return status
+
+
+# one source
+
+
+def test_nobody_drives_when_nobody_commands() -> None:
+    choice = Bench(HIGH, LOW).choice()
+    assert (choice.source, choice.twist, choice.arrived_ns) == ("", None, None)
+    assert choice.reason.startswith("no commands")
+
+
+def test_without_sources_nobody_drives() -> None:
+    assert Bench().driver() == ""
+
+
+def test_a_command_is_followed_and_the_reason_names_its_source() -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH) == ""
+    assert bench.choice() == Choice("high", GO, "commanded by high", bench.now_ns)
+
+
+def test_the_newest_command_counts() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH, GO)
+    bench.send(HIGH, BACK)
+    assert bench.choice().twist == BACK
+
+
+def test_a_zero_is_a_command_too() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH, REST)
+    assert bench.choice().twist == REST
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("source", [HIGH, SLOW, Source("quick", 1, timeout=0.02)])
+def test_a_command_counts_until_the_timeout_of_its_source(source: Source) -> None:
+    bench = Bench(source)
+    bench.send(source)
+    bench.wait(source.timeout * 1000)
+    assert bench.driver() == source.name
+    bench.wait(0.000001)
+    assert bench.driver() == ""
+
+
+def test_each_command_begins_the_timeout_again() -> None:
+    bench = Bench(HIGH)
+    for _ in range(10):
+        bench.send(HIGH)
+        assert bench.wait(240).driver() == "high"
+
+
+# refusals
+
+
+@pytest.mark.parametrize(
+    "twist",
+    [
+        Twist(math.nan, 0.0),
+        Twist(0.0, math.nan),
+        Twist(math.inf, 0.0),
+        Twist(0.0, -math.inf),
+    ],
+)
+def test_what_is_not_finite_is_refused(twist: Twist) -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH, twist) == "not_finite"
+    assert bench.driver() == ""
+
+
+def test_an_unknown_source_is_refused_and_never_listed() -> None:
+    bench = Bench(HIGH)
+    assert bench.send("stranger") == "unknown_source"
+    assert bench.driver() == ""
+    assert [s.name for s in bench.arbiter.sources(bench.now_ns)] == ["high"]
+
+
+def test_a_huge_command_is_accepted_for_the_limits_to_clamp() -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH, Twist(1e308, -1e308)) == ""
+
+
+def test_a_refused_command_refreshes_no_timeout() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(200)
+    assert bench.send(HIGH, Twist(math.nan, 0.0)) == "not_finite"
+    assert bench.wait(60).driver() == ""
+
+
+def test_a_refused_command_changes_no_twist() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.send(HIGH, Twist(math.nan, 0.0))
+    assert bench.choice().twist == GO
+
+
+# several sources
+
+
+def test_the_higher_priority_drives_whatever_the_order_of_arrival() -> None:
+    for first, second in ((HIGH, LOW), (LOW, HIGH)):
+        bench = Bench(LOW, HIGH)
+        bench.send(first)
+        bench.send(second)
+        assert bench.driver() == "high"
+
+
+def test_the_higher_priority_takes_over_at_once() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    assert bench.driver() == "low"
+    bench.send(HIGH, BACK)
+    assert bench.choice().twist == BACK
+
+
+def test_when_the_higher_priority_falls_silent_the_lower_takes_over_with_its_own_command() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH, GO)
+    bench.wait(200).send(LOW, BACK)
+    assert bench.driver() == "high"
+    assert bench.wait(51).choice().twist == BACK
+
+
+def test_when_the_higher_priority_falls_silent_an_old_lower_command_stays_dead() -> None:
+    bench = Bench(SLOW, LOW)
+    bench.send(SLOW)
+    bench.send(LOW)
+    bench.wait(1000)
+    assert bench.driver() == "slow"
+    assert bench.wait(1).driver() == ""
+
+
+def test_the_order_of_configuration_does_not_matter() -> None:
+    for sources in ((HIGH, LEFT, LOW), (LOW, LEFT, HIGH), (LEFT, HIGH, LOW)):
+        bench = Bench(*sources)
+        for source in sources:
+            bench.send(source)
+        assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equals_the_first_to_come_keeps_the_robot(sources: tuple[Source, ...]) -> None:
+    bench = Bench(*sources)
+    for _ in range(50):
+        bench.send(LEFT)
+        assert bench.driver() == "left"
+        bench.wait(20).send(RIGHT)
+        assert bench.driver() == "left"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equals_the_second_takes_over_when_the_first_is_silent_and_keeps_it(
+    sources: tuple[Source, ...],
+) -> None:
+    bench = Bench(*sources)
+    bench.send(LEFT)
+    assert bench.driver() == "left"
+    bench.wait(200).send(RIGHT)
+    assert bench.wait(51).driver() == "right"
+    bench.send(LEFT)
+    assert bench.driver() == "right"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT, HIGH), (RIGHT, LEFT, HIGH)])
+def test_among_equals_the_first_to_come_has_the_robot_back_after_a_higher_one(
+    sources: tuple[Source, ...],
+) -> None:
+    bench = Bench(*sources)
+    bench.send(RIGHT)
+    assert bench.driver() == "right"
+    bench.wait(10).send(LEFT)
+    bench.send(RIGHT)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    for _ in range(3):
+        bench.wait(100).send(LEFT)
+        bench.send(RIGHT)
+    assert bench.driver() == "right"
+
+
+def test_among_equals_the_first_to_come_is_the_first_to_arrive() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    bench.wait(1).send(LEFT)
+    assert bench.driver() == "right"
+
+
+def test_a_lower_priority_never_keeps_the_robot_from_a_higher() -> None:
+    bench = Bench(LEFT, HIGH, RIGHT)
+    bench.send(LEFT)
+    assert bench.driver() == "left"
+    bench.send(RIGHT)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+
+
+# neutral first
+
+
+def test_a_source_that_was_never_neutral_does_not_drive() -> None:
+    bench = Bench(HIGH, armed=False)
+    for _ in range(100):
+        assert bench.send(HIGH) == ""
+        assert bench.driver() == ""
+        bench.wait(50)
+
+
+def test_a_zero_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO)
+    bench.send(HIGH, REST)
+    assert bench.choice().twist == REST
+    bench.send(HIGH, GO)
+    assert bench.choice().twist == GO
+
+
+def test_a_negative_zero_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, Twist(-0.0, -0.0))
+    bench.send(HIGH, GO)
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("twist", [Twist(0.0, 1e-9), Twist(1e-9, 0.0)])
+def test_hardly_moving_is_not_neutral(twist: Twist) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, twist)
+    bench.send(HIGH, GO)
+    assert bench.driver() == ""
+
+
+@pytest.mark.parametrize("source", [HIGH, SLOW])
+def test_a_source_that_was_heard_and_then_silent_for_its_own_timeout_is_neutral(
+    source: Source,
+) -> None:
+    bench = Bench(source, armed=False)
+    bench.send(source)
+    bench.wait(source.timeout * 1000).send(source)
+    assert bench.driver() == ""
+    bench.wait(source.timeout * 1000 + 0.000001).send(source)
+    assert bench.driver() == source.name
+
+
+def test_silence_from_the_start_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.wait(60_000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_refused_zero_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, Twist(0.0, math.nan))
+    bench.stamped(HIGH)
+    stamp_ns = bench.now_ns + bench.offset_ns - HOUR_NS
+    zero = Command("high", REST, bench.now_ns, stamp_ns)
+    assert bench.arbiter.accept(zero) == "stale"
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_refused_command_is_not_heard_so_its_silence_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, Twist(math.nan, 0.0))
+    bench.wait(1000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_source_that_was_neutral_stays_so_through_its_own_silence() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(60_000).send(HIGH)
+    assert bench.driver() == "high"
+
+
+def test_the_neutral_of_one_source_is_not_that_of_another() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_every_command() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    bench.arbiter.require_neutral()
+    assert bench.driver() == ""
+    assert bench.status(LOW).age_s is None
+
+
+def test_requiring_neutral_forgets_what_was_neutral() -> None:
+    bench = Bench(HIGH)
+    bench.arbiter.require_neutral()
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_what_was_heard() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH)
+    bench.arbiter.require_neutral()
+    bench.wait(1000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_who_came_first() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    assert bench.driver() == "right"
+    bench.arbiter.require_neutral()
+    bench.wait(10).send(LEFT, REST)
+    assert bench.driver() == "left"
+    bench.wait(10).send(RIGHT, REST)
+    assert bench.driver() == "left"
+
+
+def test_a_waiting_source_holds_its_place_with_zero() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(LOW, GO)
+    assert bench.driver() == "low"
+    bench.send(HIGH, GO)
+    choice = bench.choice()
+    assert (choice.source, choice.twist, choice.arrived_ns) == ("high", None, None)
+    assert choice.reason.startswith("neutral first: high must send a zero, or pause for 0.25 s")
+
+
+def test_without_neutral_first_the_first_command_drives() -> None:
+    bench = Bench(HIGH, neutral_first=False, armed=False)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    bench.arbiter.require_neutral()
+    assert bench.driver() == ""
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+
+
+# the age of stamped commands
+
+
+def test_a_prompt_stamp_is_accepted_whatever_the_clocks_say() -> None:
+    for offset_ns in (0, HOUR_NS, -HOUR_NS, -1_800_000_000 * NS_PER_S, 1 << 62):
+        bench = Bench(HIGH)
+        bench.offset_ns = offset_ns
+        for _ in range(10):
+            assert bench.stamped(HIGH) == ""
+            bench.wait(50)
+        assert bench.driver() == "high"
+
+
+def test_a_command_later_than_the_promptest_by_more_than_the_timeout_is_stale() -> None:
+    bench = Bench(HIGH)
+    assert bench.stamped(HIGH) == ""
+    assert bench.stamped(HIGH, late_ms=250) == ""
+    assert bench.stamped(HIGH, late_ms=250.000001) == "stale"
+
+
+@pytest.mark.parametrize("source", [SLOW, Source("quick", 1, timeout=0.02)])
+def test_how_late_is_stale_depends_on_the_source(source: Source) -> None:
+    bench = Bench(source)
+    bench.stamped(source)
+    assert bench.stamped(source, late_ms=source.timeout * 1000) == ""
+    assert bench.stamped(source, late_ms=source.timeout * 1000 + 1) == "stale"
+
+
+def test_a_stale_command_refreshes_nothing() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    for _ in range(5):
+        bench.wait(51)
+        assert bench.stamped(HIGH, late_ms=5000) == "stale"
+    assert bench.driver() == ""
+
+
+def test_a_backlog_is_not_obeyed_and_what_is_fresh_again_is() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    bench.wait(3000)
+    ages = [float(age) for age in range(3000, -1, -50)]
+    answers = [bench.stamped(HIGH, late_ms=age) for age in ages]
+    # the sender has been silent for 3 s: its minimum may have risen by 3 s x 2e-4 = 0.6 ms
+    assert answers == ["stale" if age > 250.6 else "" for age in ages]
+
+
+def test_a_promptest_command_makes_the_later_ones_late() -> None:
+    bench = Bench(HIGH)
+    assert bench.stamped(HIGH, late_ms=400) == ""
+    assert bench.stamped(HIGH, late_ms=0) == ""
+    assert bench.stamped(HIGH, late_ms=400) == "stale"
+
+
+def test_each_sender_has_its_own_clock() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.stamped(HIGH, sender="alice")
+    bench.offset_ns -= HOUR_NS
+    assert bench.stamped(HIGH, sender="bob") == ""
+    assert bench.stamped(HIGH, sender="alice") == "stale"
+
+
+def test_a_sender_is_known_by_its_source_when_it_has_no_name() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.stamped(HIGH)
+    bench.offset_ns -= HOUR_NS
+    assert bench.stamped(LOW) == ""
+    assert bench.stamped(HIGH) == "stale"
+
+
+def test_one_sender_has_one_clock_on_all_its_sources() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.stamped(HIGH, sender="alice")
+    assert bench.stamped(LOW, late_ms=300, sender="alice") == "stale"
+
+
+def test_a_command_without_a_stamp_is_as_old_as_its_arrival() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    assert bench.wait(5000).send(HIGH) == ""
+
+
+def test_a_sender_that_was_silent_for_long_may_have_set_its_clock() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    bench.offset_ns -= HOUR_NS
+    bench.wait(FORGET_NS / MS)
+    assert bench.stamped(HIGH) == "stale"
+    bench.wait(FORGET_NS / MS + 1)
+    assert bench.stamped(HIGH) == ""
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_an_hour_with_a_drifting_clock_loses_no_command(drift: float) -> None:
+    # 1e-4 x 3600 s = 360 ms: more than the timeout, if nothing followed it
+    bench = Bench(HIGH)
+    for _ in range(3600 * 5):
+        bench.offset_ns -= int(drift * 200 * MS)
+        assert bench.wait(200).stamped(HIGH) == ""
+
+
+def test_a_delay_that_creeps_up_is_noticed_all_the_same() -> None:
+    # 1 ms more with each command; in the 50 ms between two the minimum may rise 0.01 ms: late by
+    # 0.99 k ms, which is over 250 ms from k = 253
+    bench = Bench(HIGH)
+    answers = [bench.wait(50).stamped(HIGH, late_ms=late) for late in range(300)]
+    assert answers == [""] * 253 + ["stale"] * 47
+
+
+def test_the_extra_delay_is_measured_from_the_promptest_command() -> None:
+    freshness = Freshness()
+    assert freshness.extra_delay_ns("a", 1000, 5000) == 0.0  # the first: delay 4000
+    assert freshness.extra_delay_ns("a", 1000, 5500) == pytest.approx(500, abs=1)
+    assert freshness.extra_delay_ns("a", 3000, 6000) == 0.0  # prompter: delay 3000
+    assert freshness.extra_delay_ns("a", 3000, 7000) == pytest.approx(1000, abs=1)
+
+
+def test_the_minimum_rises_with_time_by_the_drift_allowed() -> None:
+    freshness = Freshness()
+    freshness.extra_delay_ns("a", 0, 0)
+    silence = FORGET_NS
+    late = freshness.extra_delay_ns("a", 0, silence)
+    assert late == pytest.approx(silence - DRIFT * silence)
+
+
+def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
+    freshness = Freshness()
+    for number in range(MAX_SENDERS):
+        freshness.extra_delay_ns(f"sender {number}", 0, 0)
+    freshness.extra_delay_ns("sender 0", 0, 0)  # heard again: now number 1 is the oldest
+    freshness.extra_delay_ns("one more", 0, 0)
+    assert freshness.extra_delay_ns("sender 0", 0, 1000) > 0.0
+    assert freshness.extra_delay_ns("sender 1", 0, 1000) == 0.0
+
+
+@given(
+    jitter=st.lists(st.floats(0.0, 249.0), min_size=1, max_size=50),
+    offset_s=st.floats(-1e9, 1e9),
+)
+def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset_s: float) -> None:
+    bench = Bench(HIGH)
+    bench.offset_ns = int(offset_s * NS_PER_S)
+    for late in jitter:
+        assert bench.wait(50).stamped(HIGH, late_ms=late) == ""
+
+
+# what state shows
+
+
+def test_the_sources_are_listed_by_priority() -> None:
+    statuses = Bench(LOW, HIGH, LEFT).arbiter.sources(0)
+    assert [(s.name, s.priority) for s in statuses] == [("high", 100), ("left", 50), ("low", 10)]
+
+
+def test_a_source_that_was_never_heard_has_no_age_and_waits_for_a_command() -> None:
+    bench = Bench(HIGH, armed=False)
+    assert bench.status(HIGH) == SourceStatus("high", 100, None, "a command")
+
+
+def test_the_age_is_that_of_the_last_accepted_command() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(100).send(HIGH, Twist(math.nan, 0.0))
+    assert bench.status(HIGH).age_s == 0.1
+
+
+def test_the_source_that_drives_waits_for_nothing() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    assert bench.status(HIGH).waits_for == ""
+
+
+def test_a_silent_source_waits_for_a_command() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(251).choice()
+    assert bench.status(HIGH).waits_for == "a command"
+
+
+def test_a_source_that_was_not_neutral_says_how_to_become_so() -> None:
+    bench = Bench(SLOW, armed=False)
+    bench.send(SLOW)
+    bench.choice()
+    assert bench.status(SLOW).waits_for == (
+        "neutral first: slow must send a zero, or pause for 1 s, before it can drive"
+    )
+
+
+def test_a_lower_source_is_told_who_is_above_it() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH)
+    bench.send(LOW)
+    bench.choice()
+    assert bench.status(LOW).waits_for == "high has the higher priority: until it is silent"
+
+
+def test_an_equal_source_is_told_who_came_first() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    bench.choice()
+    bench.wait(10).send(LEFT)
+    bench.choice()
+    assert bench.status(LEFT).waits_for == (
+        "right, of the same priority, came first: until it is silent"
+    )

@@ -1,0 +1,355 @@
+"""Wheel speeds over time -> pose, wheel angles and how certain they are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
+from acsard.mcu.session import Feedback
+from acsard.settings import DriveConfig, OdometryConfig
+from acsard.values import Instant, Pose, PoseCovariance, Sample, Twist, WheelSpeeds
+from tests.vectors.drive import (
+    PATHS,
+    SEED_STEP,
+    SEED_STEP_ARC,
+    SEED_STEP_POSE,
+    SEED_STEP_TWIST,
+)
+
+AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
+Three = tuple[float, float, float]
+
+START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
+"""The default covariance of a pose that was just set."""
+
+wheel_speed = st.floats(-40.0, 40.0)
+moves = st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1))
+"""left, right (rad/s), dt (s)."""
+
+
+def odometry(settings: OdometryConfig | None = None) -> Odometry:
+    return Odometry(settings or OdometryConfig(), Kinematics(DriveConfig()))
+
+
+def feedback(left: float, right: float, dt: float, gap: float = 0.0) -> Feedback:
+    return Feedback(AT, WheelSpeeds(right, left, left, right), dt, gap)
+
+
+def same_pose(got: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
+    """Equal within `tolerance`, angles a whole turn apart being equal."""
+    turn = math.remainder(got.yaw - expected[2], math.tau)
+    return (got.x, got.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
+
+
+def matrix(p: PoseCovariance) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    return np.array(
+        [[p.xx, p.xy, p.xyaw], [p.xy, p.yy, p.yyaw], [p.xyaw, p.yyaw, p.yawyaw]], dtype=np.float64
+    )
+
+
+# the path
+
+
+@pytest.mark.parametrize("steps", [1, 2, 10, 314])
+@pytest.mark.parametrize(
+    ("left", "right", "seconds", "pose"), [pytest.param(*path[1:], id=path[0]) for path in PATHS]
+)
+def test_a_path_ends_where_geometry_says_in_however_many_steps(
+    left: float, right: float, seconds: float, pose: Three, steps: int
+) -> None:
+    robot = odometry()
+    for _ in range(steps):
+        robot.fold(feedback(left, right, seconds / steps))
+    assert same_pose(robot.pose, pose)
+
+
+def test_a_step_gives_the_twist_of_the_seed_equations() -> None:
+    sample = odometry().fold(feedback(*SEED_STEP))
+    assert (sample.twist.linear, sample.twist.angular) == pytest.approx(SEED_STEP_TWIST)
+
+
+def test_a_step_ends_on_the_arc() -> None:
+    sample = odometry().fold(feedback(*SEED_STEP))
+    assert same_pose(sample.pose, SEED_STEP_ARC, tolerance=1e-10)
+
+
+def test_the_seed_equations_end_less_than_a_millimetre_beside_the_arc() -> None:
+    assert not same_pose(odometry().fold(feedback(*SEED_STEP)).pose, SEED_STEP_POSE, 1e-4)
+    assert same_pose(odometry().fold(feedback(*SEED_STEP)).pose, SEED_STEP_POSE, 1e-3)
+
+
+@settings(max_examples=25)
+@given(distance=st.floats(-2.0, 2.0), turn=st.floats(-7.0, 7.0), yaw=st.floats(-3.0, 3.0))
+def test_the_arc_is_the_limit_of_many_small_steps_of_the_seed_equations(
+    distance: float, turn: float, yaw: float
+) -> None:
+    x, y, heading, steps = 0.0, 0.0, yaw, 4000
+    for _ in range(steps):
+        x += distance / steps * math.cos(heading)
+        y += distance / steps * math.sin(heading)
+        heading += turn / steps
+    error = abs(distance * turn) / steps + 1e-9  # of the small steps; of second order per step
+    assert same_pose(arc(Pose(0.0, 0.0, yaw), distance, turn), (x, y, heading), error)
+
+
+@given(
+    pose=st.builds(Pose, st.floats(-9, 9), st.floats(-9, 9), st.floats(-3.1, 3.1)),
+    distance=st.floats(-2.0, 2.0),
+    turn=st.floats(-7.0, 7.0),
+)
+def test_an_arc_driven_back_ends_where_it_began(pose: Pose, distance: float, turn: float) -> None:
+    there = arc(pose, distance, turn)
+    assert same_pose(arc(there, -distance, -turn), (pose.x, pose.y, pose.yaw))
+
+
+@given(distance=st.floats(-2.0, 2.0), turn=st.floats(-7.0, 7.0), share=st.floats(0.0, 1.0))
+def test_an_arc_in_two_parts_is_the_same_arc(distance: float, turn: float, share: float) -> None:
+    whole = arc(Pose(), distance, turn)
+    first = arc(Pose(), distance * share, turn * share)
+    second = arc(first, distance * (1 - share), turn * (1 - share))
+    assert same_pose(second, (whole.x, whole.y, whole.yaw))
+
+
+@pytest.mark.parametrize("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
+def test_an_arc_of_hardly_any_turn_is_a_straight_line(turn: float) -> None:
+    assert same_pose(arc(Pose(), 1.0, turn), (1.0, 0.0, turn))
+
+
+@given(path=st.lists(moves, max_size=30))
+def test_there_and_back_the_same_way_ends_where_it_began(
+    path: list[tuple[float, float, float]],
+) -> None:
+    robot = odometry()
+    for left, right, dt in path:
+        robot.fold(feedback(left, right, dt))
+    for left, right, dt in reversed(path):
+        robot.fold(feedback(-left, -right, dt))
+    assert same_pose(robot.pose, (0.0, 0.0, 0.0))
+    assert robot.fold(feedback(0.0, 0.0, 0.0)).positions == pytest.approx((0.0,) * 4, abs=1e-9)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 10, 1000, -1, -10, -1000])
+def test_yaw_is_wrapped_however_many_turns_one_step_makes(turns: int) -> None:
+    # in place: 3 rad/s are 1 rad/s of yaw
+    wheel = 3.0 * (1.0 + turns * math.tau)
+    sample = odometry().fold(feedback(-wheel, wheel, 1.0))
+    assert sample.pose.yaw == pytest.approx(1.0, abs=1e-9)
+
+
+@given(turns=st.lists(st.floats(-10.0, 10.0), max_size=50))
+def test_yaw_stays_within_half_a_turn(turns: list[float]) -> None:
+    robot = odometry()
+    for turn in turns:
+        assert abs(robot.fold(feedback(-3.0 * turn, 3.0 * turn, 1.0)).pose.yaw) <= math.pi
+    assert same_pose(robot.pose, (0.0, 0.0, sum(turns)))
+
+
+# the sample
+
+
+def test_a_sample_has_the_stamp_the_speeds_and_the_twist_of_its_line() -> None:
+    speeds = WheelSpeeds(4.0, 1.0, 3.0, 8.0)
+    sample = odometry().fold(Feedback(AT, speeds, 0.01))
+    assert (sample.at, sample.speeds) == (AT, speeds)
+    assert (sample.twist.linear, sample.twist.angular) == pytest.approx((0.2, 2 / 3))
+
+
+def test_each_wheel_turns_by_its_own_speed() -> None:
+    robot = odometry()
+    robot.fold(Feedback(AT, WheelSpeeds(1.0, 2.0, -3.0, 4.0), 0.5))
+    sample = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.25))
+    assert sample.positions == (0.75, 1.0, -1.75, 2.0)
+
+
+def test_wheel_angles_are_continuous_past_a_turn() -> None:
+    robot = odometry()
+    sample = robot.fold(feedback(10.0, 10.0, 100.0))
+    assert sample.positions == (1000.0,) * 4
+
+
+def test_the_last_twist_and_speeds_can_be_asked_for() -> None:
+    robot = odometry()
+    assert (robot.twist, robot.speeds) == (Twist(), WheelSpeeds())
+    sample = robot.fold(feedback(3.0, 9.0, 0.01))
+    assert (robot.twist, robot.speeds, robot.pose) == (sample.twist, sample.speeds, sample.pose)
+
+
+def test_the_first_line_moves_nothing() -> None:
+    sample = odometry().fold(feedback(10.0, 10.0, 0.0))
+    assert (sample.pose, sample.positions) == (Pose(), (0.0,) * 4)
+    assert sample.covariance == START
+
+
+def test_a_gap_moves_neither_pose_nor_wheels() -> None:
+    robot = odometry()
+    before = robot.fold(feedback(10.0, 10.0, 0.1))
+    after = robot.fold(feedback(10.0, 10.0, 0.0, gap=5.0))
+    assert (after.pose, after.positions) == (before.pose, before.positions)
+    assert after.speeds == before.speeds
+
+
+def test_setting_the_pose_moves_the_robot_and_leaves_the_wheels() -> None:
+    robot = odometry()
+    wheels = robot.fold(feedback(4.5, 7.5, 1.0)).positions
+    robot.set_pose(Pose(1.0, 2.0, math.pi / 2))
+    sample = robot.fold(feedback(10.0, 10.0, 1.0))
+    assert same_pose(sample.pose, (1.0, 2.5, math.pi / 2))
+    assert sample.positions[0] == wheels[0] + 10.0
+
+
+def test_setting_the_pose_wraps_its_yaw() -> None:
+    robot = odometry()
+    robot.set_pose(Pose(1.0, 2.0, 7.0))
+    assert robot.pose == Pose(1.0, 2.0, math.remainder(7.0, math.tau))
+    assert robot.pose.yaw == pytest.approx(7.0 - 2 * math.pi)
+
+
+def test_setting_the_pose_makes_it_as_certain_as_at_the_start() -> None:
+    robot = odometry()
+    assert robot.fold(feedback(4.5, 7.5, 10.0)).covariance != START
+    robot.set_pose(Pose(5.0, 5.0, 1.0))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == START
+
+
+# the covariance
+
+
+def approx(p: PoseCovariance) -> object:
+    return pytest.approx(matrix(p), rel=1e-9, abs=1e-15)
+
+
+def test_at_the_start_the_pose_is_as_certain_as_configured() -> None:
+    robot = odometry(OdometryConfig(pose_covariance_diagonal=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == PoseCovariance(1, 0, 0, 2, 0, 6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_straight_metre_adds_the_variance_worked_by_hand(sign: float) -> None:
+    # F shears y by d x yaw: yy += d2 x 1e-6, yyaw = d x 1e-6. Noise: 1e-4 per metre along x and
+    # 1e-4 per metre of yaw.
+    covariance = odometry().fold(feedback(sign * 10.0, sign * 10.0, 2.0)).covariance
+    expected = PoseCovariance(1.01e-4, 0.0, 0.0, 2e-6, sign * 1e-6, 1.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+def test_two_straight_metres_shear_y_by_the_yaw_noise_of_the_first() -> None:
+    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second adds
+    # yy += 2 x 1e-6 + 1.01e-4 = 1.05e-4, yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 2.0))
+    covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
+    expected = PoseCovariance(2.01e-4, 0.0, 0.0, 1.05e-4, 1.02e-4, 2.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+def test_facing_left_the_roles_of_x_and_y_change() -> None:
+    # cos = 0, sin = 1: the noise along the way is y's, the shear is -d x yaw on x.
+    robot = odometry()
+    robot.set_pose(Pose(0.0, 0.0, math.pi / 2))
+    covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
+    expected = PoseCovariance(2e-6, 0.0, -1e-6, 1.01e-4, 0.0, 1.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
+    # 1 rad x 1e-2 per radian
+    covariance = odometry().fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
+    assert matrix(covariance) == approx(PoseCovariance(1e-6, 0, 0, 1e-6, 0, 1e-6 + 1e-2))
+
+
+def test_an_arc_noises_along_its_chord() -> None:
+    # From yaw -pi/4 through pi/2 the chord points along x: F shears y by d x yaw.
+    # d = 0.3 x pi = 0.942478: along = 0.942478e-4, shear = 0.942478e-6, its square 0.888264e-6,
+    # yaw = 0.942478e-4 + 1e-2 x pi / 2 = 0.0158022.
+    robot = odometry()
+    robot.set_pose(Pose(0.0, 0.0, -math.pi / 4))
+    covariance = robot.fold(feedback(4.5, 7.5, math.pi)).covariance
+    expected = PoseCovariance(0.952478e-4, 0.0, 0.0, 1.888264e-6, 0.942478e-6, 0.0158032)
+    assert matrix(covariance) == pytest.approx(matrix(expected), rel=1e-5, abs=1e-15)
+
+
+def test_standing_adds_no_uncertainty() -> None:
+    robot = odometry()
+    for _ in range(100):
+        sample = robot.fold(feedback(0.0, 0.0, 0.01))
+    assert sample.covariance == START
+
+
+def test_a_gap_adds_what_the_robot_could_have_driven_in_it() -> None:
+    # last seen at 0.3 m/s and 0.5 rad/s: in 2 s 0.6 m and 1 rad, squared
+    robot = odometry()
+    before = matrix(robot.fold(feedback(4.5, 7.5, 0.0)).covariance)
+    after = matrix(robot.fold(feedback(0.0, 0.0, 0.0, gap=2.0)).covariance)
+    assert after - before == pytest.approx(np.diag([0.36, 0.36, 1.0]))
+
+
+def test_a_gap_of_a_standing_robot_adds_nothing() -> None:
+    robot = odometry()
+    robot.fold(feedback(0.0, 0.0, 0.01))
+    assert robot.fold(feedback(10.0, 10.0, 0.0, gap=2.0)).covariance == START
+
+
+def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Sample]:
+    """Each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
+    return [
+        robot.fold(
+            feedback(left, right, 0.0, gap=dt * 10) if dt > 0.09 else feedback(left, right, dt)
+        )
+        for left, right, dt in path
+    ]
+
+
+@given(path=st.lists(moves, min_size=1, max_size=50))
+def test_the_covariance_is_always_positive(path: list[tuple[float, float, float]]) -> None:
+    for sample in fold_all(odometry(), path):
+        eigenvalues = np.linalg.eigvalsh(matrix(sample.covariance))
+        assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
+
+
+@given(path=st.lists(moves, min_size=1, max_size=50))
+def test_moving_never_makes_the_pose_more_certain(
+    path: list[tuple[float, float, float]],
+) -> None:
+    yaw, volume = START.yawyaw, float(np.linalg.det(matrix(START)))
+    for sample in fold_all(odometry(), path):
+        grown = float(np.linalg.det(matrix(sample.covariance)))
+        assert sample.covariance.yawyaw >= yaw
+        assert grown >= volume * (1 - 1e-6)
+        yaw, volume = sample.covariance.yawyaw, grown
+
+
+def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
+    near, far = odometry(), odometry()
+    for step in range(1000):
+        far_sample = far.fold(feedback(9.0, 10.0, 0.01))
+        if step < 500:
+            near_sample = near.fold(feedback(9.0, 10.0, 0.01))
+    near_p, far_p = near_sample.covariance, far_sample.covariance
+    assert far_p.xx > near_p.xx
+    assert far_p.yy > near_p.yy
+    assert far_p.yawyaw > near_p.yawyaw
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e6], ids=["driving", "gaps"])
+def test_the_covariance_stays_finite_for_years(gap: float) -> None:
+    robot = odometry(
+        OdometryConfig(
+            distance_variance_per_metre=10.0,
+            yaw_variance_per_metre=10.0,
+            yaw_variance_per_radian=10.0,
+        )
+    )
+    for _ in range(20_000):
+        sample = robot.fold(feedback(40.0, 40.0, 0.0 if gap else 100.0, gap))
+        robot.fold(feedback(40.0, 40.0, 1.0))
+    values = matrix(sample.covariance)
+    assert np.isfinite(values).all()
+    assert np.diag(values).max() >= MAX_VARIANCE
+    assert np.abs(values).max() < 1e15

@@ -1,0 +1,434 @@
+"""The link's states, and the time, the gap and the session each good line belongs to."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.mcu.session import GOOD_LINES, LONG_GAP_NS, Feedback, McuSession
+from acsard.mcu.wire import wire_ns
+from acsard.settings import McuConfig, WheelMap
+from acsard.values import NS_PER_S, Instant, Received, WheelSpeeds
+from tests.vectors.lines import SEED_LINE, SEED_MOTORS
+
+MS = 1_000_000
+GOOD = SEED_LINE + b"\r\n"
+BAD = b"hello\r\n"
+WALL_NS = 1_800_000_000 * NS_PER_S
+
+
+class Bench:
+    """A session, its time, and a port that can be opened and closed."""
+
+    def __init__(self, mcu: McuConfig | None = None, rate_hz: float = 100.0) -> None:
+        self.session = McuSession(mcu or McuConfig(), rate_hz)
+        self.now_ns = 1000 * MS
+        self.opened = 0
+        self.port_open = False
+
+    @property
+    def now(self) -> Instant:
+        return Instant(self.now_ns, self.now_ns + WALL_NS)
+
+    def link(self) -> str:
+        return self.session.link
+
+    def open(self) -> Bench:
+        self.opened += 1
+        self.port_open = True
+        return self
+
+    def close(self) -> Bench:
+        self.port_open = False
+        return self
+
+    def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
+        """Let `ms` pass, then bring the session up to date with what was read just now."""
+        self.now_ns += int(ms * MS)
+        received = tuple(Received(self.now, data) for data in reads)
+        return self.session.update(self.now, self.port_open, self.opened, received)
+
+    def up(self) -> Bench:
+        """Open the port and hear good lines until the link is up."""
+        self.open().wait(10)
+        for _ in range(GOOD_LINES):
+            self.wait(10, GOOD)
+        return self
+
+
+# the link
+
+
+def test_the_link_is_down_while_the_port_is_closed() -> None:
+    bench = Bench()
+    bench.wait(10)
+    assert bench.link() == "down"
+
+
+def test_bytes_read_from_a_closed_port_are_dropped() -> None:
+    bench = Bench()
+    assert bench.wait(10, GOOD * 5) == []
+    assert bench.link() == "down"
+
+
+def test_an_open_port_is_booting() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    assert bench.link() == "booting"
+
+
+def test_the_link_is_up_with_the_third_good_line_and_not_before() -> None:
+    bench = Bench().open()
+    links = []
+    for _ in range(4):
+        bench.wait(10, GOOD)
+        links.append(bench.link())
+    assert links == ["booting", "booting", "up", "up"]
+
+
+def test_good_lines_of_one_read_count_each() -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD * 3)
+    assert bench.link() == "up"
+
+
+def test_a_bad_line_while_booting_starts_the_count_again() -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD + GOOD + BAD + GOOD + GOOD)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
+
+
+def test_a_board_that_prints_noise_keeps_booting() -> None:
+    bench = Bench().open()
+    for _ in range(100):
+        bench.wait(10, b"\x00\xf8~boot\r\n" + GOOD[:20])
+    assert bench.link() == "booting"
+
+
+def test_bad_lines_do_not_take_the_link_down_while_good_ones_come() -> None:
+    bench = Bench().up()
+    for _ in range(100):
+        bench.wait(10, BAD + BAD + GOOD + BAD)
+        assert bench.link() == "up"
+
+
+def test_after_quiet_without_a_good_line_the_link_is_stale() -> None:
+    bench = Bench().up()
+    bench.wait(100)
+    assert bench.link() == "up"
+    bench.wait(0.000001)
+    assert bench.link() == "stale"
+
+
+def test_bad_lines_do_not_hold_the_link_up() -> None:
+    bench = Bench().up()
+    for _ in range(11):
+        bench.wait(10, BAD)
+    assert bench.link() == "stale"
+
+
+def test_a_stale_link_is_up_again_after_three_good_lines() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    links = []
+    for _ in range(3):
+        bench.wait(10, GOOD)
+        links.append(bench.link())
+    assert links == ["stale", "stale", "up"]
+
+
+def test_a_stale_link_whose_port_closes_is_down() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    bench.close().wait(10)
+    assert bench.link() == "down"
+
+
+@pytest.mark.parametrize("lines", range(5))
+def test_a_reopened_port_is_booting_whatever_came_before(lines: int) -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD * lines)
+    bench.open().wait(10)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD * 2)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
+
+
+def test_half_a_line_of_the_old_session_does_not_spoil_the_first_of_the_new() -> None:
+    bench = Bench().up()
+    bench.wait(1, GOOD[:10])
+    assert len(bench.open().wait(10, GOOD)) == 1
+
+
+def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> None:
+    bench = Bench().up()
+    bench.wait(1, GOOD[:10])
+    bench.close().wait(10)
+    assert len(bench.open().wait(10, GOOD)) == 1
+
+
+# silence
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "reply_period", "quiet_ms"),
+    [
+        (100.0, 0.0, 100),  # the least
+        (40.0, 0.0, 100),  # 4 x 25 ms, just as long
+        (20.0, 0.0, 200),  # 4 x 50 ms
+        (23.0, 0.0, 173.913),  # 4 / 23 s
+        (100.0, 0.1, 300),  # 3 x 100 ms, for a sketch that speaks unprompted
+        (10.0, 0.1, 400),  # 4 x 100 ms beat 3 x 100 ms
+        (10.0, 0.2, 600),  # 3 x 200 ms beat 4 x 100 ms
+    ],
+)
+def test_quiet_is_100_ms_or_4_periods_or_3_reply_periods(
+    rate_hz: float, reply_period: float, quiet_ms: float
+) -> None:
+    session = McuSession(McuConfig(reply_period=reply_period), rate_hz)
+    assert session.quiet_ns / MS == pytest.approx(quiet_ms, abs=0.001)
+
+
+def test_the_session_is_silent_until_the_first_good_line() -> None:
+    bench = Bench().open()
+    bench.wait(10, BAD)
+    assert bench.session.silent(bench.now_ns)
+    bench.wait(10, GOOD)
+    assert not bench.session.silent(bench.now_ns)
+
+
+def test_the_session_is_silent_after_quiet() -> None:
+    bench = Bench().up()
+    assert not bench.session.silent(bench.now_ns + bench.session.quiet_ns)
+    assert bench.session.silent(bench.now_ns + bench.session.quiet_ns + 1)
+
+
+def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
+    bench = Bench().up()
+    bench.open().wait(10)
+    assert bench.session.silent(bench.now_ns)
+
+
+# the time of a line
+
+
+def test_a_line_that_ends_its_read_was_complete_when_it_was_read() -> None:
+    bench = Bench().open()
+    (feedback,) = bench.wait(10, GOOD)
+    assert feedback == Feedback(bench.now, WheelSpeeds(*SEED_MOTORS), 0.0)
+
+
+def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
+    bench = Bench(McuConfig(baud_rate=9600)).open()
+    first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
+    # 45 bytes at 9600 baud: 46.875 ms; 12 bytes: 12.5 ms
+    assert bench.now_ns - first.at.mono_ns == 46_875_000
+    assert bench.now_ns - second.at.mono_ns == 12_500_000
+    assert first.at.wall_ns - first.at.mono_ns == WALL_NS
+    assert second.at.wall_ns - second.at.mono_ns == WALL_NS
+
+
+def test_dt_is_the_time_since_the_line_before() -> None:
+    bench = Bench().open()
+    assert [f.dt for f in bench.wait(10, GOOD)] == [0.0]
+    assert [f.dt for f in bench.wait(10, GOOD)] == [0.01]
+    assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
+
+
+def test_lines_read_together_are_a_line_of_wire_apart() -> None:
+    bench = Bench().up()
+    _, second, third = bench.wait(10, GOOD * 3)
+    assert second.dt == third.dt == pytest.approx(33 * 10 / 115200, abs=1e-8)
+
+
+def test_a_line_is_never_older_than_the_one_before_it() -> None:
+    bench = Bench(McuConfig(baud_rate=9600)).open()
+    (first,) = bench.wait(10, GOOD)
+    (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire in 1 ms of time
+    assert second.at == first.at
+    assert second.dt == 0.0
+
+
+@given(
+    reads=st.lists(
+        st.tuples(st.floats(0.0, 90.0), st.integers(0, 4), st.integers(0, 32)), max_size=30
+    ),
+    baud=st.sampled_from([9600, 115200]),
+)
+def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
+    reads: list[tuple[float, int, int]], baud: int
+) -> None:
+    bench = Bench(McuConfig(baud_rate=115200 if baud == 115200 else 9600)).open()
+    heard = bench.wait(10, GOOD)
+    for ms, lines, cut in reads:
+        data = GOOD * (lines + 1)
+        heard += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
+    total = (heard[-1].at.mono_ns - heard[0].at.mono_ns) / NS_PER_S
+    assert sum(f.dt for f in heard) == pytest.approx(total, abs=1e-9)
+    assert all(f.dt >= 0.0 and f.gap == 0.0 for f in heard)
+    assert all(a.at.mono_ns <= b.at.mono_ns for a, b in pairwise(heard))
+    assert all(f.at.mono_ns <= bench.now_ns for f in heard)
+
+
+def test_a_line_cut_over_two_reads_is_as_old_as_the_second() -> None:
+    bench = Bench().up()
+    bench.wait(5, GOOD[:20])
+    (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
+    assert bench.now_ns - feedback.at.mono_ns == wire_ns(3, 115200)
+
+
+def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
+    session = McuSession(McuConfig(), 100.0)
+    for step in range(1, 10):
+        now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
+        (feedback,) = session.update(now, True, 1, (Received(now, GOOD),))
+        assert feedback.dt == (0.01 if step > 1 else 0.0)
+        assert feedback.at == now
+
+
+# gaps
+
+
+def test_after_a_gap_dt_is_zero_and_the_gap_is_its_length() -> None:
+    bench = Bench().up()
+    bench.wait(200)
+    (feedback,) = bench.wait(50, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.25)
+
+
+def test_a_silence_as_long_as_quiet_is_no_gap() -> None:
+    bench = Bench().up()
+    (feedback,) = bench.wait(100, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.1, 0.0)
+    (feedback,) = bench.wait(100.000001, GOOD)
+    assert feedback.dt == 0.0
+    assert feedback.gap > 0.1
+
+
+def test_bad_lines_do_not_fill_a_gap() -> None:
+    bench = Bench().up()
+    for _ in range(15):
+        bench.wait(10, BAD)
+    (feedback,) = bench.wait(10, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.16)
+
+
+def test_the_second_line_after_a_gap_has_its_dt_again() -> None:
+    bench = Bench().up()
+    bench.wait(500, GOOD)
+    (feedback,) = bench.wait(10, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.01, 0.0)
+
+
+def test_the_time_a_port_was_closed_is_a_gap_however_short() -> None:
+    bench = Bench().up()
+    bench.close().wait(20)
+    (feedback,) = bench.open().wait(20, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.04)
+
+
+# a new session
+
+
+def test_a_session_restarts_when_the_port_is_opened_and_only_in_that_update() -> None:
+    bench = Bench()
+    bench.wait(10)
+    assert not bench.session.restarted
+    bench.open().wait(10)
+    assert bench.session.restarted
+    bench.wait(10)
+    assert not bench.session.restarted
+
+
+def test_a_session_restarts_when_the_port_was_closed_and_opened_between_two_updates() -> None:
+    bench = Bench().up()
+    assert not bench.session.restarted
+    bench.open().wait(10, GOOD)
+    assert bench.session.restarted
+
+
+def test_a_closed_port_is_not_yet_a_new_session() -> None:
+    bench = Bench().up()
+    bench.close().wait(10)
+    assert not bench.session.restarted
+
+
+def test_a_session_restarts_with_the_first_line_after_a_long_gap() -> None:
+    bench = Bench().up()
+    bench.wait(LONG_GAP_NS / MS)
+    assert not bench.session.restarted
+    bench.wait(0, GOOD)
+    assert bench.session.restarted
+    bench.wait(10, GOOD)
+    assert not bench.session.restarted
+
+
+def test_a_session_does_not_restart_after_a_short_gap() -> None:
+    bench = Bench().up()
+    bench.wait(999.999, GOOD)
+    assert not bench.session.restarted
+
+
+def test_a_long_gap_counts_wherever_in_the_read_its_end_is() -> None:
+    bench = Bench().up()
+    bench.wait(1500, GOOD + GOOD + BAD + GOOD)
+    assert bench.session.restarted
+
+
+# counting
+
+
+def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
+    bench = Bench().up()
+    bench.wait(10, b"hello\r\n" + GOOD + b"x" * 200 + b"\n" + b"x\r\n")
+    bench.wait(10, b"ap99.999,bp00.00,cp00.00,dp00.00\n" + b"\x00" * 300)
+    bench.wait(10, b"\n" + b"ap01.00,ap00.00,cp00.00,dp00.00\n" * 3)
+    assert bench.session.good_lines == GOOD_LINES + 1
+    assert bench.session.rejects == {
+        "malformed": 2,
+        "too_long": 2,
+        "over_range": 1,
+        "wheel_twice": 3,
+    }
+
+
+def test_the_counts_go_on_in_the_next_session() -> None:
+    bench = Bench().up()
+    bench.wait(10, BAD + b"x" * 200)
+    bench.close().wait(10)
+    bench.open().wait(10, BAD + b"x" * 200 + b"\n" + GOOD)
+    assert bench.session.rejects["malformed"] == 2
+    assert bench.session.rejects["too_long"] == 2
+    assert bench.session.good_lines == GOOD_LINES + 1
+
+
+def test_the_line_is_read_by_the_wheel_map_of_the_configuration() -> None:
+    mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "-a"))
+    (feedback,) = Bench(mcu).open().wait(10, GOOD)
+    assert feedback.speeds == WheelSpeeds(10.25, -8.75, 15.0, -12.5)
+
+
+def test_the_codec_writes_the_dialect_of_the_configuration() -> None:
+    session = McuSession(McuConfig(trailing_comma=True), 100.0)
+    assert session.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
+
+
+def test_an_over_long_line_starts_the_count_of_good_lines_again() -> None:
+    bench = Bench().open()
+    for _ in range(4):
+        bench.wait(10, b"x" * 200 + b"\r\n" + GOOD)
+    assert bench.link() == "booting"
+
+
+def test_good_lines_with_silences_between_them_do_not_bring_the_link_up() -> None:
+    bench = Bench().open()
+    for _ in range(10):
+        bench.wait(150, GOOD)
+    assert bench.link() == "booting"

@@ -1,0 +1,72 @@
+"""One step's outputs with every figure different, so that a mixed-up field shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msgspec.structs import replace
+
+from acsard.values import (
+    Instant,
+    Outputs,
+    Pose,
+    PoseCovariance,
+    Sample,
+    Snapshot,
+    SourceStatus,
+    Spread,
+    Twist,
+    WheelSpeeds,
+)
+
+START = Instant(100_000_000_000, 1_700_000_000_000_000_000)
+
+SAMPLE = Sample(
+    at=Instant(104_000_000_000, 1_700_000_003_250_000_001),
+    pose=Pose(1.5, -2.5, 0.5),
+    twist=Twist(0.25, -0.75),
+    covariance=PoseCovariance(0.11, 0.12, 0.16, 0.22, 0.26, 0.66),
+    positions=(10.0, 20.0, 30.0, 40.0),
+    speeds=WheelSpeeds(1.0, 2.0, 3.0, 4.0),
+)
+
+OUTPUTS = Outputs(
+    now=Instant(104_004_000_000, 1_700_000_003_254_000_002),
+    tick=True,
+    line=None,
+    speeds=WheelSpeeds(5.0, 6.0, 7.0, 8.0),
+    applied=Twist(0.3, 0.9),
+    linked=True,
+    samples=(SAMPLE,),
+    mode="driving",
+    reason="driving: commanded by app",
+    link="up",
+    source="app",
+    command_ns=103_990_000_000,
+    status_changed=False,
+)
+
+SNAPSHOT = Snapshot(
+    pose=Pose(1.6, -2.6, 0.6),
+    measured=Twist(0.26, -0.76),
+    speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
+    sources=(
+        SourceStatus("app", 50, 0.01, ""),
+        SourceStatus("nav", 10, None, "a command"),
+    ),
+    counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
+    refused="source nav: held up",
+    lateness_us=Spread(1000, 50.0, 400.0, 900.0),
+)
+
+
+def at(instant: Instant, **changes: Any) -> Outputs:
+    """The outputs of a tick at another time, with one sample of that time."""
+    sample = replace(SAMPLE, at=instant)
+    return replace(OUTPUTS, now=instant, **({"samples": (sample,)} | changes))
+
+
+def later(seconds: float) -> Instant:
+    """That long after `START` on both clocks."""
+    ns = round(seconds * 1e9)
+    return Instant(START.mono_ns + ns, START.wall_ns + ns)

@@ -1,0 +1,405 @@
+"""A sample becomes a command or is refused whole, and nothing but `DecodeError` says so."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any
+
+import msgspec
+import pytest
+
+from acsard.drive.arbiter import Arbiter
+from acsard.drive.kinematics import Kinematics
+from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.messages.incoming import MAX_COMMAND_BYTES, Arrival, Receiver
+from acsard.settings import CommandsConfig, DriveConfig, JointsConfig
+from acsard.values import Command, Pose, Request, Twist
+
+KINEMATICS = Kinematics(DriveConfig())
+RECEIVER = Receiver(JointsConfig(), KINEMATICS)
+JOINTS = list(JointsConfig().as_tuple())
+
+ARRIVED_NS = 77_000_000_000
+AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
+        ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
+NOT_FINITE = [math.nan, math.inf, -math.inf]
+
+
+def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
+    given: dict[str, Any] = {"put": True, "encoding": "", "stamp_ns": None, "sender": ""} | changes
+    return Arrival(key=key, payload=payload, arrived_ns=ARRIVED_NS, **given)
+
+
+def command(body: object, form: Format = "msgpack", **changes: Any) -> Command:
+    return RECEIVER.command(arrival(encode(body, form), **changes))
+
+
+def wheels(body: object, form: Format = "msgpack", **changes: Any) -> Command:
+    return command(body, form, key="wheel_cmd/app", **changes)
+
+
+def refusal(incoming: Arrival) -> str:
+    with pytest.raises(DecodeError) as caught:
+        RECEIVER.command(incoming)
+    return caught.value.reason
+
+
+def refused(body: object, **changes: Any) -> str:
+    return refusal(arrival(msgspec.msgpack.encode(body), **changes))
+
+
+def twist(linear: float = 0.5, angular: float = 0.2) -> dict[str, Any]:
+    return {"linear": {"x": linear}, "angular": {"z": angular}}
+
+
+def stamped(sec: int, nanosec: int = 0) -> dict[str, Any]:
+    return {"header": {"stamp": {"sec": sec, "nanosec": nanosec}}, "twist": twist()}
+
+
+def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
+    return {"name": names or JOINTS, "velocity": list(velocity)}
+
+
+# what is a command
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_twist_is_a_command_of_the_source_in_its_key(form: Format) -> None:
+    assert command(twist(), form) == Command("app", Twist(0.5, 0.2), ARRIVED_NS, None, "cmd/app")
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
+    body = {
+        "header": {"stamp": {"sec": 3, "nanosec": 4}, "frame_id": "base_link"},
+        "twist": twist(),
+    }
+    assert command(body, form) == Command(
+        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, "cmd/app"
+    )
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_an_encoding_may_say_what_the_first_byte_would(form: Format) -> None:
+    name = f"application/{form};acsard.Twist.v1"
+    assert command(twist(), form, encoding=name).twist == Twist(0.5, 0.2)
+
+
+def test_axes_default_to_zero() -> None:
+    assert command({"linear": {}, "angular": {}}).twist == Twist(0.0, 0.0)
+    assert command({"linear": {"x": -1.5}, "angular": {}}).twist == Twist(-1.5, 0.0)
+
+
+def test_axes_a_planar_base_cannot_follow_are_ignored() -> None:
+    body = {"linear": {"x": 1, "y": 2, "z": 3}, "angular": {"x": 4, "y": 5, "z": 6}}
+    assert command(body).twist == Twist(1.0, 6.0)
+
+
+@pytest.mark.parametrize("missing", ["linear", "angular"])
+def test_both_parts_of_a_twist_are_required(missing: str) -> None:
+    body = twist()
+    del body[missing]
+    assert refused(body) == "wrong_shape"
+    assert refused({"header": {}, "twist": body}) == "wrong_shape"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"header": {}},
+        {"twist": {}},
+        {"x": 1.0},
+        twist() | {"gain": 1},
+        {"linear": {"x": 1, "X": 2}, "angular": {}},
+        {"linear": {"x": "1"}, "angular": {}},
+        {"linear": {"x": None}, "angular": {}},
+        {"linear": 1.0, "angular": 1.0},
+        {"linear": [1, 0, 0], "angular": [0, 0, 0]},
+        {"twist": twist(), "linear": {"x": 1}},
+        {"twist": twist(), "linear": {"x": 1}, "angular": {}},
+        {"twist": twist(), "header": {"stamp": 5}},
+        {"twist": twist(), "header": {"seq": 1}},
+        {"twist": {"twist": twist()}},
+    ],
+)
+def test_any_other_shape_is_refused_whole(body: object) -> None:
+    assert refused(body) == "wrong_shape"
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
+@pytest.mark.parametrize(("part", "axis"), AXES)
+def test_one_axis_that_is_not_finite_refuses_the_command_whole(
+    part: str, axis: str, bad: float
+) -> None:
+    body = twist()
+    body[part][axis] = bad
+    assert refused(body) == "not_finite"
+    assert refused({"header": {}, "twist": body}) == "not_finite"
+
+
+# wheels
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_wheel_speeds_are_the_twist_they_give(form: Format) -> None:
+    got = wheels(joints(4.0, 2.0, 2.0, 4.0), form).twist
+    assert got.linear == pytest.approx(0.05 * 3.0)
+    assert got.angular == pytest.approx(0.05 * 2.0 / 0.30)
+
+
+def test_wheels_are_found_by_their_names_in_any_order() -> None:
+    ordered = wheels(joints(1.0, 2.0, 4.0, 8.0)).twist
+    mixed = joints(4.0, 1.0, 8.0, 2.0, names=[JOINTS[2], JOINTS[0], JOINTS[3], JOINTS[1]])
+    assert wheels(mixed).twist == ordered
+
+
+def test_wheels_that_differ_on_one_side_give_the_mean_of_the_side() -> None:
+    assert wheels(joints(5.0, 1.0, 3.0, 3.0)).twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
+
+
+def test_joint_names_are_the_configured_ones() -> None:
+    receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
+    body = joints(1.0, 1.0, 1.0, 1.0, names=["rl", "fr", "rr", "fl"])
+    got = receiver.command(arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app"))
+    assert got.twist.linear == pytest.approx(0.05)
+    assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        joints(),
+        joints(1.0, 2.0, 3.0),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0),
+        joints(1.0, 2.0, 3.0, names=JOINTS[:3]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], JOINTS[0]]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS, JOINTS[0]]),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS, "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS, JOINTS[0]]),
+        {"velocity": [1.0, 2.0, 3.0, 4.0]},
+        {"name": JOINTS, "position": [1.0, 2.0, 3.0, 4.0]},
+    ],
+)
+def test_all_four_wheels_or_none(body: object) -> None:
+    assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
+@pytest.mark.parametrize("place", range(4))
+def test_one_wheel_that_is_not_finite_refuses_all_four(place: int, bad: float) -> None:
+    velocity = [1.0] * 4
+    velocity[place] = bad
+    assert refused(joints(*velocity), key="wheel_cmd/app") == "not_finite"
+
+
+@pytest.mark.parametrize("unused", ["position", "effort"])
+def test_a_number_that_is_not_finite_in_an_unused_field_refuses_too(unused: str) -> None:
+    body = joints(1.0, 1.0, 1.0, 1.0) | {unused: [0.0, math.nan]}
+    assert refused(body, key="wheel_cmd/app") == "not_finite"
+
+
+def test_wheel_speeds_that_overflow_are_refused() -> None:
+    assert refused(joints(1e308, 1e308, 1e308, 1e308), key="wheel_cmd/app") == "not_finite"
+    assert refused(joints(1e308, -1e308, -1e308, 1e308), key="wheel_cmd/app") == "not_finite"
+
+
+def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
+    assert refused(twist(), key="wheel_cmd/app") == "wrong_shape"
+    assert refused(joints(1.0, 1.0, 1.0, 1.0), key="cmd/app") == "wrong_shape"
+
+
+# how it came
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["cmd/*", "cmd/**", "**", "*/app", "wheel_cmd/*", "wheel_cmd/**", "cmd/a$*", "*",
+     "acsard/*/cmd/app", "cmd/app/more", "acsard/**"],
+)  # fmt: skip
+def test_a_command_needs_its_exact_key(key: str) -> None:
+    assert refused(twist(), key=key) == "wildcard"
+
+
+@pytest.mark.parametrize("key", ["cmd/app", "wheel_cmd/app"])
+def test_a_delete_is_not_a_command(key: str) -> None:
+    assert refused(twist(), key=key, put=False) == "not_a_put"
+
+
+def test_a_command_may_be_as_big_as_the_limit_and_no_bigger() -> None:
+    text = encode(twist(), "json")
+    largest = text + b" " * (MAX_COMMAND_BYTES - len(text))
+    assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
+    assert refusal(arrival(largest + b" ")) == "too_big"
+    assert refusal(arrival(largest + b" ", key="wheel_cmd/app")) == "too_big"
+
+
+def test_no_reason_outweighs_another_refusal() -> None:
+    assert refusal(arrival(b"", key="cmd/*", put=False)) == "wildcard"
+
+
+# whose clock
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 5])
+def test_the_stamp_of_the_header_counts_before_that_of_the_arrival(stamp_ns: int | None) -> None:
+    got = command(stamped(1_700_000_000, 500_000_000), stamp_ns=stamp_ns)
+    assert got.stamp_ns == 1_700_000_000_500_000_000
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 5])
+def test_a_header_stamp_of_zero_is_none(stamp_ns: int | None) -> None:
+    assert command(stamped(0), stamp_ns=stamp_ns).stamp_ns == stamp_ns
+    assert command(twist(), stamp_ns=stamp_ns).stamp_ns == stamp_ns
+
+
+def test_wheel_commands_are_stamped_the_same_way() -> None:
+    body = joints(1.0, 1.0, 1.0, 1.0)
+    header = {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
+    assert wheels(body | header, stamp_ns=5).stamp_ns == 9_000_000_001
+    assert wheels(body, stamp_ns=5).stamp_ns == 5
+
+
+def test_the_sender_is_the_one_of_the_arrival_else_the_key() -> None:
+    assert command(twist(), sender="z1").sender == "z1"
+    assert command(twist(), sender="").sender == "cmd/app"
+
+
+def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
+    assert command(stamped(1), stamp_ns=2).arrived_ns == ARRIVED_NS
+
+
+# services
+
+
+@pytest.mark.parametrize("verb", ["stop", "clear", "activate", "deactivate", "reset_odometry"])
+@pytest.mark.parametrize("payload", [b"", b"{}", b"\xff garbage"])
+def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
+    assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
+    payload = encode({"x": 1.5, "y": -2, "yaw": 0.5}, form)
+    assert Receiver.request("set_pose", 7, "", payload) == Request(
+        "set_pose", 7, Pose(1.5, -2.0, 0.5)
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ({}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0, "yaw": "0"}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0, "yaw": 0.0, "z": 0.0}, "wrong_shape"),
+        ({"x": math.nan, "y": 0.0, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": math.inf, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": 0.0, "yaw": -math.inf}, "not_finite"),
+        ({"x": 1.1e6, "y": 0.0, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": -1.1e6, "yaw": 0.0}, "not_finite"),
+    ],
+)
+def test_set_pose_refuses_what_is_not_a_pose(body: object, reason: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        Receiver.request("set_pose", 7, "", msgspec.msgpack.encode(body))
+    assert caught.value.reason == reason
+
+
+def test_set_pose_needs_a_payload() -> None:
+    with pytest.raises(DecodeError):
+        Receiver.request("set_pose", 7, "", b"")
+
+
+# damage
+
+BODIES: list[tuple[str, dict[str, Any]]] = [
+    ("cmd/app", twist()),
+    ("cmd/app", stamped(1_700_000_000, 5)),
+    ("cmd/app", {"linear": {}, "angular": {}}),
+    ("wheel_cmd/app", joints(1.0, -2.0, 3.5, 0.0)),
+]
+VALID = [(key, encode(body, form)) for key, body in BODIES for form in FORMATS]
+
+NASTY = [
+    b"\x00", b"\xff", b"\xc0", b"\xc1", b"\xed\xa0\x80", b"\xdd\xff\xff\xff\xff",
+    b"\xdb\x7f\xff\xff\xff", b"\x91" * 1500, b"[" * 1500, b'{"linear":' * 300,
+    b"\x81\xa6linear" * 400, b"NaN", b"1e999", b"-",
+    b"\xcb\x7f\xf8\x00\x00\x00\x00\x00\x00", b"\xca\xff\x80\x00\x00", b"\xcf" + b"\xff" * 8,
+    b"\xd3\x80" + b"\x00" * 7, b"9" * 60, b"\\ud800", b'"', b"}", b"\xc9\x7f\xff\xff\xff\x01",
+]  # fmt: skip
+
+
+def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
+    """A valid payload flipped, cut, doubled, spliced or given another number once or twice."""
+    for _ in range(rnd.randint(1, 2)):
+        a = rnd.randrange(len(payload) + 1)
+        b = min(len(payload), a + rnd.randint(0, 12))
+        match rnd.randrange(7):
+            case 0 if payload:
+                i = rnd.randrange(len(payload))
+                payload = (
+                    payload[:i] + bytes([payload[i] ^ 1 << rnd.randrange(8)]) + payload[i + 1 :]
+                )
+            case 1:
+                payload = payload[:a]
+            case 2:
+                payload = payload[:a] + payload[b:]
+            case 3:
+                payload = payload[:b] + payload[a:]
+            case 4:
+                payload = payload[:a] + other[rnd.randrange(len(other) + 1) :]
+            case 5:
+                # A number of the right length but none: only msgpack can write one.
+                number = rnd.choice([math.nan, math.inf, -math.inf, 1e308, -5e-324])
+                i = payload.find(b"\xcb", a)
+                if i >= 0:
+                    payload = payload[:i] + msgspec.msgpack.encode(number) + payload[i + 9 :]
+            case _:
+                payload = payload[:a] + rnd.choice(NASTY) + payload[b:]
+    return payload
+
+
+def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> None:
+    rnd = random.Random(20_000)
+    encodings = ["", "", "application/json", "application/msgpack"]
+    reasons: dict[str, int] = {}
+    for _ in range(20_000):
+        key, payload = rnd.choice(VALID)
+        data = damage(payload, rnd.choice(VALID)[1], rnd)
+        try:
+            got = RECEIVER.command(arrival(data, key, encoding=rnd.choice(encodings)))
+        except DecodeError as error:
+            reasons[error.reason] = reasons.get(error.reason, 0) + 1
+            msgspec.json.encode(str(error))  # its words are published
+        else:
+            assert math.isfinite(got.twist.linear)
+            assert math.isfinite(got.twist.angular)
+            assert got.arrived_ns == ARRIVED_NS
+            reasons["accepted"] = reasons.get("accepted", 0) + 1
+    expected = {"accepted", "malformed", "wrong_shape", "unknown_encoding", "wrong_wheels"}
+    assert expected | {"not_finite", "too_big"} == set(reasons)
+
+
+@pytest.mark.parametrize("digits", [19, 40, 400, 4000])
+def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
+    body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * digits)
+    with pytest.raises(DecodeError):
+        RECEIVER.command(arrival(body.encode()))
+
+
+def test_whatever_the_receiver_lets_through_the_arbiter_survives() -> None:
+    body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * 400)
+    try:
+        got = RECEIVER.command(arrival(body.encode()))
+    except DecodeError:
+        return
+    Arbiter(CommandsConfig()).accept(got)
+
+
+def test_a_header_beside_a_bare_twist_is_neither_a_twist_nor_a_stamped_one() -> None:
+    with pytest.raises(DecodeError):
+        RECEIVER.command(arrival(b'{"header":{"stamp":{"sec":5}},"linear":{"x":1},"angular":{}}'))

@@ -1,0 +1,83 @@
+"""The table: every key the design promises, each once, and the form of a full key."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.messages.schema import MESSAGES
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, by_key, full_key
+
+PROMISED = [
+    ("odom", "out", "Odometry"),
+    ("tf", "out", "TFMessage"),
+    ("tf_static", "out", "TFMessage"),
+    ("wheel_states", "out", "JointState"),
+    ("cmd_vel_out", "out", "TwistStamped"),
+    ("state", "out", "RobotState"),
+    ("diagnostics", "out", "DiagnosticArray"),
+    ("cmd/<source>", "in", "Twist or TwistStamped"),
+    ("wheel_cmd/<source>", "in", "JointState"),
+    ("stop", "in", "anything"),
+    ("srv/stop", "query", "ServiceReply"),
+    ("srv/clear", "query", "ServiceReply"),
+    ("srv/activate", "query", "ServiceReply"),
+    ("srv/deactivate", "query", "ServiceReply"),
+    ("srv/reset_odometry", "query", "ServiceReply"),
+    ("srv/set_pose", "query", "ServiceReply"),
+    ("info", "query", "Info"),
+    ("config", "query", "configuration"),
+    ("interfaces", "query", "Interfaces"),
+    ("topics", "query", "Topics"),
+    ("schema/<Type>", "query", "JSON Schema"),
+    ("alive", "out", "liveliness token"),
+]
+"""DESIGN section 3."""
+
+
+def test_the_table_is_the_one_of_the_design() -> None:
+    assert sorted((t.key, t.direction, t.type) for t in TOPICS) == sorted(PROMISED)
+
+
+def test_no_key_is_there_twice() -> None:
+    assert len({topic.key for topic in TOPICS}) == len(TOPICS)
+
+
+def test_every_row_says_what_it_is_for() -> None:
+    assert all(topic.note for topic in TOPICS)
+
+
+def test_published_is_every_way_out_but_the_token() -> None:
+    names = [key for key, direction, _ in PROMISED if direction == "out" and key != "alive"]
+    assert [topic.key for topic in PUBLISHED] == names
+    assert all(topic.type in MESSAGES for topic in PUBLISHED)
+
+
+def test_only_the_static_transforms_wait_for_late_joiners() -> None:
+    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_every_service_has_a_row(service: str) -> None:
+    row = by_key(f"srv/{service}")
+    assert row is not None
+    assert row.direction == "query"
+
+
+def test_a_full_key_has_the_robot_in_it() -> None:
+    assert full_key("r7", "cmd/teleop") == "acsard/r7/cmd/teleop"
+
+
+@pytest.mark.parametrize(
+    ("key", "pattern"),
+    [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
+     ("schema/<Type>", "schema/*"), ("odom", "odom"), ("srv/stop", "srv/stop")],
+)  # fmt: skip
+def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
+    row = by_key(key)
+    assert row is not None
+    assert row.pattern == pattern
+
+
+def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
+    assert by_key("odometry") is None
+    assert by_key("cmd/teleop") is None

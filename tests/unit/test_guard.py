@@ -1,0 +1,460 @@
+"""The last look at every line: what it lets pass, what it replaces, and why."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.limits import Limiter
+from acsard.guard import Guard
+from acsard.mcu.frames import Codec
+from acsard.robot import Robot
+from acsard.settings import CommandsConfig, Config, DriveConfig, LimitsConfig, Source, WheelMap
+from acsard.values import (
+    REST,
+    STILL,
+    Command,
+    Inputs,
+    Instant,
+    Outputs,
+    Received,
+    Request,
+    Twist,
+    Verb,
+    WheelSpeeds,
+)
+
+MS = 1_000_000
+NOW_NS = 50_000 * MS
+SOURCES = (Source("app", 50), Source("slow", 10, timeout=1.0))
+CODEC = Codec(WheelMap())
+STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+NOT_A_LINE = "it is not a whole line of four wheels"
+TOO_FAST = "a wheel is over limits.wheel_speed"
+NO_LINK = "it moves a wheel without a link"
+GROWS = "a wheel grows without a fresh command in mode driving"
+
+
+def line(*wheels: float) -> bytes:
+    """The line for a, b, c, d; one figure is for all of them."""
+    return CODEC.encode(WheelSpeeds(*(wheels * 4 if len(wheels) == 1 else wheels)))
+
+
+def outputs(
+    data: bytes | None,
+    *,
+    mode: str = "driving",
+    linked: bool = True,
+    source: str = "app",
+    age_ms: float | None = 0.0,
+) -> Outputs:
+    """A step's outputs with this line; by default a fresh command is followed on a live link."""
+    return Outputs(
+        now=Instant(NOW_NS, NOW_NS),
+        tick=True,
+        line=data,
+        speeds=STILL,
+        applied=REST,
+        linked=linked,
+        samples=(),
+        mode=mode,
+        reason="",
+        link="up" if linked else "down",
+        source=source,
+        command_ns=None if age_ms is None else NOW_NS - int(age_ms * MS),
+        status_changed=False,
+    )
+
+
+def coasting(data: bytes) -> Outputs:
+    """The same without any commander."""
+    return outputs(data, mode="ready", source="", age_ms=None)
+
+
+@pytest.fixture
+def guard() -> Guard:
+    return Guard(STOP, 40.0, SOURCES)
+
+
+def sent(guard: Guard, *wheels: float) -> Guard:
+    """The guard after it let a line with these speeds pass, and it went out."""
+    data = line(*wheels)
+    assert guard.check(outputs(data)) == data
+    guard.note_sent()
+    return guard
+
+
+def objection(guard: Guard, found: Outputs) -> str:
+    """Why the line became STOP; "" when it passed as it is."""
+    passed = guard.check(found)
+    assert passed == (STOP if guard.trip else found.line)
+    return guard.trip
+
+
+# what passes
+
+
+def test_no_line_is_no_line(guard: Guard) -> None:
+    assert guard.check(outputs(None)) is None
+    assert guard.trip == ""
+
+
+@pytest.mark.parametrize("linked", [True, False])
+@pytest.mark.parametrize("mode", ["inactive", "waiting", "ready", "driving", "stopped", "fault"])
+def test_zero_passes_always(guard: Guard, mode: str, linked: bool) -> None:
+    sent(guard, 10.0)
+    assert objection(guard, outputs(STOP, mode=mode, linked=linked, age_ms=None)) == ""
+
+
+def test_a_commanded_line_passes(guard: Guard) -> None:
+    assert objection(guard, outputs(line(12.5, -8.75, 15.0, -10.25))) == ""
+
+
+def test_a_line_as_fast_as_the_last_one_sent_passes_without_a_command(guard: Guard) -> None:
+    sent(guard, 12.5, -8.75, 15.0, -10.25)
+    assert objection(guard, coasting(line(12.5, -8.75, 15.0, -10.25))) == ""
+
+
+@pytest.mark.parametrize("trailing_comma", [True, False])
+def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
+    kinematics = Kinematics(DriveConfig())
+    codec, limiter = Codec(WheelMap(), trailing_comma), Limiter(LimitsConfig(), kinematics)
+    guard = Guard(codec.stop, 40.0, SOURCES)
+    limiter.follow(Twist(0.7, -2.3), 1000.0)
+    data = codec.encode(kinematics.wheel_speeds(limiter.twist))
+    assert guard.check(outputs(data)) == data
+    guard.note_sent()
+    while limiter.twist != REST:
+        data = codec.encode(kinematics.wheel_speeds(limiter.coast(0.01)))
+        assert guard.check(coasting(data)) == data
+        guard.note_sent()
+    assert data == codec.stop
+
+
+# not a line
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\r\n",
+        b"ap01.00,bp01.00,cp01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.00",
+        b"ap01.00,bp01.00,cp01.00,dp01.00\n\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.00,\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp001.0\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01,00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp 1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp+1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp0x.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.0_\r\n",
+        b"ap01.00,bp01.00,cp01.00,dpnanan\r\n",
+        b"ap01.00,bp01.00,cp01.00,d-01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dP01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,cp01.00\r\n",
+        b"bp01.00,ap01.00,cp01.00,dp01.00\r\n",
+        b"Ap01.00,bp01.00,cp01.00,dp01.00\r\n",
+        b"ap01.00;bp01.00;cp01.00;dp01.00\r\n",
+        b"ap01.00 bp01.00,cp01.00,dp01.00\r\n",
+        b"ap01.00, bp1.00,cp01.00,dp01.00\r\n",
+        b"ap100.00,bp01.00,cp1.00,dp1.00\r\n",
+        # two lines at once: the first would be obeyed before anyone looked at it
+        b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" * 2,
+        b"ap90.00,bp90.00,cp90.00,dp90.00\r\nap01.00,bp01.00,cp01.00,dp01.00\r\n",
+    ],
+)
+def test_what_is_not_a_whole_line_of_this_dialect_becomes_stop(guard: Guard, data: bytes) -> None:
+    assert objection(guard, outputs(data)) == NOT_A_LINE
+
+
+def test_with_a_trailing_comma_only_lines_with_one_pass() -> None:
+    stop = STOP[:-2] + b",\r\n"
+    guard = Guard(stop, 40.0, SOURCES)
+    good = b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n"
+    assert guard.check(outputs(good)) == good
+    assert guard.check(outputs(line(1.0))) == stop
+    assert guard.trip == NOT_A_LINE
+    assert guard.check(outputs(b"ap12.50,bn08.75,cp15.00,dn10.25;\r\n")) == stop
+
+
+@given(data=st.binary(max_size=40))
+def test_noise_never_passes_and_never_raises(data: bytes) -> None:
+    assert objection(Guard(STOP, 40.0, SOURCES), outputs(data)) == NOT_A_LINE
+
+
+# over the limit
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_wheel_may_be_faster_than_its_limit(guard: Guard, wheel: int, sign: float) -> None:
+    speeds = [0.0, 0.0, 0.0, 0.0]
+    speeds[wheel] = sign * 40.0
+    assert objection(guard, outputs(line(*speeds))) == ""
+    speeds[wheel] = sign * 40.02
+    assert objection(guard, outputs(line(*speeds))) == TOO_FAST
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.294, 0.295, 0.296, 1.005, 39.996, 40.0, 99.985, 99.99])
+def test_a_wheel_at_its_limit_passes_however_the_limit_is_rounded(limit: float) -> None:
+    guard = Guard(STOP, limit, SOURCES)
+    assert objection(guard, outputs(line(limit))) == ""
+    assert objection(guard, outputs(line(-limit))) == ""
+
+
+# no link
+
+
+def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guard) -> None:
+    sent(guard, 10.0)
+    assert objection(guard, outputs(line(1.0), linked=False)) == NO_LINK
+    assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
+
+
+# growing
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_command_no_wheel_may_grow(guard: Guard, wheel: int, sign: float) -> None:
+    sent(guard, sign * 10.0)
+    speeds = [sign * 9.0] * 4
+    speeds[wheel] = sign * 10.01
+    assert objection(guard, coasting(line(*speeds))) == GROWS
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_command_no_wheel_may_turn_round(guard: Guard, wheel: int, sign: float) -> None:
+    sent(guard, sign * 10.0)
+    speeds = [sign * 9.0] * 4
+    speeds[wheel] = sign * -0.01
+    assert objection(guard, coasting(line(*speeds))) == GROWS
+
+
+def test_from_rest_nothing_moves_without_a_command(guard: Guard) -> None:
+    assert objection(guard, coasting(line(0.01))) == GROWS
+
+
+@pytest.mark.parametrize(
+    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "leaving", "", "Driving"]
+)
+def test_a_wheel_grows_only_in_mode_driving(guard: Guard, mode: str) -> None:
+    assert objection(guard, outputs(line(1.0), mode=mode)) == GROWS
+
+
+def test_a_wheel_grows_only_for_a_configured_source(guard: Guard) -> None:
+    assert objection(guard, outputs(line(1.0), source="stranger")) == GROWS
+    assert objection(guard, outputs(line(1.0), source="")) == GROWS
+
+
+@pytest.mark.parametrize(("source", "timeout_ms"), [("app", 250), ("slow", 1000)])
+def test_a_wheel_grows_only_for_a_command_within_the_timeout_of_its_source(
+    guard: Guard, source: str, timeout_ms: float
+) -> None:
+    fresh = outputs(line(1.0), source=source, age_ms=timeout_ms)
+    old = outputs(line(1.0), source=source, age_ms=timeout_ms + 0.001)
+    assert objection(guard, fresh) == ""
+    assert objection(guard, old) == GROWS
+    assert objection(guard, outputs(line(1.0), source=source, age_ms=None)) == GROWS
+
+
+def test_a_command_that_arrived_while_the_step_ran_is_fresh(guard: Guard) -> None:
+    assert objection(guard, outputs(line(1.0), age_ms=-1.0)) == ""
+
+
+def test_a_command_from_the_far_future_is_not_fresh(guard: Guard) -> None:
+    assert objection(guard, outputs(line(1.0), age_ms=-1000.0)) == GROWS
+
+
+# what was sent
+
+
+def test_a_line_that_did_not_go_out_is_not_what_the_next_is_compared_with(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, outputs(line(6.0))) == ""  # passed and not sent
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    assert objection(guard, coasting(line(5.0))) == ""
+
+
+def test_a_slower_line_that_did_not_go_out_does_not_lower_the_comparison(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(3.0))) == ""  # passed and not sent
+    assert objection(guard, coasting(line(4.0))) == ""
+
+
+def test_each_line_sent_lowers_what_the_next_may_say(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(3.0))) == ""
+    guard.note_sent()
+    assert objection(guard, coasting(line(3.01))) == GROWS
+
+
+def test_after_a_trip_what_was_sent_is_the_stop(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    guard.note_sent()
+    assert objection(guard, coasting(line(1.0))) == GROWS
+
+
+def test_a_trip_that_did_not_go_out_leaves_the_last_line_sent(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    assert objection(guard, coasting(line(4.0))) == ""
+
+
+def test_a_step_without_a_line_leaves_the_last_line_sent(guard: Guard) -> None:
+    sent(guard, 5.0)
+    assert guard.check(outputs(None)) is None
+    assert objection(guard, coasting(line(5.0))) == ""
+
+
+def test_the_trip_is_of_the_last_line_only(guard: Guard) -> None:
+    assert objection(guard, coasting(line(1.0))) == GROWS
+    assert objection(guard, outputs(line(1.0))) == ""
+    assert objection(guard, coasting(line(2.0))) == GROWS
+    assert guard.check(outputs(None)) is None
+    assert guard.trip == ""
+
+
+# with a robot
+
+
+class Loop:
+    """Robot and guard, wired as the control loop does it; what goes out is in `wire`."""
+
+    def __init__(self, config: Config, wheel_speed: float | None = None) -> None:
+        self.robot = Robot(config)
+        self.stop = self.robot.session.codec.stop
+        most = config.limits.wheel_speed if wheel_speed is None else wheel_speed
+        self.guard = Guard(self.stop, most, config.commands.sources)
+        self.now_ns = NOW_NS
+        self.opened = 1
+        self.superseded = False
+        self.trip = ""
+        self.trips: list[str] = []
+        self.events: list[str] = []
+        self.wire: list[tuple[bytes, Outputs]] = []
+
+    def step(
+        self,
+        *commands: Command,
+        ask: Verb | None = None,
+        ms: float = 10.0,
+        tick: bool = True,
+        heard: int = 1,
+        port_open: bool = True,
+        goes: bool = True,
+    ) -> Outputs:
+        self.now_ns += int(ms * MS)
+        now = Instant(self.now_ns, self.now_ns)
+        found = self.robot.step(
+            Inputs(
+                now=now,
+                tick=tick,
+                port_open=port_open,
+                opened=self.opened,
+                received=(Received(now, self.stop * heard),),
+                commands=commands,
+                requests=(Request(ask),) if ask else (),
+                guard_trip=self.trip,
+                superseded=self.superseded,
+            )
+        )
+        self.events += [event.name for event in found.events]
+        data, self.trip = self.guard.check(found), self.guard.trip
+        self.trips += [self.trip] * bool(self.trip)
+        if data is None:
+            self.superseded = self.superseded and not tick
+            return found
+        self.superseded = not (goes and port_open)
+        if not self.superseded:
+            self.guard.note_sent()
+            self.wire.append((data, found))
+        return found
+
+    def command(self, linear: float, angular: float = 0.0) -> Command:
+        return Command("app", Twist(linear, angular), self.now_ns)
+
+
+def test_one_trip_is_one_fault_that_names_it() -> None:
+    loop = Loop(Config(), wheel_speed=5.0)  # the robot believes in 40 rad/s
+    loop.step(heard=3)
+    loop.step(loop.command(0.0))
+    for _ in range(60):
+        found = loop.step(loop.command(1.0))
+    assert loop.trips == [TOO_FAST]
+    assert loop.events.count("fault") == 1
+    assert TOO_FAST in found.reason
+    assert loop.wire[-1][0] == STOP
+
+
+CONFIGS = [
+    Config(),
+    Config(commands=CommandsConfig(neutral_first=False)),
+    Config(limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=20.0)),
+]
+
+
+def random_walk(rng: random.Random, config: Config) -> Loop:
+    """Three seconds in which the port, the MCU, the wire and the people do what they like."""
+    loop, port_open, heard, goes = Loop(config), True, 1, 1.0
+    twist = REST
+    verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate")
+    for _ in range(300):
+        if rng.random() < (0.01 if port_open else 0.2):
+            port_open = not port_open
+            loop.opened += port_open
+        if rng.random() < 0.01:
+            loop.opened += port_open  # lost and found again between two steps
+        if rng.random() < 0.05:
+            heard = rng.choice((0, 1, 1, 1, 3))
+        if rng.random() < 0.02:
+            goes = rng.choice((1.0, 1.0, 0.7, 0.2))
+        if rng.random() < 0.1:
+            twist = rng.choice((REST, REST, Twist(0.5), Twist(-2.0, 2.0), Twist(0.0, -9.0)))
+        loop.step(
+            *[loop.command(twist.linear, twist.angular)] * (rng.random() < 0.5),
+            ask=rng.choice(verbs) if rng.random() < 0.01 else None,
+            ms=rng.choice((10.0, 10.0, 10.0, 11.0, 3.0, 60.0)),
+            tick=rng.random() < 0.85,
+            heard=heard,
+            port_open=port_open,
+            goes=rng.random() < goes,
+        )
+    return loop
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=["default", "without neutral first", "jerk"])
+def test_a_healthy_robot_never_trips_the_guard(config: Config) -> None:
+    moved = 0
+    for seed in range(40):
+        loop = random_walk(random.Random(seed), config)
+        assert loop.trips == []
+        moved += sum(data != STOP for data, _ in loop.wire)
+    assert moved > 1000
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=["default", "without neutral first", "jerk"])
+def test_on_the_wire_no_wheel_grows_without_a_fresh_command_nor_moves_without_a_link(
+    config: Config,
+) -> None:
+    for seed in range(40):
+        before = (0.0, 0.0, 0.0, 0.0)
+        for data, found in random_walk(random.Random(seed), config).wire:
+            wheels = CODEC.decode(data.rstrip()).as_tuple()
+            assert found.linked or not any(wheels)
+            arrived_ns = found.command_ns
+            fresh = arrived_ns is not None and found.now.mono_ns - arrived_ns <= 250 * MS
+            if not (fresh and found.linked and found.mode == "driving"):
+                for old, new in zip(before, wheels, strict=True):
+                    assert abs(new) <= abs(old)
+                    assert new * old >= 0.0
+            before = wheels

@@ -1,0 +1,859 @@
+"""`Robot.step`, one step at a time: link, modes, commands, lines, answers and counts."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from acsard.mcu.frames import Codec
+from acsard.robot import MAX_DT, UNHEARD_S, Robot
+from acsard.settings import (
+    CommandsConfig,
+    Config,
+    ControlConfig,
+    McuConfig,
+    Source,
+)
+from acsard.values import (
+    NS_PER_S,
+    REST,
+    STILL,
+    Answer,
+    Command,
+    Inputs,
+    Instant,
+    Outputs,
+    Pose,
+    Received,
+    Refusal,
+    Request,
+    Spread,
+    Twist,
+    Verb,
+    WheelSpeeds,
+)
+
+MS = 1_000_000
+WALL_NS = 1_800_000_000 * NS_PER_S
+GO = Twist(0.5, 0.0)
+ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+ROLLING = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+"""0.5 m/s straight on."""
+
+
+class Bench:
+    """A robot, its time, and an MCU that answers every period with `reply`."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        config = config or Config()
+        self.robot = Robot(config)
+        self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
+        self.now_ns = 50 * NS_PER_S
+        self.period_ms = 1000 / config.rate_hz
+        self.opened = 1
+        self.port_open = True
+        self.reply: bytes | None = self.codec.stop
+        self.leaving = False
+        self.out = self.robot.step(Inputs(self.now, tick=False, port_open=False))
+
+    @property
+    def now(self) -> Instant:
+        return Instant(self.now_ns, self.now_ns + WALL_NS)
+
+    def step(
+        self,
+        *commands: Twist,
+        source: str = "app",
+        ask: Verb | None = None,
+        pose: Pose | None = None,
+        ms: float | None = None,
+        tick: bool = True,
+        superseded: bool = False,
+        guard_trip: str = "",
+        refusals: tuple[Refusal, ...] = (),
+    ) -> Outputs:
+        """One period later (or `ms`): what happened meanwhile goes in, the outputs come out."""
+        self.now_ns += int((self.period_ms if ms is None else ms) * MS)
+        heard = self.reply is not None and self.port_open
+        self.out = self.robot.step(
+            Inputs(
+                now=self.now,
+                tick=tick,
+                port_open=self.port_open,
+                opened=self.opened,
+                received=(Received(self.now, self.reply),) if heard and self.reply else (),
+                commands=tuple(Command(source, twist, self.now_ns) for twist in commands),
+                requests=(Request(ask, 7, pose),) if ask else (),
+                refusals=refusals,
+                guard_trip=guard_trip,
+                superseded=superseded,
+                leaving=self.leaving,
+            )
+        )
+        return self.out
+
+    def linked(self) -> Bench:
+        """Step until the link is up."""
+        for _ in range(3):
+            self.step()
+        assert self.out.link == "up"
+        return self
+
+    def driving(self, twist: Twist = GO, steps: int = 60) -> Bench:
+        """Link up, open with a zero, and follow the twist until it is reached."""
+        self.linked().step(REST)
+        for _ in range(steps):
+            self.step(twist)
+        assert self.out.mode == "driving"
+        return self
+
+    def unplug(self) -> Bench:
+        self.port_open = False
+        return self
+
+    def replug(self) -> Bench:
+        self.port_open = True
+        self.opened += 1
+        return self
+
+    def answer(self, ask: Verb, pose: Pose | None = None) -> Answer:
+        (answer,) = self.step(ask=ask, pose=pose).answers
+        assert answer.id == 7
+        return answer
+
+    def said(self) -> WheelSpeeds | None:
+        """What the last line tells the wheels; None without a line."""
+        return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
+
+    def link(self) -> str:
+        return self.out.link
+
+    def mode(self) -> str:
+        return self.out.mode
+
+    def counters(self) -> dict[str, int]:
+        return self.robot.snapshot(self.now_ns, Spread()).counters
+
+
+def names(outputs: Outputs) -> list[str]:
+    return [event.name for event in outputs.events]
+
+
+# the link
+
+
+def test_without_a_port_the_robot_waits_and_says_why() -> None:
+    out = Bench().out
+    assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
+    assert out.reason == "the serial port is closed; it is being reopened"
+
+
+def test_an_open_port_boots_and_three_good_lines_make_it_ready() -> None:
+    bench = Bench()
+    seen = []
+    for _ in range(4):
+        out = bench.step()
+        seen.append((out.mode, out.link, out.linked))
+    booting = ("waiting", "booting", False)
+    assert seen == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
+
+
+def test_each_change_of_the_link_is_an_event_once() -> None:
+    bench = Bench()
+    assert names(bench.step()) == ["link_booting"]
+    assert names(bench.step()) == []
+    assert names(bench.step()) == ["link_up"]
+    bench.reply = None
+    assert names(bench.step(ms=101)) == ["link_stale"]
+    assert names(bench.unplug().step()) == ["link_down"]
+    assert names(bench.step()) == []
+
+
+def test_a_lost_link_is_a_warning() -> None:
+    bench = Bench().linked()
+    (event,) = bench.unplug().step().events
+    assert (event.name, event.level) == ("link_down", "warning")
+
+
+def test_every_feedback_line_is_a_sample_with_its_own_stamp() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING) * 2
+    first, second = bench.step(tick=False).samples
+    assert second.at == bench.now
+    assert first.at.mono_ns == bench.now_ns - 33 * 10 * NS_PER_S // 115200
+    assert first.speeds == second.speeds == ROLLING
+
+
+def test_a_step_without_a_tick_folds_feedback_and_sends_nothing() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, tick=False)
+    assert len(out.samples) == 1
+    assert (out.line, out.tick) == (None, False)
+    assert out.mode == "driving"
+
+
+def test_odometry_follows_the_wheels() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING)
+    for _ in range(100):
+        bench.step()
+    (sample,) = bench.out.samples
+    # 0.5 m/s for 1 s
+    assert sample.pose.x == pytest.approx(0.5)
+    assert sample.twist == Twist(0.5, 0.0)
+    assert sample.positions == pytest.approx((10.0,) * 4)
+    snapshot = bench.robot.snapshot(bench.now_ns, Spread())
+    assert (snapshot.pose, snapshot.measured) == (sample.pose, sample.twist)
+    assert snapshot.speeds == ROLLING
+
+
+def test_the_pose_does_not_jump_over_a_lost_port() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING)
+    before = bench.step().samples[-1].pose
+    bench.unplug().step(ms=3000)
+    after = bench.replug().step(ms=3000).samples[-1].pose
+    assert after == before
+
+
+# commands
+
+
+def test_a_commander_that_never_sent_a_zero_does_not_drive() -> None:
+    bench = Bench().linked()
+    for _ in range(100):
+        assert bench.step(GO).applied == REST
+    assert bench.mode() == "ready"
+    assert bench.out.reason.startswith("neutral first: app must send a zero")
+    assert bench.out.source == "app"
+
+
+def test_after_a_zero_a_command_drives() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    out = bench.step(GO)
+    assert (out.mode, out.reason) == ("driving", "driving: commanded by app")
+    assert (out.source, out.command_ns) == ("app", bench.now_ns)
+    assert out.applied.linear == pytest.approx(0.01)
+
+
+def test_without_neutral_first_the_first_command_drives() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).linked()
+    bench.step(GO)
+    assert bench.mode() == "driving"
+
+
+def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    for step in range(1, 61):
+        out = bench.step(GO)
+        assert out.applied.linear == pytest.approx(min(0.01 * step, 0.5))
+    assert out.applied == GO
+
+
+def test_the_line_says_what_is_applied() -> None:
+    bench = Bench().driving(Twist(0.3, 1.0), steps=100)
+    # 3 and 9 rad/s
+    assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
+    assert bench.out.applied == Twist(0.3, 1.0)
+    assert bench.out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
+
+
+def test_the_line_is_written_in_the_configured_dialect() -> None:
+    bench = Bench(Config(mcu=McuConfig(trailing_comma=True))).driving()
+    assert bench.out.line == b"ap10.00,bp10.00,cp10.00,dp10.00,\r\n"
+
+
+def test_a_command_beyond_the_limits_is_clamped() -> None:
+    bench = Bench().driving(Twist(2.0, 0.0), steps=150)
+    assert bench.out.applied == Twist(1.0, 0.0)
+
+
+def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zero() -> None:
+    bench = Bench().driving()
+    for _ in range(25):
+        assert bench.step().applied == GO
+    for step in range(1, 51):
+        out = bench.step()
+        assert out.applied.linear == pytest.approx(max(0.5 - 0.01 * step, 0.0), abs=1e-12)
+        assert out.mode == "ready"
+    assert out.applied == REST
+    assert out.line == ZERO_LINE
+    assert out.reason.startswith("no commands")
+
+
+def test_a_commander_that_returns_after_its_timeout_drives_on_from_the_speed_left() -> None:
+    bench = Bench().driving()
+    for _ in range(35):
+        bench.step()
+    left = bench.out.applied.linear
+    assert bench.step(GO).applied.linear == pytest.approx(left + 0.01)
+
+
+def test_commands_are_counted_and_refusals_by_reason() -> None:
+    bench = Bench().linked()
+    bench.step(REST, GO)
+    refusals = tuple(Refusal(reason, "") for reason in ("malformed", "malformed", "wildcard"))
+    bench.step(Twist(math.nan, 0.0), refusals=refusals)
+    bench.step(GO, source="stranger")
+    counters = bench.counters()
+    assert counters["commands"] == 2
+    assert counters["command_not_finite"] == 1
+    assert counters["command_unknown_source"] == 1
+    assert counters["command_malformed"] == 2
+    assert counters["command_wildcard"] == 1
+
+
+def test_the_last_refusal_is_shown_in_words() -> None:
+    bench = Bench().linked()
+    assert bench.robot.snapshot(bench.now_ns, Spread()).refused == ""
+    bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
+    assert bench.robot.snapshot(bench.now_ns, Spread()).refused == "cmd/**: no wildcards"
+    bench.step(REST, source="stranger")
+    bench.step(REST)
+    refused = bench.robot.snapshot(bench.now_ns, Spread()).refused
+    assert refused == "source stranger: not one of commands.sources"
+
+
+def test_lines_are_counted_and_rejects_by_reason_and_zeros_left_out() -> None:
+    bench = Bench().linked()
+    bench.reply = b"hello\r\n" + bench.codec.stop
+    bench.step()
+    counters = bench.counters()
+    assert counters["lines"] == 4
+    assert counters["line_malformed"] == 1
+    assert "line_too_long" not in counters
+
+
+def test_commands_are_heard_in_a_step_without_a_tick() -> None:
+    bench = Bench().linked()
+    bench.step(REST, tick=False)
+    bench.step(GO, tick=False)
+    bench.step()
+    assert bench.mode() == "driving"
+
+
+def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None:
+    bench = Bench().driving()
+    bench.step(REST, source="teleop")
+    assert bench.step(GO).source == "teleop"
+    snapshot = bench.robot.snapshot(bench.now_ns, Spread())
+    waits = {source.name: source.waits_for for source in snapshot.sources}
+    assert waits["app"] == "teleop has the higher priority: until it is silent"
+    assert waits["teleop"] == ""
+
+
+# a lost link
+
+
+def test_an_unplugged_port_is_rest_in_the_same_step() -> None:
+    bench = Bench().driving()
+    out = bench.unplug().step(GO, tick=False)
+    assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
+    assert (out.applied, out.speeds) == (REST, STILL)
+
+
+def test_a_lost_port_clears_every_command() -> None:
+    bench = Bench().driving()
+    bench.unplug().step()
+    sources = bench.robot.snapshot(bench.now_ns, Spread()).sources
+    assert {source.age_s for source in sources} == {None}
+
+
+def test_a_silent_mcu_is_rest_after_quiet() -> None:
+    bench = Bench().driving()
+    bench.reply = None
+    for _ in range(10):
+        assert bench.step(GO).applied == GO
+    out = bench.step(GO)
+    assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
+    assert out.reason == "the microcontroller has fallen silent"
+
+
+def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
+    bench = Bench().driving()
+    bench.reply = None
+    for _ in range(10):
+        bench.step(GO)  # quiet is not over yet: the last line is of this moment
+    lines = [bench.step(GO).line for _ in range(100)]
+    assert [index for index, line in enumerate(lines) if line] == list(range(9, 100, 10))
+    assert {line for line in lines if line} == {ZERO_LINE}
+
+
+def test_the_first_line_of_a_new_robot_is_zero_and_goes_at_once() -> None:
+    bench = Bench()
+    bench.reply = None
+    assert bench.step().line == ZERO_LINE
+    assert bench.step().line is None
+
+
+def test_while_it_boots_every_line_is_zero() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False)))
+    assert bench.step(REST).line == ZERO_LINE
+    assert bench.step(GO).line == ZERO_LINE
+    assert bench.link() == "booting"
+
+
+def test_after_a_short_gap_the_robot_ramps_up_again_from_zero() -> None:
+    bench = Bench().driving()
+    reply, bench.reply = bench.reply, None
+    for _ in range(50):
+        bench.step(GO)
+    bench.reply = reply
+    assert [bench.step(GO).applied.linear for _ in range(5)] == pytest.approx(
+        [0.0, 0.0, 0.01, 0.02, 0.03]
+    )
+
+
+def test_after_a_long_gap_each_source_must_be_neutral_again() -> None:
+    bench = Bench().driving()
+    reply, bench.reply = bench.reply, None
+    for _ in range(101):
+        bench.step(GO)
+    bench.reply = reply
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+    assert bench.out.reason.startswith("neutral first")
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_after_a_reopened_port_each_source_must_be_neutral_again() -> None:
+    bench = Bench().driving()
+    bench.unplug().step(GO)
+    bench.replug()
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+    assert bench.out.reason.startswith("neutral first")
+
+
+def test_a_port_reopened_between_two_steps_is_a_new_session() -> None:
+    bench = Bench().driving()
+    out = bench.replug().step(GO)
+    assert (out.link, out.applied) == ("booting", REST)
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+
+
+def test_a_zero_sent_while_the_port_was_closed_does_not_count_as_neutral() -> None:
+    bench = Bench().driving()
+    bench.unplug().step(REST)
+    bench.replug().step(GO)
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+
+
+# stop, clear, activate, deactivate
+
+
+def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
+    bench = Bench().driving()
+    answer = bench.answer("stop")
+    assert answer == Answer(7, True, "stopped and latched; srv/clear releases it")
+    # 3 m/s2: 0.03 m/s a step; 0.5 m/s take 17 of them
+    path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
+    assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
+    assert bench.mode() == "stopped"
+    assert bench.out.reason == "stopped by request; call srv/clear"
+
+
+def test_a_stop_is_an_event() -> None:
+    assert names(Bench().driving().step(ask="stop")) == ["stop"]
+
+
+def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    assert bench.answer("stop").success
+    assert names(bench.out) == []
+
+
+def test_a_refused_request_is_no_event() -> None:
+    bench = Bench().linked()
+    assert bench.answer("clear") == Answer(
+        7, False, "nothing to clear: neither stopped nor in fault"
+    )
+    assert names(bench.out) == []
+
+
+def test_a_stop_holds_over_a_lost_link() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    bench.unplug().step()
+    bench.replug()
+    for _ in range(10):
+        bench.step(REST)
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("stopped", REST)
+
+
+def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    answer = bench.answer("clear")
+    assert answer == Answer(7, True, "cleared; each source must be neutral once before it drives")
+    assert bench.mode() == "ready"
+    for _ in range(20):
+        bench.step(GO)
+        assert bench.mode() == "ready"
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_clear_without_a_link_waits_for_it() -> None:
+    bench = Bench()
+    bench.step(ask="stop")
+    bench.unplug().step()
+    bench.step(ask="clear")
+    assert bench.mode() == "waiting"
+
+
+def test_clear_leaves_a_robot_that_was_switched_off_switched_off() -> None:
+    bench = Bench().linked()
+    bench.step(ask="deactivate")
+    bench.step(ask="stop")
+    bench.step(ask="clear")
+    assert bench.mode() == "inactive"
+
+
+def test_a_stopped_robot_refuses_to_be_activated() -> None:
+    bench = Bench().linked()
+    bench.step(ask="stop")
+    assert bench.answer("activate") == Answer(7, False, "stopped: call srv/clear first")
+    assert bench.mode() == "stopped"
+
+
+def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
+    bench = Bench().driving()
+    answer = bench.answer("deactivate")
+    assert answer == Answer(7, True, "inactive: ramping to zero; srv/activate switches it on")
+    assert bench.out.applied.linear == pytest.approx(0.49)
+    for _ in range(50):
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("inactive", REST)
+    assert bench.out.reason == "switched off; call srv/activate"
+
+
+def test_activating_switches_it_on_and_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(ask="deactivate")
+    assert bench.answer("activate") == Answer(7, True, "active")
+    for _ in range(20):
+        bench.step(GO)
+    assert bench.mode() == "ready"
+    bench.step(REST)
+    bench.step(GO)
+    assert bench.mode() == "driving"
+
+
+def test_activating_an_active_robot_changes_nothing() -> None:
+    bench = Bench().driving()
+    bench.step(GO, ask="activate")
+    assert bench.mode() == "driving"
+    assert bench.step(GO).applied == GO
+
+
+def test_without_auto_activate_the_robot_starts_switched_off() -> None:
+    bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
+    assert bench.mode() == "inactive"
+    bench.step(ask="activate")
+    bench.step()
+    assert bench.mode() == "ready"
+
+
+# the pose
+
+
+def test_set_pose_puts_the_robot_there() -> None:
+    bench = Bench().linked()
+    answer = bench.answer("set_pose", Pose(1.0, 2.0, 0.5))
+    assert answer == Answer(7, True, "pose is x 1, y 2, yaw 0.5")
+    assert bench.step().samples[-1].pose == Pose(1.0, 2.0, 0.5)
+
+
+def test_reset_odometry_is_the_pose_zero() -> None:
+    bench = Bench().linked()
+    bench.step(ask="set_pose", pose=Pose(1.0, 2.0, 0.5))
+    assert bench.answer("reset_odometry") == Answer(7, True, "pose is x 0, y 0, yaw 0")
+    assert bench.step().samples[-1].pose == Pose()
+
+
+def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, ask="set_pose", pose=Pose(5.0, 5.0, 3.0))
+    assert (out.mode, out.applied) == ("driving", GO)
+
+
+def test_several_requests_of_one_step_are_answered_in_order() -> None:
+    bench = Bench().linked()
+    bench.now_ns += 10 * MS
+    requests = (Request("stop", 1), Request("clear", 2), Request("clear", 3))
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests))
+    assert [(answer.id, answer.success) for answer in out.answers] == [
+        (1, True),
+        (2, True),
+        (3, False),
+    ]
+
+
+# fault
+
+
+def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, guard_trip="a wheel is too fast")
+    assert out.mode == "fault"
+    assert out.reason == "the guard replaced a line: a wheel is too fast; call srv/clear"
+    (event,) = out.events
+    assert (event.name, event.level) == ("fault", "error")
+    for _ in range(50):
+        bench.step(REST)
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("fault", REST)
+
+
+def test_after_a_guard_trip_the_robot_goes_on_from_the_stop_that_was_sent() -> None:
+    bench = Bench().driving()
+    assert bench.step(GO, guard_trip="a wheel is too fast").line == ZERO_LINE
+
+
+def test_a_fault_keeps_its_first_reason() -> None:
+    bench = Bench().driving()
+    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, guard_trip="a wheel grows")
+    assert bench.out.reason == "the guard replaced a line: a wheel is too fast; call srv/clear"
+
+
+def test_a_fault_is_cleared_by_clear_alone() -> None:
+    bench = Bench().driving()
+    bench.step(guard_trip="a wheel is too fast")
+    assert not bench.answer("activate").success
+    assert bench.answer("stop").success
+    assert bench.mode() == "fault"
+    assert bench.answer("clear").success
+    assert bench.mode() == "ready"
+
+
+def test_after_a_fault_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, ask="clear")
+    for _ in range(20):
+        bench.step(GO)
+    assert bench.mode() == "ready"
+
+
+# leaving
+
+
+def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
+    bench = Bench().driving()
+    bench.leaving = True
+    path = [bench.step(GO).applied.linear for _ in range(20)]
+    assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
+    assert path[17:] == [0.0, 0.0, 0.0]
+    assert (bench.mode(), bench.out.reason) == ("leaving", "the daemon is going down")
+
+
+def test_leaving_is_one_event() -> None:
+    bench = Bench().driving()
+    bench.leaving = True
+    assert names(bench.step()) == ["leaving"]
+    assert names(bench.step()) == []
+
+
+@pytest.mark.parametrize("verb", ["clear", "activate", "deactivate"])
+def test_a_leaving_robot_refuses_to_be_switched(verb: Verb) -> None:
+    bench = Bench().linked()
+    bench.leaving = True
+    assert bench.answer(verb) == Answer(7, False, "the daemon is going down")
+
+
+def test_a_leaving_robot_never_drives_again() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).driving()
+    bench.leaving = True
+    for _ in range(100):
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("leaving", REST)
+
+
+# lines that did not go
+
+
+def test_a_superseded_line_never_happened() -> None:
+    # Every second line goes: two periods have passed since the last one that did.
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.01)
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.02)
+    bench.step(GO, superseded=True)
+    assert bench.out.applied.linear == pytest.approx(0.03)  # 0.01 and 20 ms
+    bench.step(GO, superseded=True)
+    assert bench.out.applied.linear == pytest.approx(0.04)  # 0.01 and 30 ms
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.05)
+
+
+def test_while_lines_are_superseded_the_speed_cannot_run_away_from_the_last_line_sent() -> None:
+    bench = Bench().driving(Twist(0.1, 0.0))
+    bench.step(Twist(1.0, 0.0))  # 0.11 m/s went out; from here nothing does
+    bench.step(Twist(1.0, 0.0))
+    for _ in range(23):
+        out = bench.step(Twist(1.0, 0.0), superseded=True)
+        assert out.applied.linear <= 0.11 + 1.0 * MAX_DT + 1e-9
+
+
+def test_a_superseded_line_in_a_ramp_brakes_as_time_passes() -> None:
+    bench = Bench().driving()
+    for _ in range(26):
+        bench.step()
+    assert bench.out.applied.linear == pytest.approx(0.49)
+    bench.step()  # does not go
+    assert bench.step(superseded=True).applied.linear == pytest.approx(0.47)  # 0.49 and 20 ms
+
+
+def test_what_was_not_said_for_too_long_is_not_resumed() -> None:
+    bench = Bench().driving()
+    assert bench.step(GO, ms=UNHEARD_S * 1000).applied == GO
+    assert bench.step(GO, ms=UNHEARD_S * 1000 + 10).applied == REST
+    assert bench.step(GO).applied.linear == pytest.approx(0.01)
+
+
+def test_lines_superseded_for_too_long_begin_again_from_rest() -> None:
+    bench = Bench().driving()
+    bench.step(GO)  # the first that does not go; the one before it is the last the MCU heard
+    path = [bench.step(GO, superseded=True).applied.linear for _ in range(26)]
+    assert path[:24] == [0.5] * 24  # 20 to 250 ms
+    assert path[24:] == [0.0, 0.0]
+
+
+def test_a_stalled_loop_does_not_leap() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.step(GO)
+    assert bench.step(GO, ms=200).applied.linear == pytest.approx(0.01 + MAX_DT)
+
+
+def test_a_stalled_loop_brakes_for_all_the_time_that_passed() -> None:
+    bench = Bench().driving()
+    bench.reply = bench.codec.stop
+    for _ in range(25):
+        bench.step()
+    assert bench.step(ms=200).applied.linear == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("neutral_first", [True, False])
+def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back(
+    neutral_first: bool,
+) -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+    bench.step(GO)  # does not go
+    bench.replug().step(GO, superseded=True)  # zero, and does not go
+    assert bench.out.applied == REST
+    bench.reply = bench.codec.stop * 2
+    bench.step(GO, superseded=True)
+    assert bench.link() == "up"
+    assert bench.out.applied.linear <= 1.0 * MAX_DT
+
+
+@pytest.mark.parametrize("neutral_first", [True, False])
+def test_nor_when_the_port_was_lost_and_found_between_two_ticks(neutral_first: bool) -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+    bench.step(GO)  # does not go
+    bench.replug()
+    for _ in range(3):
+        bench.step(GO, tick=False)
+    assert bench.link() == "up"
+    assert bench.step(GO, superseded=True).applied.linear <= 1.0 * MAX_DT
+
+
+# what changed
+
+
+def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise() -> None:
+    bench = Bench()
+    assert bench.out.status_changed
+    assert not bench.unplug().step().status_changed
+    bench.replug()
+    assert [bench.step().status_changed for _ in range(4)] == [True, False, True, False]
+    assert bench.step(REST).status_changed  # driving by app
+    assert not bench.step(GO).status_changed
+    assert bench.step(REST, source="teleop").status_changed
+    assert not bench.step(REST, source="teleop").status_changed
+    assert bench.step(ask="stop").status_changed
+
+
+def test_the_outputs_carry_the_time_of_the_step() -> None:
+    bench = Bench()
+    assert bench.step().now == bench.now
+
+
+# determinism
+
+
+def random_walk(seed: int) -> list[Outputs]:
+    """Two hundred steps of whatever may happen."""
+    rng = random.Random(seed)
+    bench = Bench(
+        Config(commands=CommandsConfig(sources=(Source("app", 50), Source("teleop", 100))))
+    )
+    found = []
+    for _ in range(200):
+        bench.reply = rng.choice((bench.codec.stop, bench.codec.encode(ROLLING), b"hello\n", None))
+        if rng.random() < 0.02:
+            bench.unplug()
+        elif rng.random() < 0.2 and not bench.port_open:
+            bench.replug()
+        verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate", "set_pose")
+        found.append(
+            bench.step(
+                *rng.choices((REST, GO, Twist(-1.0, 3.0)), k=rng.randrange(3)),
+                source=rng.choice(("app", "teleop", "stranger")),
+                ask=rng.choice(verbs) if rng.random() < 0.1 else None,
+                ms=rng.choice((3.0, 10.0, 10.0, 10.0, 25.0)),
+                tick=rng.random() < 0.8,
+                superseded=rng.random() < 0.1,
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
+    first = random_walk(seed)
+    assert first == random_walk(seed)
+    assert len({outputs.mode for outputs in first}) > 2
+
+
+def test_a_linked_robot_is_ready_in_the_step_that_activates_it() -> None:
+    bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
+    bench.step(ask="activate")
+    assert (bench.mode(), bench.link()) == ("ready", "up")
+
+
+def test_a_stop_on_the_way_down_does_not_claim_to_be_latched() -> None:
+    bench = Bench().linked()
+    bench.leaving = True
+    assert "going down" in bench.answer("stop").message
+
+
+def test_a_stop_in_fault_says_that_the_fault_holds_the_robot() -> None:
+    bench = Bench().driving()
+    bench.step(guard_trip="a wheel is too fast")
+    assert "in fault" in bench.answer("stop").message
+    assert bench.mode() == "fault"
+
+
+def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> None:
+    slow = Config(
+        control=ControlConfig(rate=10.0),
+        commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
+    )
+    bench = Bench(slow).driving(Twist(1.0), steps=30)
+    speeds = [bench.step(REST).applied.linear for _ in range(3)]
+    assert speeds == pytest.approx([0.9, 0.8, 0.7])
