@@ -1,0 +1,33 @@
+"""The simulator's daemon and a client of it, started once for the tests of a module."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import Bus, Daemon, Peer, until
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A daemon on the simulator for tests that leave no mark on it."""
+    with Daemon(tmp_path_factory.mktemp("shared")) as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def bus(shared: Daemon) -> Iterator[Bus]:
+    """A plain client of `shared`, with the link up."""
+    with Bus(shared.endpoint) as bus:
+        # Asked instead of awaited on `state`, whose next message may be 0.1 s away.
+        until(lambda: bus.state()["link"] == "up", 5.0, "link up")
+        yield bus
+
+
+@pytest.fixture
+def peer(tmp_path: Path) -> Iterator[Peer]:
+    """A serial peer that is not ours, plugged in at `tmp_path/mcu`."""
+    with Peer(tmp_path / "mcu") as peer:
+        yield peer

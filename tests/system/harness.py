@@ -1,0 +1,646 @@
+"""What the system tests share: programs as processes, an MCU that is not ours, a plain bus client.
+
+Nothing of acsard is imported here: the tests see what a stranger on the wire, on the bus or at the
+shell sees. Every wait has a deadline and waits for the thing itself; every process is ended by its
+own pid.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import zenoh
+
+T = TypeVar("T")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+START_S = 15.0
+"""A start takes 0.2 s; this is for a machine that is busy with other things."""
+
+END_S = 5.0
+"""A daemon that has not ended by then is killed, and the test fails by its exit code."""
+
+ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+ZERO = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
+
+
+def until(look: Callable[[], T | None], within: float, what: str) -> T:
+    """The first true value of `look`; fails with `what` was awaited."""
+    deadline = time.monotonic() + within
+    while True:
+        got = look()
+        if got:
+            return got
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {within:g} s: {what}")
+        time.sleep(0.005)
+
+
+def twist(linear: float, angular: float = 0.0) -> dict[str, dict[str, float]]:
+    """A command as a stranger writes it."""
+    return {"linear": {"x": linear}, "angular": {"z": angular}}
+
+
+def free_endpoint() -> str:
+    """A loopback address nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def environment(**more: str) -> dict[str, str]:
+    """The environment of a shell that knows nothing of this test run."""
+    hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "RUST_LOG")
+    env = {key: value for key, value in os.environ.items() if key not in hidden}
+    paths = [str(ROOT), *filter(None, [env.get("PYTHONPATH")])]
+    return env | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"} | more
+
+
+# processes
+
+
+class Program:
+    """A process whose output is collected while it runs; leaving ends it, whatever happened."""
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        cwd: Path | str,
+        env: Mapping[str, str] | None = None,
+        **how: Any,
+    ) -> None:
+        self.words = list(words)
+        self._how: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
+        self._how |= {"stderr": subprocess.PIPE, "cwd": str(cwd), "env": env or environment()}
+        self._how |= how
+        self.started = 0.0
+        self.out: list[str] = []
+        self.err: list[str] = []
+        self._readers: list[threading.Thread] = []
+
+    def __enter__(self: P) -> P:
+        self.started = time.monotonic()
+        self.process: subprocess.Popen[bytes] = subprocess.Popen(self.words, **self._how)
+        for stream, lines in ((self.process.stdout, self.out), (self.process.stderr, self.err)):
+            if stream is not None:
+                reader = threading.Thread(target=_collect, args=(stream, lines), daemon=True)
+                reader.start()
+                self._readers.append(reader)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        process = self.process
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(END_S)
+        for reader in self._readers:
+            reader.join(END_S)
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    @property
+    def stderr(self) -> str:
+        return "\n".join(self.err)
+
+    @property
+    def stdout(self) -> str:
+        return "\n".join(self.out)
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def ended(self, within: float) -> int:
+        """The exit code; fails when it does not end in time."""
+        try:
+            code = self.process.wait(within)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"{self.words} still runs after {within:g} s\n{self}") from None
+        for reader in self._readers:
+            reader.join(END_S)
+        return code
+
+    def says(self, text: str, within: float = START_S) -> str:
+        """The first line on standard output that holds `text`."""
+
+        def look() -> str | None:
+            found = next((line for line in list(self.out) if text in line), None)
+            if found is None and self.process.poll() is not None:
+                for reader in self._readers:
+                    reader.join(END_S)
+                if not any(text in line for line in self.out):
+                    raise AssertionError(f"ended with {self.process.returncode}\n{self}")
+            return found
+
+        return until(look, within, f"{text!r} from {self.words}\n{self}")
+
+    def __str__(self) -> str:
+        return f"--- stdout\n{self.stdout}\n--- stderr\n{self.stderr}"
+
+
+P = TypeVar("P", bound=Program)
+
+
+def _collect(stream: Any, lines: list[str]) -> None:
+    with stream:
+        for line in stream:
+            lines.append(line.decode(errors="replace").rstrip("\n"))
+
+
+def acsard(*words: str) -> list[str]:
+    """The words that run the program under test."""
+    return [sys.executable, "-m", "acsard", *words]
+
+
+class Finished(NamedTuple):
+    """What became of a program that was run to its end."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+
+
+def finish(
+    words: Sequence[str],
+    cwd: Path | str,
+    within: float = 20.0,
+    env: Mapping[str, str] | None = None,
+) -> Finished:
+    """Run a program to its end."""
+    with Program(words, cwd, env) as program:
+        code = program.ended(within)
+        seconds = time.monotonic() - program.started
+    return Finished(code, program.stdout, program.stderr, seconds)
+
+
+Tables = Mapping[str, Mapping[str, object]]
+
+
+def write_config(path: Path, tables: Tables) -> Path:
+    """A TOML file of plain tables; their values are written alike in JSON and TOML."""
+    lines = []
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+class Daemon(Program):
+    """`acsard run` with a configuration and a bus address of its own, ready when entered."""
+
+    def __init__(
+        self,
+        where: Path,
+        port: Path | str = "sim",
+        config: Tables | None = None,
+        *,
+        name: str = "daemon",
+        endpoint: str = "",
+        ready: bool = True,
+        words: Sequence[str] = (),
+        shell: str = "",
+        **how: Any,
+    ) -> None:
+        self.endpoint = endpoint or free_endpoint()
+        given = {table: dict(values) for table, values in (config or {}).items()}
+        given.setdefault("mcu", {}).setdefault("port", str(port))
+        given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
+        self.config = write_config(where / f"{name}.toml", given)
+        self._ready = ready
+        run = acsard("run", "--config", str(self.config), *words)
+        if shell:
+            run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
+        super().__init__(run, where, **how)
+
+    def __enter__(self) -> Daemon:
+        super().__enter__()
+        if self._ready:
+            try:
+                self.says("bus ")
+            except BaseException:
+                self.__exit__()
+                raise
+        return self
+
+    def events(self, name: str) -> list[dict[str, Any]]:
+        """The log lines of one event so far."""
+        found = [json.loads(line) for line in list(self.err) if line.startswith("{")]
+        return [event for event in found if event["event"] == name]
+
+
+# what the system knows of a process
+
+
+def resident_kb(pid: int) -> int:
+    """Memory in use, kB."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0])
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time of all its threads so far, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+# the microcontroller that is not ours
+
+Speeds = tuple[float, float, float, float]
+Reply = Callable[[Speeds], bytes]
+
+
+def form(
+    separator: str = ",", end: str = "\r\n", pad: int = 2, decimals: int = 2, comma: str = ""
+) -> Reply:
+    """Replies that say the speeds asked for, in one of the forms of MCU.md section 1."""
+
+    def reply(speeds: Speeds) -> bytes:
+        width = pad + 1 + decimals
+        tokens = [
+            f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):0{width}.{decimals}f}"
+            for motor, speed in zip("abcd", speeds, strict=True)
+        ]
+        return (separator.join(tokens) + comma + end).encode()
+
+    return reply
+
+
+PLAIN = form()
+
+
+def silence(speeds: Speeds) -> bytes:
+    """Hears everything, answers nothing."""
+    return b""
+
+
+class Heard(NamedTuple):
+    """A line as it came, and when."""
+
+    at: float
+    line: bytes
+
+
+class Session:
+    """All that came over one pty."""
+
+    def __init__(self) -> None:
+        self.plugged = time.monotonic()
+        self.raw: list[Heard] = []
+        self.lines: list[Heard] = []
+
+    @property
+    def stream(self) -> bytes:
+        return b"".join(piece.line for piece in list(self.raw))
+
+    def said(self) -> list[bytes]:
+        """The lines without their times."""
+        return [heard.line for heard in list(self.lines)]
+
+
+class Peer:
+    """A serial peer at the other end of a pty: records every byte, answers each command line.
+
+    It keeps a symbolic link at `path` for as long as it is plugged in, as udev does.
+    """
+
+    def __init__(self, path: Path, reply: Reply = PLAIN) -> None:
+        self.path = path
+        self.reply = reply
+        self.sessions: list[Session] = []
+        self._ends: tuple[int, int] | None = None
+        self._thread: threading.Thread | None = None
+        self._leave = threading.Event()
+        self._idle = 0
+
+    @property
+    def session(self) -> Session:
+        return self.sessions[-1]
+
+    @property
+    def lines(self) -> list[Heard]:
+        return list(self.session.lines)
+
+    def __enter__(self) -> Peer:
+        self.plug()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._ends is not None:
+            self.unplug()
+
+    def plug(self) -> None:
+        """A new pty under the same name."""
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        self._ends = master, slave
+        self.sessions.append(Session())
+        self._leave.clear()
+        self._thread = threading.Thread(target=self._serve, args=(master, self.session))
+        self._thread.start()
+        self.path.symlink_to(os.ttyname(slave))
+
+    def unplug(self) -> float:
+        """Pull the cable; when."""
+        assert self._ends is not None
+        assert self._thread is not None
+        # The link first: the number of a closed pty goes to the next who asks for one.
+        self.path.unlink()
+        self._leave.set()
+        self._thread.join()
+        for end in self._ends:
+            os.close(end)
+        self._ends = None
+        return time.monotonic()
+
+    def say(self, data: bytes) -> None:
+        """Send bytes unasked."""
+        assert self._ends is not None
+        os.write(self._ends[0], data)
+
+    def await_lines(self, count: int, within: float = 5.0) -> list[Heard]:
+        """The next `count` lines from now on."""
+        start = len(self.session.lines)
+        until(lambda: len(self.lines) >= start + count, within, f"{count} lines on the wire")
+        return self.lines[start : start + count]
+
+    def last_line(self) -> bytes:
+        """The last line ever, once the daemon has ended and all it left behind has been read."""
+        idle = self._idle
+        until(lambda: self._idle > idle, 5.0, "the line falls silent")
+        return self.session.said()[-1]
+
+    def _serve(self, master: int, session: Session) -> None:
+        held = b""
+        while not self._leave.is_set():
+            if not select.select([master], [], [], 0.05)[0]:
+                self._idle += 1
+                continue
+            data = os.read(master, 4096)
+            now = time.monotonic()
+            session.raw.append(Heard(now, data))
+            *lines, held = (held + data).split(b"\n")
+            for line in lines:
+                session.lines.append(Heard(now, line + b"\n"))
+                speeds = _speeds(line)
+                if speeds is not None:
+                    answer = self.reply(speeds)
+                    if answer:
+                        os.write(master, answer)
+
+
+def _speeds(line: bytes) -> Speeds | None:
+    """What a command line asks of the motors; None when it is not one."""
+    try:
+        tokens = line.decode().strip().rstrip(",").split(",")
+        values = [float(token[2:]) * {"p": 1, "n": -1}[token[1]] for token in tokens]
+        a, b, c, d = values if [token[0] for token in tokens] == list("abcd") else []
+    except (ValueError, KeyError, IndexError):
+        return None
+    return a, b, c, d
+
+
+def wheels(line: bytes) -> Speeds:
+    """The four speeds of a line that must be a command."""
+    speeds = _speeds(line)
+    assert speeds is not None, line
+    return speeds
+
+
+# the bus
+
+
+def client_config(endpoint: str, mode: str = "client") -> zenoh.Config:
+    """The settings any Zenoh user writes to reach one address."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    role = "listen" if mode == "router" else "connect"
+    config.insert_json5(f"{role}/endpoints", json.dumps([endpoint]))
+    return config
+
+
+def read(sample: zenoh.Sample) -> Any:
+    """A published payload as plain values, by its encoding."""
+    data = sample.payload.to_bytes()
+    if str(sample.encoding).startswith("application/json"):
+        return msgspec.json.decode(data)
+    return msgspec.msgpack.decode(data)
+
+
+class Seen(NamedTuple):
+    """A message, its encoding and when it arrived."""
+
+    at: float
+    value: Any
+    encoding: str
+
+
+class Following:
+    """What comes on a key, from now on."""
+
+    def __init__(self) -> None:
+        self.seen: list[Seen] = []
+        self._news = threading.Condition()
+
+    def add(self, sample: zenoh.Sample) -> None:
+        """Take a sample; Zenoh calls this."""
+        seen = Seen(time.monotonic(), read(sample), str(sample.encoding))
+        with self._news:
+            self.seen.append(seen)
+            self._news.notify_all()
+
+    def find(
+        self, wanted: Callable[[Any], bool], within: float, what: str, after: float = 0.0
+    ) -> Seen:
+        """The first message that is `wanted` and arrived `after` then."""
+        deadline, looked = time.monotonic() + within, 0
+        with self._news:
+            while True:
+                for seen in self.seen[looked:]:
+                    if seen.at >= after and wanted(seen.value):
+                        return seen
+                looked = len(self.seen)
+                left = deadline - time.monotonic()
+                if left <= 0 or not self._news.wait(left):
+                    last = self.seen[-1].value if self.seen else None
+                    raise AssertionError(f"not within {within:g} s: {what}; last: {last}")
+
+
+class Answered(NamedTuple):
+    """One reply to a query."""
+
+    key: str
+    ok: bool
+    encoding: str
+    payload: bytes
+
+
+class Bus:
+    """A plain Zenoh client of one robot."""
+
+    def __init__(self, endpoint: str, robot_id: str = "acsar") -> None:
+        self.session = zenoh.open(client_config(endpoint))
+        self.root = f"acsard/{robot_id}"
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.session.close()
+
+    def put(self, key: str, value: object) -> None:
+        """JSON without an encoding, as the smallest client sends it."""
+        self.session.put(f"{self.root}/{key}", json.dumps(value))
+
+    def ask(self, key: str, payload: object = None) -> list[Answered]:
+        """All replies to a query."""
+        data = None if payload is None else json.dumps(payload)
+        found = []
+        for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
+            if reply.ok is not None:
+                sample, where = reply.ok, str(reply.ok.key_expr).removeprefix(self.root + "/")
+                encoding, payload_bytes = str(sample.encoding), sample.payload.to_bytes()
+                found.append(Answered(where, True, encoding, payload_bytes))
+            elif reply.err is not None:
+                text = reply.err.payload.to_bytes()
+                found.append(Answered("", False, str(reply.err.encoding), text))
+        return found
+
+    def get(self, key: str, payload: object = None) -> Any:
+        """The one JSON reply to a query."""
+        answers = self.ask(key, payload)
+        assert len(answers) == 1, f"{key}: {answers}"
+        assert answers[0].ok, f"{key}: {answers[0]}"
+        return json.loads(answers[0].payload)
+
+    def state(self) -> Any:
+        return self.get("state")
+
+    def count(self, name: str) -> int:
+        """A counter of `state`; 0 before it first counts."""
+        return int(self.state()["counters"].get(name, 0))
+
+    @contextmanager
+    def follow(self, key: str) -> Iterator[Following]:
+        """Subscribe while entered; the daemon knows of it by then."""
+        following = Following()
+        subscriber = self.session.declare_subscriber(f"{self.root}/{key}", following.add)
+        # On one link all is in order: what is answered now was asked behind the subscription.
+        self.ask("info")
+        try:
+            yield following
+        finally:
+            subscriber.undeclare()
+
+    def linked(self, within: float = 5.0) -> None:
+        """Wait until the robot could drive."""
+        with self.follow("state") as states:
+            states.find(lambda state: state["link"] == "up", within, "link up")
+
+    def at_rest(self, within: float = 5.0) -> Any:
+        """The state when the robot is ready, obeys nobody and its wheels stand."""
+
+        def look() -> Any:
+            state = self.state()
+            return state if state["mode"] == "ready" and not any(state["wheels"]) else None
+
+        return until(look, within, "at rest")
+
+    @contextmanager
+    def commanding(
+        self, linear: float, angular: float = 0.0, *, source: str = "app", neutral: bool = True
+    ) -> Iterator[Commander]:
+        """A commander at 20 Hz that opens with a zero, unless told to be rude, while entered."""
+        commander = Commander(self, f"cmd/{source}", linear, angular)
+        if neutral:
+            before = self.count("commands")
+            self.put(commander.key, ZERO)
+            until(lambda: self.count("commands") > before, 5.0, "the zero was heard")
+        commander.thread.start()
+        try:
+            yield commander
+        finally:
+            commander.silenced.set()
+            commander.thread.join()
+
+
+class Commander:
+    """Keeps sending, whatever happens to the robot, as commanders do."""
+
+    def __init__(self, bus: Bus, key: str, linear: float, angular: float) -> None:
+        self.key = key
+        self.wish = twist(linear, angular)
+        self.silenced = threading.Event()
+        self._bus = bus
+        self.thread = threading.Thread(target=self._send)
+
+    def _send(self) -> None:
+        while not self.silenced.is_set():
+            self._bus.put(self.key, self.wish)
+            self.silenced.wait(0.05)
+
+
+class Periods(NamedTuple):
+    """What became of the control periods between two states."""
+
+    elapsed: float
+    """By the stamps of the states, at 100 Hz."""
+    sent: int
+    superseded: int
+    missed: int
+
+    @classmethod
+    def between(cls, first: Any, last: Any) -> Periods:
+        counters = ("lines_sent", "lines_superseded", "missed_periods")
+        counts = [last["counters"].get(c, 0) - first["counters"].get(c, 0) for c in counters]
+        return cls(100.0 * (seconds(last["stamp"]) - seconds(first["stamp"])), *counts)
+
+    @property
+    def accounted(self) -> int:
+        return self.sent + self.superseded + self.missed
+
+
+def seconds(stamp: Mapping[str, int]) -> float:
+    """A stamp of a message as seconds since 1970."""
+    return stamp["sec"] + stamp["nanosec"] / 1e9
+
+
+@contextmanager
+def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
+    """The alive tokens seen by a client of `endpoint`, where `daemon` is coming up."""
+
+    def connect() -> zenoh.Session | None:
+        assert daemon.process.poll() is None, f"ended with {daemon.process.returncode}\n{daemon}"
+        try:
+            return zenoh.open(client_config(endpoint))
+        except zenoh.ZError:
+            return None
+
+    with until(connect, START_S, f"somebody at {endpoint}") as session:
+        yield session.liveliness().declare_subscriber(
+            "acsard/acsar/alive", zenoh.handlers.FifoChannel(10), history=True
+        )

@@ -1,0 +1,254 @@
+"""Whatever is sent, over the real bus: refused whole, counted, said in words, and no motion."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+
+from tests.system.harness import (
+    ZERO,
+    Bus,
+    Daemon,
+    Periods,
+    Program,
+    resident_kb,
+    twist,
+    until,
+)
+from tests.system.strangers import FLOOD, words
+
+GO = json.dumps(twist(0.5)).encode()
+JOINTS = [f"{wheel}_wheel_joint" for wheel in ("front_right", "front_left", "rear_left")]
+ALL_JOINTS = [*JOINTS, "rear_right_wheel_joint"]
+
+
+class Bad(NamedTuple):
+    """What is put where, the reason it is counted under, and a word of what is said."""
+
+    payload: bytes
+    reason: str
+    said: str
+    key: str = "acsard/acsar/cmd/app"
+    encoding: str = ""
+
+
+def pack(value: object) -> bytes:
+    return msgspec.msgpack.encode(value)
+
+
+def stamped(seconds: float) -> bytes:
+    """A go that claims to be so old."""
+    sec, nanosec = divmod(int((time.time() - seconds) * 1e9), 10**9)
+    stamp = {"sec": sec, "nanosec": nanosec}
+    return json.dumps({"header": {"stamp": stamp}, "twist": twist(0.5)}).encode()
+
+
+def wheel_speeds(names: list[str], speeds: list[Any]) -> bytes:
+    return json.dumps({"name": names, "velocity": speeds}).encode()
+
+
+WHEEL = "acsard/acsar/wheel_cmd/app"
+
+BAD = {
+    "JSON cut short": Bad(GO[:-3], "malformed", "cmd/app"),
+    "JSON and more": Bad(GO + b"}", "malformed", "cmd/app"),
+    "NaN in JSON": Bad(GO.replace(b"0.5", b"NaN"), "malformed", "cmd/app"),
+    "NaN in msgpack": Bad(pack(twist(math.nan)), "not_finite", "NaN"),
+    "NaN on an axis that is ignored": Bad(
+        pack({"linear": {"x": 0.5, "z": math.nan}, "angular": {}}), "not_finite", "NaN"
+    ),
+    "infinity in msgpack": Bad(pack(twist(0.5, math.inf)), "not_finite", "infinity"),
+    "a number beyond all": Bad(GO.replace(b"0.5", b"1e400"), "wrong_shape", "cmd/app"),
+    "msgpack cut short": Bad(pack(twist(0.5))[:-1], "malformed", "cmd/app"),
+    "nothing": Bad(b"", "unknown_encoding", "neither"),
+    "words": Bad(b"forward!", "unknown_encoding", "neither"),
+    "bytes": Bad(bytes(range(0xA0, 0xFF)), "unknown_encoding", "neither"),
+    "a list": Bad(b"[0.5, 0.0]", "unknown_encoding", "neither"),
+    "JSON that claims to be msgpack": Bad(
+        GO, "wrong_shape", "cmd/app", encoding="application/msgpack"
+    ),
+    "msgpack that claims to be JSON": Bad(
+        pack(twist(0.5)), "malformed", "cmd/app", encoding="application/json"
+    ),
+    "an unknown field": Bad(GO[:-1] + b', "speed": 1}', "wrong_shape", "speed"),
+    "a misspelt axis": Bad(GO.replace(b"x", b"X"), "wrong_shape", "X"),
+    "no angular": Bad(b'{"linear": {"x": 0.5}}', "wrong_shape", "both `linear` and `angular`"),
+    "a speed in words": Bad(GO.replace(b"0.5", b'"0.5"'), "wrong_shape", "cmd/app"),
+    "null for a speed": Bad(GO.replace(b"0.5", b"null"), "wrong_shape", "cmd/app"),
+    "brackets without end": Bad(b'{"linear":' * 400, "wrong_shape", "cmd/app"),
+    "brackets in an unknown field": Bad(b'{"q":' + b"[" * 4000, "wrong_shape", "cmd/app"),
+    "5 kB": Bad(GO + b" " * 5000, "too_big", "bytes"),
+    "60 kB": Bad(GO + b" " * 60_000, "too_big", "bytes"),
+    "an unknown source": Bad(
+        GO, "unknown_source", "not one of commands.sources", "acsard/acsar/cmd/stranger"
+    ),
+    "a put on every source": Bad(GO, "wildcard", "exact key", "acsard/acsar/cmd/*"),
+    "a put on some sources": Bad(GO, "wildcard", "exact key", "acsard/acsar/cmd/a$*"),
+    "a put on every robot": Bad(GO, "wildcard", "exact key", "acsard/*/cmd/app"),
+    "a put on every key": Bad(GO, "wildcard", "exact key", "acsard/**"),
+    "a put on every key of all": Bad(GO, "wildcard", "exact key", "**"),
+    "a wheel missing": Bad(wheel_speeds(JOINTS, [10.0] * 3), "wrong_wheels", "rear_right", WHEEL),
+    "a wheel twice": Bad(
+        wheel_speeds([*JOINTS, JOINTS[0]], [10.0] * 4), "wrong_wheels", "rear_right", WHEEL
+    ),
+    "a fifth wheel": Bad(
+        wheel_speeds([*ALL_JOINTS, "spare"], [10.0] * 5), "wrong_wheels", "rear_right", WHEEL
+    ),
+    "a speed missing": Bad(
+        wheel_speeds(ALL_JOINTS, [10.0] * 3), "wrong_wheels", "rear_right", WHEEL
+    ),
+    "a wheel at NaN": Bad(
+        pack({"name": ALL_JOINTS, "velocity": [10.0, 10.0, 10.0, math.nan]}),
+        "not_finite", "NaN", WHEEL,
+    ),
+    "wheels for a stranger": Bad(
+        wheel_speeds(ALL_JOINTS, [10.0] * 4), "unknown_source", "commands.sources",
+        "acsard/acsar/wheel_cmd/stranger",
+    ),
+    "wheels on every source": Bad(
+        wheel_speeds(ALL_JOINTS, [10.0] * 4), "wildcard", "exact key", "acsard/acsar/wheel_cmd/*"
+    ),
+}  # fmt: skip
+
+
+def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said: str) -> None:
+    """`send` is counted once more under `reason`, told with `said`, and moves nothing."""
+    # The source may drive: had the bad command been taken, it would.
+    heard = bus.count("commands")
+    bus.put("cmd/app", ZERO)
+    until(lambda: bus.count("commands") > heard, 5.0, "the zero was heard")
+    before = bus.state()
+    send()
+    counted = before["counters"].get(f"command_{reason}", 0)
+    until(
+        lambda: bus.count(f"command_{reason}") > counted,
+        3.0,
+        f"counted as {reason}; counters {bus.state()['counters']}",
+    )
+    lines = bus.count("lines_sent")
+    until(lambda: bus.count("lines_sent") >= lines + 5, 3.0, "five more lines")
+    after = bus.state()
+    assert said in after["refused"], after["refused"]
+    assert len(after["refused"]) <= 300
+    assert after["counters"]["commands"] == before["counters"]["commands"], "it refreshed something"
+    for key in ("x", "y", "yaw", "linear", "angular", "wheels"):
+        assert after[key] == before[key], key
+    assert after["mode"] in ("ready", "driving")
+    reasons = {k for k in after["counters"] if k.startswith("command_")}
+    changed = {k for k in reasons if after["counters"][k] != before["counters"].get(k, 0)}
+    assert changed == {f"command_{reason}"}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_command_is_counted_and_said_and_moves_nothing(bus: Bus, name: str) -> None:
+    bad = BAD[name]
+
+    def send() -> None:
+        encoding = bad.encoding or None
+        bus.session.put(bad.key, bad.payload, encoding=encoding)
+
+    refused_without_motion(bus, send, bad.reason, bad.said)
+
+
+def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
+    def send() -> None:
+        bus.session.put("acsard/acsar/cmd/app", stamped(1.0))
+
+    # The source's own clock is known from here on.
+    heard = bus.count("commands")
+    bus.session.put("acsard/acsar/cmd/app", stamped(0.0).replace(b"0.5", b"0.0"))
+    until(lambda: bus.count("commands") > heard, 5.0, "a stamped zero")
+    refused_without_motion(bus, send, "stale", "held up on the way")
+
+
+@pytest.mark.parametrize("key", ["cmd/app", "wheel_cmd/app"])
+def test_a_delete_is_no_command(bus: Bus, key: str) -> None:
+    refused_without_motion(
+        bus, lambda: bus.session.delete(f"acsard/acsar/{key}"), "not_a_put", "DELETE"
+    )
+
+
+def test_a_delete_on_every_source_is_no_command(bus: Bus) -> None:
+    refused_without_motion(
+        bus, lambda: bus.session.delete("acsard/acsar/cmd/*"), "wildcard", "exact key"
+    )
+
+
+def test_wheel_speeds_without_end_are_held_to_the_limits(bus: Bus) -> None:
+    # Finite, so not refused: clamped. 1e308 on every wheel must not become NaN on the way.
+    with bus.follow("cmd_vel_out") as applied:
+        bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
+        heard = bus.count("commands")
+        bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
+        until(lambda: bus.count("commands") > heard, 5.0, "it was heard")
+        until(lambda: bus.state()["mode"] == "ready", 5.0, "its timeout is over")
+        until(lambda: bus.state()["linear"] == bus.state()["angular"] == 0, 5.0, "at rest")
+    for seen in applied.seen:
+        assert abs(seen.value["twist"]["linear"]["x"]) <= 1.0
+        assert abs(seen.value["twist"]["angular"]["z"]) <= 4.0
+
+
+def test_a_message_over_the_link_s_size_harms_only_who_sent_it(bus: Bus, shared: Daemon) -> None:
+    with Bus(shared.endpoint) as sender:
+        sender.session.put("acsard/acsar/cmd/app", GO + b" " * 1_000_000)
+        lines = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") > lines + 50, 5.0, "it goes on")
+    state = bus.state()
+    assert (state["linear"], state["mode"]) == (0.0, "ready")
+    with Bus(shared.endpoint) as another:
+        another.linked()
+
+
+def test_nothing_of_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+    assert shared.process.poll() is None
+    assert "Traceback" not in shared.stderr
+    assert "Error" not in shared.stderr
+    assert "panicked" not in shared.stderr
+    assert bus.state()["mode"] == "ready"
+
+
+def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once(
+    tmp_path: Path,
+) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
+        bus.linked()
+        before, memory = bus.state(), resident_kb(daemon.pid)
+        with Program(words(FLOOD, daemon.endpoint, 0.2, 3.0), tmp_path) as flood:
+            flood.says("flooding")
+            begun = time.monotonic()
+            driving = states.find(
+                lambda state: state["linear"] == pytest.approx(0.2, abs=0.01), 3.0, "0.2 m/s"
+            )
+            # Most of the flood first, then the stop in the middle of it.
+            states.find(lambda _: True, 3.0, "2.5 s of flood", after=begun + 2.5)
+            sent = time.monotonic()
+            bus.session.put("acsard/acsar/stop", b"")
+            stopped = states.find(
+                lambda state: state["mode"] == "stopped", 3.0, "stopped", after=sent
+            )
+            assert flood.process.poll() is None, "the flood was over too early"
+            count = int(flood.says("flooded").split()[1])
+            assert flood.ended(5.0) == 0
+        after, grown = bus.state(), resident_kb(daemon.pid) - memory
+        until(lambda: bus.state()["linear"] == 0.0, 3.0, "at rest")
+    periods = Periods.between(before, after)
+    counters = after["counters"]
+    print(
+        f"flood of {count} puts in 3 s: {periods.missed} of {periods.elapsed:.0f} periods missed, "
+        f"{counters['commands']} commands taken, overrun {counters.get('bus_overrun', 0)}, "
+        f"memory +{grown} kB, driving after {driving.at - begun:.3f} s, "
+        f"stop latched after {stopped.at - sent:.4f} s"
+    )
+    assert count > 10_000
+    assert periods.missed <= 0.03 * periods.elapsed
+    assert grown < 10_000
+    assert stopped.at - sent < 0.2
+    assert after["mode"] == "stopped"
+    assert "Traceback" not in daemon.stderr

@@ -1,0 +1,466 @@
+"""The keys on the bus as a plain Zenoh client sees them: values, services, latch, token, rates."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+import zenoh.ext
+
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Following,
+    alive_at,
+    client_config,
+    seconds,
+    twist,
+    until,
+)
+
+PUBLISHED = {
+    "odom": "Odometry",
+    "tf": "TFMessage",
+    "tf_static": "TFMessage",
+    "wheel_states": "JointState",
+    "cmd_vel_out": "TwistStamped",
+    "state": "RobotState",
+    "diagnostics": "DiagnosticArray",
+}
+SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose")
+FIELDS = {
+    "odom": {"header", "child_frame_id", "pose", "twist"},
+    "tf": {"transforms"},
+    "tf_static": {"transforms"},
+    "wheel_states": {"header", "name", "position", "velocity", "effort"},
+    "cmd_vel_out": {"header", "twist"},
+    "state": {
+        "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
+        "source", "sources", "refused", "counters",
+    },
+    "diagnostics": {"header", "status"},
+}  # fmt: skip
+
+
+class Late(Following):
+    """Somebody who subscribed to `tf_static` late and plainly, and since when."""
+
+    since = 0.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def late(shared: Daemon) -> Iterator[Late]:
+    """Subscribed while all the other tests run: what it waits for is sent every 5 s only."""
+    with Bus(shared.endpoint) as bus:
+        bus.linked()  # the first tf_static, sent at the start, is gone by then
+        late = Late()
+        late.since = time.monotonic()
+        subscriber = bus.session.declare_subscriber("acsard/acsar/tf_static", late.add)
+        yield late
+        subscriber.undeclare()
+
+
+@contextmanager
+def restored(bus: Bus) -> Iterator[None]:
+    """Leaves the shared robot at rest, ready and at the origin."""
+    try:
+        yield
+    finally:
+        if bus.state()["mode"] == "stopped":
+            assert bus.get("srv/clear")["success"]
+        assert bus.get("srv/activate")["success"]
+        bus.at_rest()
+        assert bus.get("srv/reset_odometry")["success"]
+
+
+# last values
+
+
+@pytest.mark.parametrize("key", PUBLISHED)
+def test_a_get_on_a_published_key_answers_with_its_last_value_in_json(bus: Bus, key: str) -> None:
+    (answer,) = bus.ask(key)
+    assert (answer.ok, answer.key) == (True, key)
+    assert answer.encoding == f"application/json;acsard.{PUBLISHED[key]}.v1"
+    assert set(json.loads(answer.payload)) == FIELDS[key]
+
+
+@pytest.mark.parametrize("key", PUBLISHED)
+def test_a_get_with_fmt_msgpack_answers_in_msgpack(bus: Bus, key: str) -> None:
+    (answer,) = bus.ask(f"{key}?fmt=msgpack")
+    assert (answer.ok, answer.key) == (True, key)
+    assert answer.encoding == f"application/msgpack;acsard.{PUBLISHED[key]}.v1"
+    assert set(msgspec.msgpack.decode(answer.payload)) == FIELDS[key]
+
+
+def test_fmt_json_is_the_default(bus: Bus) -> None:
+    assert bus.ask("tf_static?fmt=json")[0].encoding == bus.ask("tf_static")[0].encoding
+
+
+def test_an_unknown_fmt_is_an_error_that_says_what_to_write(bus: Bus) -> None:
+    for key in ("odom", "info", "srv/activate"):
+        (answer,) = bus.ask(f"{key}?fmt=xml")
+        assert not answer.ok
+        assert answer.encoding.startswith("text/plain")
+        assert answer.payload.decode() == "fmt=xml: write fmt=json or fmt=msgpack"
+
+
+def test_a_last_value_is_the_present_one(bus: Bus) -> None:
+    stamps = [seconds(bus.get("odom")["header"]["stamp"]) for _ in range(2)]
+    assert abs(time.time() - stamps[0]) < 0.5
+    until(
+        lambda: seconds(bus.get("odom")["header"]["stamp"]) > stamps[1], 2.0, "a newer last value"
+    )
+
+
+# what it says of itself
+
+
+def test_info_says_who_the_daemon_is(bus: Bus, shared: Daemon) -> None:
+    info = bus.get("info")
+    assert (info["id"], info["pid"]) == ("acsar", shared.pid)
+    assert (info["simulated"], info["rate"]) == (True, 100.0)
+    assert info["listen"] == [shared.endpoint]
+    assert info["connect"] == []
+    assert info["port"].startswith("/dev/pts/")
+
+
+def test_config_is_the_configuration_in_force(bus: Bus, shared: Daemon) -> None:
+    config = bus.get("config")
+    assert config["mcu"]["port"] == "sim"
+    assert config["bus"]["listen"] == [shared.endpoint]
+    assert config["drive"]["wheel_radius"] == 0.05
+    assert [source["name"] for source in config["commands"]["sources"]][:2] == ["teleop", "app"]
+
+
+def test_interfaces_lists_four_commands_and_eight_states_available_and_unclaimed(bus: Bus) -> None:
+    interfaces = bus.get("interfaces")["interfaces"]
+    kinds = [one["kind"] for one in interfaces]
+    assert (kinds.count("command"), kinds.count("state")) == (4, 8)
+    assert "front_right_wheel_joint/velocity" in [one["name"] for one in interfaces]
+    assert all(one["available"] for one in interfaces)
+    assert not any(one["claimed"] for one in interfaces)
+
+
+def test_command_interfaces_are_claimed_while_a_source_drives(bus: Bus) -> None:
+    with restored(bus), bus.commanding(0.1):
+        until(lambda: bus.state()["mode"] == "driving", 5.0, "driving")
+        claimed = {one["kind"] for one in bus.get("interfaces")["interfaces"] if one["claimed"]}
+        assert claimed == {"command"}
+
+
+def test_topics_lists_every_key_that_is_declared(bus: Bus) -> None:
+    rows = bus.get("topics")["topics"]
+    keys = {row["key"].removeprefix("acsard/acsar/") for row in rows}
+    services = {f"srv/{name}" for name in SERVICES}
+    assert {*PUBLISHED, *services, "info", "config", "cmd/<source>", "stop", "alive"} <= keys
+    assert all(row["key"].startswith("acsard/acsar/") for row in rows)
+
+
+def test_a_schema_describes_the_fields_of_its_type(bus: Bus) -> None:
+    schema = bus.get("schema/Odometry")
+    fields = schema["$defs"]["Odometry"]["properties"]
+    assert set(fields) == set(bus.get("odom"))
+
+
+def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
+    answers = bus.ask("schema/*")
+    assert all(answer.ok for answer in answers)
+    types = [answer.key.removeprefix("schema/") for answer in answers]
+    assert len(types) == len(set(types))
+    assert {*PUBLISHED.values(), "ServiceReply", "Twist", "SetPose"} <= set(types)
+
+
+def test_a_schema_that_does_not_exist_is_no_answer_at_once(bus: Bus) -> None:
+    start = time.monotonic()
+    assert bus.ask("schema/Nonsense") == []
+    assert time.monotonic() - start < 1.0
+
+
+@pytest.mark.parametrize("pattern", ["**", "*", "srv/*", "srv/s*", "srv/**"])
+@pytest.mark.parametrize("latched", [False, True], ids=["ready", "stopped"])
+def test_a_get_by_wildcard_never_runs_a_service(bus: Bus, pattern: str, latched: bool) -> None:
+    pattern = pattern.replace("s*", "s$*")
+    with restored(bus):
+        assert bus.get("srv/set_pose", {"x": 3.0, "y": 2.0, "yaw": 1.0})["success"]
+        if latched:
+            bus.get("srv/stop")
+        before = bus.state()
+        start = time.monotonic()
+        answers = bus.ask(pattern, {"x": 7.0, "y": 7.0, "yaw": 0.0})
+        took = time.monotonic() - start
+        after = bus.state()
+    assert before["mode"] == ("stopped" if latched else "ready")
+    assert (after["mode"], after["reason"]) == (before["mode"], before["reason"])
+    # Neither reset nor set; encoders may still tick over by a fraction of a millimetre.
+    assert (after["x"], after["y"], after["yaw"]) == pytest.approx((3.0, 2.0, 1.0), abs=0.01)
+    assert all(answer.ok for answer in answers)
+    answered = {answer.key for answer in answers}
+    if pattern in ("*", "**"):
+        assert set(PUBLISHED) | {"info", "config", "topics"} <= answered
+    else:
+        assert answered == set()
+    assert not {key for key in answered if key.startswith("srv/")}
+    # An answer that never ends would cost the client its whole timeout of 5 s.
+    assert took < 2.0
+
+
+# services
+
+
+def test_stop_and_clear_by_their_exact_keys(bus: Bus) -> None:
+    with restored(bus):
+        assert bus.get("srv/stop")["success"]
+        assert bus.state()["mode"] == "stopped"
+        assert "srv/clear" in bus.state()["reason"]
+        refused = bus.get("srv/activate")
+        assert (refused["success"], "clear" in refused["message"]) == (False, True)
+        assert bus.get("srv/clear")["success"]
+        assert bus.state()["mode"] == "ready"
+        nothing = bus.get("srv/clear")
+        assert (nothing["success"], "nothing to clear" in nothing["message"]) == (False, True)
+
+
+def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
+    with restored(bus):
+        assert bus.get("srv/deactivate")["success"]
+        assert bus.state()["mode"] == "inactive"
+        assert "srv/activate" in bus.state()["reason"]
+        assert bus.get("srv/activate")["success"]
+        # Never "waiting", which says that there is no link: it is up.
+        assert bus.state()["mode"] == "ready"
+
+
+def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> None:
+    with restored(bus):
+        assert bus.get("srv/set_pose", {"x": 1.5, "y": -2.0, "yaw": 0.5})["success"]
+
+        def moved() -> bool:
+            pose = bus.get("odom")["pose"]["pose"]
+            return bool(pose["position"]["x"] == 1.5 and pose["position"]["y"] == -2.0)
+
+        state = bus.state()
+        assert (state["x"], state["y"]) == (1.5, -2.0)
+        assert state["yaw"] == pytest.approx(0.5)
+        until(moved, 2.0, "the pose in odom")
+        transform = bus.get("tf")["transforms"][0]["transform"]
+        assert transform["translation"]["x"] == 1.5
+        assert transform["rotation"]["z"] == pytest.approx(math.sin(0.25))
+        assert bus.get("srv/reset_odometry")["success"]
+        state = bus.state()
+        assert (state["x"], state["y"], state["yaw"]) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{",
+        b"here",
+        b'{"x": 1, "y": 2}',
+        b'{"x": 1, "y": 2, "yaw": "north"}',
+        b'{"x": 1, "y": 2, "yaw": 0, "z": 3}',
+        b'{"x": 1e9, "y": 2, "yaw": 0}',
+        b'{"x": NaN, "y": 2, "yaw": 0}',
+        msgspec.msgpack.encode({"x": math.nan, "y": 0.0, "yaw": 0.0}),
+        msgspec.msgpack.encode({"x": 0.0, "y": 0.0, "yaw": math.inf}),
+        b'{"x": 1, "y": 2, "yaw": 0}' + b" " * 5000,
+    ],
+)
+def test_set_pose_with_a_bad_payload_changes_nothing_and_says_what_to_send(
+    bus: Bus, payload: bytes
+) -> None:
+    before = bus.state()
+    answers = []
+    for reply in bus.session.get("acsard/acsar/srv/set_pose", payload=payload, timeout=5.0):
+        assert reply.ok is not None
+        form = msgspec.msgpack if "msgpack" in str(reply.ok.encoding) else msgspec.json
+        answers.append(form.decode(reply.ok.payload.to_bytes()))
+    after = bus.state()
+    assert (after["x"], after["y"], after["yaw"]) == (before["x"], before["y"], before["yaw"])
+    (answer,) = answers
+    assert answer["success"] is False
+    assert '{"x": 0, "y": 0, "yaw": 0}' in answer["message"]
+
+
+@pytest.mark.parametrize("payload", [b"", b"now!", b"\xff" * 5000])
+def test_a_put_of_anything_on_stop_latches(bus: Bus, payload: bytes) -> None:
+    with restored(bus), bus.follow("state") as states:
+        x = bus.state()["x"]
+        sent = time.monotonic()
+        bus.session.put("acsard/acsar/stop", payload)
+        told = states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=sent)
+        assert told.at - sent < 0.2
+        with bus.commanding(0.3):
+            waited = bus.count("lines_sent")
+            until(lambda: bus.count("lines_sent") > waited + 30, 5.0, "30 lines")
+            assert bus.state()["mode"] == "stopped"
+        assert bus.state()["x"] == pytest.approx(x, abs=0.01)
+
+
+def test_a_delete_on_stop_latches_nothing(bus: Bus) -> None:
+    bus.session.delete("acsard/acsar/stop")
+    # A command that follows on the same link has been taken when it is counted.
+    before = bus.count("commands")
+    bus.put("cmd/app", twist(0.0))
+    until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
+    assert bus.state()["mode"] != "stopped"
+    bus.at_rest()
+
+
+# what is published
+
+
+def test_every_published_key_names_its_encoding(bus: Bus) -> None:
+    for key, type_name in PUBLISHED.items():
+        if key == "tf_static":
+            continue  # sent every 5 s: below, when it comes
+        with bus.follow(key) as messages:
+            seen = messages.find(lambda _: True, 3.0, key)
+        assert seen.encoding == f"application/msgpack;acsard.{type_name}.v1"
+        assert set(seen.value) == FIELDS[key]
+
+
+def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -> None:
+    with bus.follow("odom") as odoms, bus.follow("state") as states:
+        until(lambda: len(states.seen) > 12, 5.0, "a dozen states")
+        stamps = [seconds(seen.value["header"]["stamp"]) for seen in list(odoms.seen)]
+        slow = [seconds(seen.value["stamp"]) for seen in list(states.seen)]
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
+    slow_rate = (len(slow) - 1) / (slow[-1] - slow[0])
+    print(f"by their stamps: odometry {rate:.2f} Hz, state {slow_rate:.2f} Hz")
+    assert stamps == sorted(set(stamps))
+    assert rate == pytest.approx(100.0, rel=0.03)
+    assert slow_rate == pytest.approx(10.0, rel=0.1)
+
+
+def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> None:
+    def stamps(following: Following, header: Any) -> set[tuple[int, int]]:
+        found = [header(seen.value)["stamp"] for seen in list(following.seen)]
+        return {(stamp["sec"], stamp["nanosec"]) for stamp in found}
+
+    with bus.follow("odom") as odom, bus.follow("tf") as tf, bus.follow("wheel_states") as wheels:
+        three = (odom, tf, wheels)
+        until(lambda: all(len(one.seen) > 40 for one in three), 5.0, "40 of each")
+        found = [
+            stamps(odom, lambda value: value["header"]),
+            stamps(tf, lambda value: value["transforms"][0]["header"]),
+            stamps(wheels, lambda value: value["header"]),
+        ]
+    # They began and ended to be heard one after the other; in between they are the same.
+    first, last = max(map(min, found)), min(map(max, found))
+    between = [{stamp for stamp in one if first <= stamp <= last} for one in found]
+    assert len(between[0]) > 20
+    assert between[0] == between[1] == between[2]
+
+
+def test_a_late_joiner_gets_tf_static_by_query(bus: Bus) -> None:
+    (transform,) = bus.get("tf_static")["transforms"]
+    assert transform["header"]["frame_id"] == "base_link"
+    assert transform["child_frame_id"] == "lidar_link"
+
+
+def test_a_late_advanced_subscriber_gets_tf_static_at_once(bus: Bus) -> None:
+    following = Following()
+    asked = time.monotonic()
+    subscriber = zenoh.ext.declare_advanced_subscriber(
+        bus.session,
+        "acsard/acsar/tf_static",
+        following.add,
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+    )
+    seen = following.find(lambda _: True, 3.0, "the latched transform")
+    subscriber.undeclare()
+    print(f"tf_static by history: {seen.at - asked:.3f} s")
+    # Well under the 5 s after which it would be sent again anyway.
+    assert seen.at - asked < 1.0
+    assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
+
+
+# the token
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_the_alive_token_is_there_while_the_daemon_runs_and_gone_after(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with Daemon(tmp_path) as daemon, alive_at(daemon.endpoint, daemon) as alive:
+        seen = until(alive.try_recv, 5.0, "the alive token")
+        assert seen.kind == zenoh.SampleKind.PUT
+        assert str(seen.key_expr) == "acsard/acsar/alive"
+        daemon.signal(number)
+        daemon.ended(5.0)
+        ended = time.monotonic()
+        gone = until(alive.try_recv, 5.0, "the token's end")
+        assert gone.kind == zenoh.SampleKind.DELETE
+        print(f"{number.name}: token gone {time.monotonic() - ended:.3f} s after the end")
+
+
+def test_the_alive_token_is_found_by_a_liveliness_query(bus: Bus) -> None:
+    found = [
+        str(reply.ok.key_expr)
+        for reply in bus.session.liveliness().get("acsard/*/alive", timeout=5.0)
+        if reply.ok is not None
+    ]
+    assert found == ["acsard/acsar/alive"]
+
+
+# many at once
+
+
+def test_thirty_queries_at_once_are_all_answered(bus: Bus) -> None:
+    handlers = [bus.session.get("acsard/acsar/odom", timeout=5.0) for _ in range(30)]
+    for handler in handlers:
+        replies = list(handler)
+        assert len(replies) == 1
+        assert replies[0].ok is not None
+
+
+def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) -> None:
+    handlers = [bus.session.get("acsard/acsar/info", timeout=5.0) for _ in range(400)]
+    answered, busy = 0, 0
+    for handler in handlers:
+        (reply,) = list(handler)
+        if reply.ok is not None:
+            answered += 1
+        else:
+            assert reply.err is not None
+            assert "ask again" in reply.err.payload.to_string()
+            busy += 1
+    print(f"400 queries at once: {answered} answered, {busy} told to ask again")
+    assert answered >= 64
+    assert bus.get("info")["id"] == "acsar"
+
+
+def test_two_clients_hear_the_same_odometry(bus: Bus, shared: Daemon) -> None:
+    with zenoh.open(client_config(shared.endpoint)) as other, bus.follow("odom") as mine:
+        theirs = Following()
+        subscriber = other.declare_subscriber("acsard/*/odom", theirs.add)
+        until(lambda: theirs.seen, 3.0, "odometry at the other client")
+        stamp = theirs.seen[0].value["header"]["stamp"]
+        mine.find(lambda value: value["header"]["stamp"] == stamp, 3.0, "the same sample here")
+        subscriber.undeclare()
+
+
+# at the end: what was waited for all along
+
+
+def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:
+    seen = late.find(lambda _: True, 6.0, "tf_static is sent again")
+    print(f"tf_static to a plain subscriber: {seen.at - late.since:.2f} s")
+    assert seen.at - late.since < 6.0
+    assert seen.encoding == "application/msgpack;acsard.TFMessage.v1"
+    assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
+
+
+def test_none_of_this_was_a_bug(shared: Daemon) -> None:
+    assert "Traceback" not in shared.stderr
+    assert shared.process.poll() is None

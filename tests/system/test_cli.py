@@ -1,0 +1,519 @@
+"""The tools at the shell: what they print, where, and the code they end with."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from acsard.client import connect
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Finished,
+    Program,
+    acsard,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+)
+
+VERBS = ("run", "sim", "check", "topics", "echo", "hz", "drive", "call")
+
+
+def tool(shared: Daemon, *words: str) -> Finished:
+    """A tool that knows where the shared daemon is, run to its end."""
+    ended = finish(acsard(*words, "--config", str(shared.config)), shared.config.parent)
+    assert "Traceback" not in ended.err, ended.err
+    return ended
+
+
+# help
+
+
+def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> None:
+    ended = finish(acsard("--help"), tmp_path)
+    assert (ended.code, ended.err) == (0, "")
+    for told in (*VERBS, "69", "75", "78", "try:"):
+        assert told in ended.out
+    print(f"--help: {ended.seconds:.2f} s")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_a_help_that_says_what_it_does(tmp_path: Path, verb: str) -> None:
+    ended = finish(acsard(verb, "--help"), tmp_path)
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.startswith(f"usage: acsard {verb}")
+    assert "--config" in ended.out
+
+
+def test_version(tmp_path: Path) -> None:
+    ended = finish(acsard("--version"), tmp_path)
+    assert (ended.code, ended.out.split()[0]) == (0, "acsard")
+
+
+@pytest.mark.parametrize("words", [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"]])
+def test_a_mistyped_command_ends_with_2(tmp_path: Path, words: list[str]) -> None:
+    ended = finish(acsard(*words), tmp_path)
+    assert (ended.code, ended.out) == (2, "")
+    assert "usage: acsard" in ended.err
+
+
+def test_without_a_verb_it_runs(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    for words in (["--listen", endpoint], []):
+        config = tmp_path / "acsard.toml"
+        config.write_text(f'[bus]\nlisten = ["{endpoint}"]\n')
+        with Program(acsard(*words), tmp_path) as daemon:
+            assert endpoint in daemon.says("bus ")
+            assert "SIMULATOR" in daemon.stdout
+            daemon.signal(signal.SIGINT)
+            assert daemon.ended(3.0) == 0
+
+
+def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
+    shared: Daemon,
+) -> None:
+    until(lambda: len(shared.out) >= 7, 5.0, "the whole banner")
+    assert "SIMULATOR" in shared.out[0]
+    assert shared.endpoint in shared.out[1]
+    assert "acsard/acsar/" in shared.out[1]
+    assert str(shared.config) in shared.out[2]
+    assert sum(line.strip().startswith("acsard ") for line in shared.out[3:]) == 3
+
+
+# topics and check need no daemon
+
+
+def test_topics_lists_every_key_with_its_meaning(tmp_path: Path) -> None:
+    ended = finish(acsard("topics"), tmp_path)
+    assert (ended.code, ended.err) == (0, "")
+    head, *rows = ended.out.splitlines()
+    assert head.split() == ["KEY", "TYPE", "RATE", "MEANING"]
+    assert any(row.startswith("acsard/acsar/odom ") and "Odometry" in row for row in rows)
+    assert any(row.startswith("acsard/acsar/srv/stop ") for row in rows)
+
+
+def test_topics_json_is_what_the_bus_answers(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "topics", "--json")
+    assert ended.code == 0
+    assert json.loads(ended.out) == bus.get("topics")
+
+
+def test_check_prints_a_toml_document_that_checks_again(tmp_path: Path) -> None:
+    ended = finish(acsard("check"), tmp_path)
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.startswith("# effective configuration from built-in defaults")
+    assert tomllib.loads(ended.out)["drive"]["wheel_radius"] == 0.05
+    (tmp_path / "again.toml").write_text(ended.out)
+    again = finish(acsard("check", "--config", "again.toml"), tmp_path)
+    assert again.code == 0
+    assert again.out.splitlines()[1:] == ended.out.splitlines()[1:]
+
+
+def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "check", "--json")
+    assert ended.code == 0
+    assert json.loads(ended.out) == bus.get("config")
+
+
+def test_check_of_a_bad_file_ends_with_78_and_the_mend(tmp_path: Path) -> None:
+    (tmp_path / "acsard.toml").write_text("[drive]\nwheel_radus = 0.05\n")
+    ended = finish(acsard("check"), tmp_path)
+    assert (ended.code, ended.out) == (78, "")
+    assert "drive.wheel_radus" in ended.err
+    assert "did you mean wheel_radius?" in ended.err
+
+
+# echo and hz
+
+
+def test_echo_prints_n_messages_as_json_lines_and_ends(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "echo", "odom", "-n", "2")
+    assert (ended.code, ended.err) == (0, "")
+    first, second = map(json.loads, ended.out.splitlines())
+    assert set(first) == {"header", "child_frame_id", "pose", "twist"}
+    assert first["header"]["stamp"] != second["header"]["stamp"]
+    print(f"echo odom -n 2: {ended.seconds:.2f} s")
+
+
+def test_echo_state_says_the_mode_and_why(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "echo", "state", "-n", "1")
+    state = json.loads(ended.out)
+    assert (ended.code, state["mode"], state["link"]) == (0, "ready", "up")
+    assert "no commands" in state["reason"]
+
+
+def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "echo", "tf_static", "-n", "1")
+    assert ended.code == 0
+    assert json.loads(ended.out)["transforms"][0]["child_frame_id"] == "lidar_link"
+    assert ended.seconds < 4.0
+
+
+def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: Bus) -> None:
+    words = acsard("echo", "cmd/stranger", "-n", "2", "--config", str(shared.config))
+    with Program(words, shared.config.parent) as echo:
+        for payload in (b'{"linear": {}, "angular": {}}', b"\xff"):
+            before = len(echo.out)
+
+            def shown(payload: bytes = payload, before: int = before) -> bool:
+                bus.session.put("acsard/acsar/cmd/stranger", payload)
+                return len(echo.out) > before or echo.process.poll() is not None
+
+            until(shown, 5.0, "the command at echo")
+        assert echo.ended(5.0) == 0
+    assert json.loads(echo.out[0]) == {"linear": {}, "angular": {}}
+
+
+def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
+    ended = tool(shared, "echo", "cmd/nobody", "--timeout", "0.3")
+    assert (ended.code, ended.out) == (1, "")
+
+
+def test_echo_of_no_messages_prints_none(shared: Daemon) -> None:
+    words = acsard("echo", "odom", "-n", "0", "--config", str(shared.config))
+    with Program(words, shared.config.parent) as echo:
+        code = echo.ended(3.0)
+        assert code in (0, 2)
+    assert echo.stdout == ""
+
+
+def test_echo_into_a_reader_that_leaves_ends_quietly(shared: Daemon, bus: Bus) -> None:
+    script = '{ "$@"; echo "code $?" >&2; } | head -n 1'
+    echo = acsard("echo", "odom", "--config", str(shared.config))
+    ended = finish(["sh", "-c", script, "sh", *echo], shared.config.parent, 5.0)
+    assert set(json.loads(ended.out)) == {"header", "child_frame_id", "pose", "twist"}
+    assert ended.err == "code 0"
+
+
+@pytest.mark.parametrize("words", [["topics"], ["check"], ["--help"]])
+def test_printing_to_a_reader_that_has_left_ends_quietly(tmp_path: Path, words: list[str]) -> None:
+    env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
+    reader, writer = os.pipe()
+    os.close(reader)
+    with (
+        os.fdopen(writer, "wb") as closed,
+        Program(acsard(*words), tmp_path, env, stdout=closed) as p,
+    ):
+        assert p.ended(5.0) == 0
+    assert p.stderr == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
+    words = acsard("echo", "odom", "--config", str(shared.config))
+    with Program(words, shared.config.parent) as echo:
+        echo.says("header")
+        echo.signal(number)
+        assert echo.ended(2.0) == (0 if number == signal.SIGINT else -signal.SIGTERM)
+    assert echo.stderr == ""
+
+
+def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "hz", "odom", "-n", "2", "--json")
+    assert ended.code == 0
+    lines = [json.loads(line) for line in ended.out.splitlines()]
+    print(f"hz odom: {lines[-1]}")
+    assert len(lines) == 2
+    assert lines[1]["count"] > lines[0]["count"]
+    assert lines[1]["hz"] == pytest.approx(100.0, rel=0.03)
+
+
+@pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["call", "stop"]])
+def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
+    tmp_path: Path, words: list[str]
+) -> None:
+    endpoint = free_endpoint()
+    ended = finish(acsard(*words, "--connect", endpoint), tmp_path)
+    assert (ended.code, ended.out) == (69, "")
+    (told,) = ended.err.splitlines()
+    assert endpoint in told
+    assert "acsard run" in told
+    assert ended.seconds < 4.0
+
+
+def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -> None:
+    ended = tool(shared, "call", "stop", "--id", "other")
+    assert (ended.code, ended.out) == (69, "")
+    assert "other" in ended.err
+    assert "robot.id" in ended.err
+
+
+# call
+
+
+def test_call_prints_the_answer_and_ends_with_1_when_refused(shared: Daemon, bus: Bus) -> None:
+    stop = tool(shared, "call", "stop")
+    assert (stop.code, stop.out) == (0, "stopped and latched; srv/clear releases it")
+    assert bus.state()["mode"] == "stopped"
+    assert tool(shared, "call", "activate").code == 1
+    clear = tool(shared, "call", "clear", "--json")
+    assert clear.code == 0
+    assert json.loads(clear.out)["success"] is True
+    assert bus.state()["mode"] == "ready"
+    again = tool(shared, "call", "clear")
+    assert (again.code, "nothing to clear" in again.out) == (1, True)
+
+
+@pytest.mark.parametrize("pose", [("1", "2", "0.5"), ("-1.5", "-2", "-0.5")])
+def test_call_set_pose_sets_it(shared: Daemon, bus: Bus, pose: tuple[str, ...]) -> None:
+    ended = tool(shared, "call", "set_pose", *pose)
+    state = bus.state()
+    assert ended.code == 0
+    assert [state["x"], state["y"], state["yaw"]] == pytest.approx([float(one) for one in pose])
+    assert tool(shared, "call", "reset_odometry").code == 0
+    assert bus.state()["x"] == 0.0
+
+
+def test_call_set_pose_with_a_pose_that_is_none_is_refused(shared: Daemon, bus: Bus) -> None:
+    before = bus.state()
+    ended = tool(shared, "call", "set_pose", "nan", "0", "0")
+    assert ended.code == 1
+    assert bus.state()["x"] == before["x"]
+
+
+@pytest.mark.parametrize(
+    "words", [["set_pose"], ["set_pose", "1", "2"], ["stop", "1"], ["set_pose", "1", "2", "east"]]
+)
+def test_call_with_the_wrong_values_ends_with_2_and_the_form(
+    shared: Daemon, bus: Bus, words: list[str]
+) -> None:
+    ended = tool(shared, "call", *words)
+    assert (ended.code, ended.out) == (2, "")
+    assert f"acsard call {words[0]}" in ended.err or "usage: acsard call" in ended.err
+    assert bus.state()["mode"] == "ready"
+
+
+# sim and run in two processes
+
+
+def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        assert port == "mcu"
+        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
+            bus.linked()
+            assert bus.get("info")["simulated"] is False
+            with connect(daemon.endpoint) as robot:
+                robot.drive(0.5, seconds=0.6)
+                until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
+                assert robot.pose().x == pytest.approx(0.3, abs=0.05)
+        sim.signal(signal.SIGTERM)
+        assert sim.ended(2.0) == 0
+    assert "valid lines" in sim.stderr
+    assert "Traceback" not in sim.stderr
+    assert not (tmp_path / "mcu").is_symlink()
+
+
+def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--fault", "mute"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        assert port.startswith("/dev/pts/")
+        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
+            until(lambda: bus.count("lines_sent") > 5, 5.0, "lines to the mute one")
+            state = bus.state()
+            assert (state["link"], state["mode"]) == ("booting", "waiting")
+            assert state["counters"]["lines"] == 0
+    assert "faults: mute" in sim.stderr
+
+
+# drive
+
+
+ON_TERMINAL = """\
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, "-m", "acsard", *sys.argv[1:]])
+"""
+"""Makes its standard input the controlling terminal, as a shell does, so that ^C is a signal."""
+
+
+class Terminal:
+    """A person at a terminal: presses keys, reads the screen."""
+
+    def __init__(self) -> None:
+        self.screen = ""
+        self._master, self.slave = pty.openpty()
+        self._leave = threading.Event()
+        self._reader = threading.Thread(target=self._read)
+
+    def __enter__(self) -> Terminal:
+        self._reader.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._leave.set()
+        self._reader.join()
+        os.close(self._master)
+        os.close(self.slave)
+
+    def press(self, key: str) -> None:
+        os.write(self._master, key.encode())
+
+    @property
+    def settings(self) -> list[object]:
+        return list(termios.tcgetattr(self.slave))
+
+    def _read(self) -> None:
+        while not self._leave.is_set():
+            if select.select([self._master], [], [], 0.05)[0]:
+                self.screen += os.read(self._master, 4096).decode(errors="replace")
+
+
+@contextmanager
+def held(terminal: Terminal, key: str) -> Iterator[None]:
+    """A key held down: its repeats come 20 times a second until it is let go."""
+    released = threading.Event()
+
+    def repeat() -> None:
+        while not released.wait(0.05):
+            terminal.press(key)
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        released.set()
+        thread.join()
+
+
+@contextmanager
+def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal of its own, showing the robot."""
+    with Terminal() as terminal:
+        drive = ["drive", "--config", str(shared.config), *words]
+        command = [sys.executable, "-c", ON_TERMINAL, *drive]
+        with Program(
+            command,
+            shared.config.parent,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state on the screen")
+            yield terminal, program
+
+
+def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
+    with teleop(shared) as (terminal, program):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
+            assert bus.state()["source"] == "teleop"
+        released = time.monotonic()
+        bus.at_rest()
+        took = time.monotonic() - released
+        print(f"key let go -> at rest: {took:.2f} s")
+        # 0.6 s of hold, 0.5 s of ramp, and some of the way.
+        assert 0.6 < took < 1.5 + 0.3
+        assert program.process.poll() is None
+
+
+def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
+    with teleop(shared) as (terminal, _):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
+        pressed = time.monotonic()
+        terminal.press(" ")
+        bus.at_rest()
+        took = time.monotonic() - pressed
+        print(f"space -> at rest: {took:.2f} s")
+        # The ramp alone is 0.5 s, and the source is gone 0.25 s after its last zero.
+        assert took < 0.5 + 0.25 + 0.4
+
+
+ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}
+
+
+def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> None:
+    with teleop(shared) as (terminal, _):
+        for letter, (ahead, left) in ARROWS.items():
+            with held(terminal, f"\x1b[{letter}"):
+
+                def right_way(ahead: int = ahead, left: int = left) -> bool:
+                    state = bus.state()
+                    along, about = state["linear"] * ahead, state["angular"] * left
+                    return bool(along > 0.05 or about > 0.1)
+
+                until(right_way, 5.0, f"moving by arrow {letter}")
+            terminal.press(" ")
+            bus.at_rest()
+
+
+def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
+    with teleop(shared, "--linear", "0.2") as (terminal, _):
+        terminal.press("w")
+        until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] == pytest.approx(0.22, abs=0.005), 5.0, "0.22 m/s")
+    bus.at_rest()
+
+
+def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
+    shared: Daemon, bus: Bus
+) -> None:
+    with teleop(shared) as (terminal, program):
+        during = terminal.settings
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.3, 5.0, "moving")
+        with bus.follow("cmd/teleop") as commands:
+            terminal.press("\x03")
+            left = time.monotonic()
+            assert program.ended(3.0) == 0
+            commands.find(
+                lambda value: value["twist"]["linear"]["x"] == 0, 2.0, "a zero", after=left
+            )
+        bus.at_rest()
+        after = terminal.settings
+    assert "Traceback" not in terminal.screen + program.stderr
+    assert during != after
+    with Terminal() as fresh:
+        assert after == fresh.settings
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
+    shared: Daemon, bus: Bus, number: signal.Signals
+) -> None:
+    with teleop(shared) as (terminal, program):
+        program.signal(number)
+        program.ended(3.0)
+        after = terminal.settings
+    with Terminal() as fresh:
+        assert after == fresh.settings
+
+
+def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus: Bus) -> None:
+    with teleop(shared) as (terminal, program):
+        for payload in (b"\xff", b"{}", b""):
+            bus.session.put("acsard/**", payload)
+        with held(terminal, "i"):
+            until(
+                lambda: bus.state()["linear"] > 0.2 or program.process.poll() is not None,
+                5.0,
+                "driving on",
+            )
+        assert program.process.poll() is None, program.stderr
+    bus.at_rest()
+
+
+def test_drive_without_a_terminal_ends_with_2(shared: Daemon) -> None:
+    ended = tool(shared, "drive")
+    assert (ended.code, ended.out) == (2, "")
+    assert "terminal" in ended.err

@@ -1,0 +1,386 @@
+"""`acsard.client` and the README's examples, against a running daemon."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import pytest
+
+from acsard.client import AsyncClient, Client, connect, connect_async
+from acsard.messages import schema
+from acsard.runtime.exits import ExitError
+from tests.system.harness import (
+    ROOT,
+    Bus,
+    Daemon,
+    Finished,
+    Program,
+    free_endpoint,
+    until,
+)
+from tests.system.strangers import words
+
+DEFAULT = "tcp/127.0.0.1:7448"
+
+
+# the README
+
+
+class Outcome(NamedTuple):
+    """How an example ended, and the robot's state at rest afterwards."""
+
+    ended: Finished
+    state: Any
+
+
+def code_blocks() -> list[str]:
+    """The README's Python, as printed."""
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
+
+
+def kind(code: str) -> str:
+    """Which of the three examples this is."""
+    if "connect_async" in code:
+        return "async"
+    return "five lines" if "acsard.client" in code else "plain zenoh"
+
+
+def default_is_free() -> bool:
+    """Nobody listens where an unconfigured daemon would."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", 7448))
+        except OSError:
+            return False
+    return True
+
+
+def at_endpoint(code: str, endpoint: str) -> str:
+    """The example, where the daemon is not at the default endpoint."""
+    if endpoint == DEFAULT:
+        return code
+    changed = re.sub(r"(connect|connect_async)\(\)", rf'\1("{endpoint}")', code)
+    return changed.replace(DEFAULT, endpoint)
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
+    """All examples at the same time, each with a robot of its own: each takes two seconds."""
+    where = tmp_path_factory.mktemp("examples")
+    codes = {kind(code): code for code in code_blocks()}
+    endpoints = {name: free_endpoint() for name in codes}
+    if default_is_free():
+        endpoints["five lines"] = DEFAULT
+    outcomes = {}
+    with ExitStack() as stack:
+        buses = {}
+        for number, (name, endpoint) in enumerate(endpoints.items()):
+            stack.enter_context(Daemon(where, endpoint=endpoint, name=f"daemon{number}"))
+            buses[name] = stack.enter_context(Bus(endpoint))
+        for bus in buses.values():
+            bus.linked()
+        running = {
+            name: stack.enter_context(Program(words(at_endpoint(code, endpoints[name])), where))
+            for name, code in codes.items()
+        }
+        for name, program in running.items():
+            code = program.ended(20.0)
+            took = time.monotonic() - program.started
+            ended = Finished(code, program.stdout, program.stderr, took)
+            state = buses[name].at_rest()
+            print(
+                f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
+            )
+            outcomes[name] = Outcome(ended, state)
+    return outcomes
+
+
+def test_the_readme_has_the_three_examples() -> None:
+    assert sorted(map(kind, code_blocks())) == ["async", "five lines", "plain zenoh"]
+
+
+def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
+    examples: dict[str, Outcome],
+) -> None:
+    ended, state = examples["five lines"]
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.startswith("Pose(x=")
+    assert state["x"] == pytest.approx(1.0, rel=0.03)
+    assert state["y"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
+    examples: dict[str, Outcome],
+) -> None:
+    ended, state = examples["async"]
+    assert (ended.code, ended.err) == (0, "")
+    assert len(ended.out.splitlines()) > 100
+    assert state["yaw"] == pytest.approx(0.4, rel=0.05)
+    assert state["x"] == pytest.approx(0.97, rel=0.05)
+
+
+def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_prints_the_odometry(
+    examples: dict[str, Outcome],
+) -> None:
+    ended, state = examples["plain zenoh"]
+    assert (ended.code, ended.err) == (0, "")
+    assert '"child_frame_id":"base_link"' in ended.out
+    # Its own sleeps add up to some more than 2 s.
+    assert state["x"] == pytest.approx(1.03, rel=0.05)
+
+
+# the client
+
+
+@pytest.fixture
+def fresh(shared: Daemon, bus: Bus) -> Iterator[Bus]:
+    """The shared robot, at the origin and at rest, and left so."""
+    bus.at_rest()
+    bus.get("srv/reset_odometry")
+    yield bus
+    bus.at_rest()
+
+
+def test_typed_messages_of_every_published_key(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        for name, cls in (
+            ("odom", schema.Odometry),
+            ("tf", schema.TFMessage),
+            ("tf_static", schema.TFMessage),
+            ("wheel_states", schema.JointState),
+            ("cmd_vel_out", schema.TwistStamped),
+            ("state", schema.RobotState),
+            ("diagnostics", schema.DiagnosticArray),
+        ):
+            assert isinstance(robot.get(name), cls), name
+        assert isinstance(next(robot.messages("odom", timeout=2.0)), schema.Odometry)
+
+
+def test_get_config_and_schema_give_dictionaries(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        assert robot.get("config") == fresh.get("config")
+        assert isinstance(robot.get("schema/Odometry"), dict)
+        assert robot.get("info").pid == shared.pid
+
+
+def test_get_of_a_key_that_is_not_there_says_so(shared: Daemon) -> None:
+    with connect(shared.endpoint) as robot, pytest.raises(ExitError) as error:
+        robot.get("odometry")
+    assert error.value.code == 69
+    assert "acsard topics" in str(error.value)
+
+
+def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(
+    shared: Daemon, fresh: Bus
+) -> None:
+    with connect(shared.endpoint) as robot:
+        start = time.monotonic()
+        messages = robot.messages("tf_static", timeout=0.5)
+        message = next(messages)
+        assert message.transforms[0].child_frame_id == "lidar_link"
+        assert time.monotonic() - start < 0.5
+        # At most one more, if the one of every 5 s falls into that time.
+        assert len(list(messages)) <= 1
+        assert time.monotonic() - start < 2.0
+
+
+def test_messages_of_silence_ends_after_its_timeout(shared: Daemon) -> None:
+    with connect(shared.endpoint) as robot:
+        start = time.monotonic()
+        assert list(robot.samples("cmd/nobody", timeout=0.3)) == []
+        assert 0.25 < time.monotonic() - start < 1.5
+
+
+def test_connecting_to_nobody_is_an_exit_error_with_69_and_the_mend() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(ExitError) as error, connect(endpoint):
+        pass
+    assert error.value.code == 69
+    assert endpoint in str(error.value)
+    assert "acsard run" in str(error.value)
+
+
+def test_connecting_async_to_nobody_is_the_same_error() -> None:
+    async def main() -> None:
+        async with connect_async(free_endpoint()):
+            pass
+
+    with pytest.raises(ExitError) as error:
+        asyncio.run(main())
+    assert error.value.code == 69
+
+
+def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        assert robot.call("stop").success
+        refused = robot.call("activate")
+        assert (refused.success, "srv/clear" in refused.message) == (False, True)
+        assert robot.call("clear").success
+        assert robot.call("set_pose", x=1.0, y=2.0, yaw=0.5).success
+        pose = robot.pose()
+        assert (pose.x, pose.y, pose.yaw) == pytest.approx((1.0, 2.0, 0.5))
+
+
+def test_a_source_that_is_not_listed_is_told_so_in_state(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint, source="stranger") as robot:
+        before = fresh.count("command_unknown_source")
+        robot.drive(0.5, seconds=0.2)
+        until(lambda: fresh.count("command_unknown_source") >= before + 4, 3.0, "all are counted")
+        state = robot.get("state")
+    assert "source stranger" in state.refused
+    assert "commands.sources" in state.refused
+    assert (state.x, state.linear) == (0.0, 0.0)
+
+
+def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
+        robot.drive(0.3, 0.1, seconds=0.2)
+        commands.find(lambda value: value["twist"]["linear"]["x"] == 0.3, 2.0, "the command")
+        speeds = until(
+            lambda: _ended([seen.value["twist"]["linear"]["x"] for seen in commands.seen]),
+            2.0,
+            "the last zero",
+        )
+        assert speeds[0] == 0.0
+        assert 3 <= speeds.count(0.3) <= 6
+        assert commands.seen[0].encoding == "application/msgpack;acsard.TwistStamped.v1"
+        assert all(seen.value["header"]["stamp"]["sec"] > 0 for seen in commands.seen)
+
+
+def _ended(speeds: list[float]) -> list[float]:
+    return speeds if len(speeds) > 2 and speeds[-1] == 0.0 else []
+
+
+def test_a_drive_that_is_interrupted_stops_at_once(shared: Daemon, fresh: Bus) -> None:
+    class InterruptionError(Exception):
+        pass
+
+    def drive_and_fail(robot: Any) -> None:
+        for count, _ in enumerate(robot.messages("odom", timeout=2.0)):
+            robot.send(0.3)
+            if count > 20:
+                raise InterruptionError
+
+    with pytest.raises(InterruptionError), connect(shared.endpoint) as robot:
+        drive_and_fail(robot)
+    # Nothing but silence tells it: the source is gone after 0.25 s.
+    until(lambda: fresh.state()["mode"] == "ready", 1.0, "the source is gone")
+
+
+def test_not_a_number_is_refused_before_it_is_sent(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
+        for wish in ((float("nan"), 0.0, 1.0), (0.0, float("inf"), 1.0), (0.1, 0.0, float("nan"))):
+            with pytest.raises(ValueError, match="finite"):
+                robot.drive(wish[0], wish[1], seconds=wish[2])
+        robot.send(0.0)
+        commands.find(lambda _: True, 2.0, "the first one sent")
+        assert commands.seen[0].value["twist"]["linear"]["x"] == 0.0
+
+
+# asyncio
+
+
+def run_async(shared: Daemon, work: Any, **how: Any) -> Any:
+    """`work(robot)` with an async client."""
+
+    async def main() -> Any:
+        async with asyncio.timeout(20.0), connect_async(shared.endpoint, **how) as robot:
+            return await work(robot)
+
+    return asyncio.run(main())
+
+
+def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: Bus) -> None:
+    async def work(robot: AsyncClient) -> list[schema.Odometry]:
+        driving = asyncio.create_task(robot.drive(0.5, seconds=0.6))
+        seen = []
+        async for odom in robot.messages("odom"):
+            seen.append(odom)
+            if driving.done() and odom.twist.twist.linear.x == 0.0:
+                break
+        return seen
+
+    seen = run_async(shared, work)
+    assert len(seen) > 60
+    assert max(odom.twist.twist.linear.x for odom in seen) > 0.4
+    assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03)
+
+
+def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh: Bus) -> None:
+    cancelled = 0.0
+
+    async def work(robot: AsyncClient) -> None:
+        nonlocal cancelled
+        driving = asyncio.create_task(robot.drive(0.5, seconds=60.0))
+        async for odom in robot.messages("odom"):
+            if odom.twist.twist.linear.x > 0.2:
+                break
+        cancelled = time.monotonic()
+        driving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await driving
+        state = await robot.get("state")
+        assert isinstance(state, schema.RobotState)
+
+    with fresh.follow("cmd/app") as commands:
+        run_async(shared, work)
+        zero = commands.find(
+            lambda value: value["twist"]["linear"]["x"] == 0.0, 2.0, "a zero", after=cancelled
+        )
+    print(f"cancel -> zero on the bus: {zero.at - cancelled:.4f} s")
+    assert zero.at - cancelled < 0.2
+    assert not [
+        seen
+        for seen in commands.seen
+        if seen.at > zero.at and seen.value["twist"]["linear"]["x"] != 0.0
+    ]
+
+
+def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> None:
+    # As a drive that is cancelled just after it sent: commands of one key that come faster than
+    # 1000 Hz are thinned out on the way in, and then the robot drives on for its timeout.
+    async def work(robot: AsyncClient) -> None:
+        driving = asyncio.create_task(robot.drive(0.2, seconds=60.0))
+        # The zero that opens it, the pause, and the first command, in one step of the loop.
+        await asyncio.sleep(0)
+        while "0.2" not in sent:
+            await asyncio.sleep(0)
+        driving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await driving
+        await robot.get("info")
+
+    sent = ""
+    original = Client._put
+
+    def put(self: Client, linear: float, angular: float) -> None:
+        nonlocal sent
+        original(self, linear, angular)
+        sent = str(linear)
+
+    with pytest.MonkeyPatch.context() as patch, fresh.follow("cmd/app") as commands:
+        patch.setattr(Client, "_put", put)
+        run_async(shared, work)
+        commands.find(lambda value: value["twist"]["linear"]["x"] == 0.2, 2.0, "the command")
+        until(lambda: commands.seen[-1].value["twist"]["linear"]["x"] == 0.0, 1.0, "a last zero")
+
+
+def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fresh: Bus) -> None:
+    async def work(robot: AsyncClient) -> tuple[bool, float]:
+        reply = await robot.call("set_pose", x=4.0, y=0.0, yaw=0.0)
+        pose = await robot.pose()
+        return reply.success, pose.x
+
+    assert run_async(shared, work) == (True, 4.0)
+
+
+def test_nothing_of_this_was_an_exception_in_the_daemon(shared: Daemon) -> None:
+    assert "Traceback" not in shared.stderr
+    assert shared.process.poll() is None

@@ -1,0 +1,97 @@
+"""The cable is pulled and put back: what is said, and what is not sent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.system.harness import ZERO, ZERO_LINE, Bus, Daemon, Peer, twist, until, wheels
+
+SEEN_S = 0.02
+"""SAFETY: an unplugged port is seen this fast."""
+
+SLACK_S = 0.5
+"""What a noisy two-core machine may add to a bound before a test calls it broken."""
+
+
+def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_old(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+    ):
+        bus.linked()
+        with bus.commanding(0.5) as commander:
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+            moved = bus.state()["x"]
+
+            pulled = peer.unplug()
+            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
+            print(f"unplug -> link down in state: {(down.at - pulled) * 1e3:.1f} ms")
+            assert down.at - pulled < SEEN_S + SLACK_S
+            assert "serial port" in down.value["reason"]
+            assert down.value["mode"] == "waiting"
+            assert bus.state()["link"] == "down"
+            assert until(lambda: daemon.events("port_lost"), 2.0, "a log line")
+
+            peer.plug()
+            up = states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
+            first = peer.session.raw[0].at - peer.session.plugged
+            print(f"replug -> first bytes {first:.3f} s, up {up.at - peer.session.plugged:.3f} s")
+            assert first < 0.5 + SLACK_S
+            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
+
+            # The commander has never stopped sending, and never said zero.
+            waiting = states.find(
+                lambda state: "neutral first" in state["reason"], 5.0, "why", after=up.at
+            )
+            assert "app must send a zero" in waiting.value["reason"]
+            peer.await_lines(100)
+            assert set(peer.session.said()[1:]) == {ZERO_LINE}
+
+            commander.wish = ZERO
+            zeros = bus.count("commands") + 2
+            until(lambda: bus.count("commands") >= zeros, 5.0, "the zero was heard")
+            assert set(peer.session.said()[1:]) == {ZERO_LINE}
+            commander.wish = twist(0.5)
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "driving again")
+            ramp = [wheels(line)[0] for line in peer.session.said()[1:]]
+            assert ramp == sorted(ramp), "it grew from zero by its ramp"
+            assert bus.state()["x"] > moved, "odometry went on from where it was"
+
+
+def test_the_port_can_be_lost_and_found_again_and_again(tmp_path: Path, peer: Peer) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+    ):
+        bus.linked()
+        for _ in range(3):
+            pulled = peer.unplug()
+            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
+            peer.plug()
+            states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
+            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
+            assert set(peer.session.said()[1:]) == {ZERO_LINE}
+        with bus.commanding(0.5):
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "driving at last")
+
+
+def test_a_stop_stays_latched_over_a_replug(tmp_path: Path, peer: Peer) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+    ):
+        bus.linked()
+        assert bus.get("srv/stop")["success"]
+        pulled = peer.unplug()
+        states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
+        peer.plug()
+        with bus.commanding(0.5):
+            states.find(lambda state: state["link"] == "up", 5.0, "up", after=pulled)
+            peer.await_lines(50)
+            assert bus.state()["mode"] == "stopped"
+        assert set(peer.session.said()[1:]) == {ZERO_LINE}

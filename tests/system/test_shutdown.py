@@ -1,0 +1,173 @@
+"""SIGTERM and SIGINT on the wire: ramp, STOP last, exit 0 within a second."""
+
+from __future__ import annotations
+
+import signal
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import (
+    ZERO_LINE,
+    Bus,
+    Daemon,
+    Heard,
+    Peer,
+    Program,
+    silence,
+    until,
+    wheels,
+)
+from tests.system.strangers import STUCK, words
+
+SLOW_STOP = {
+    "linear_stop_deceleration": 1.0,
+    "linear_speed": 3.0,
+    "linear_acceleration": 20.0,
+    "wheel_speed": 99.0,
+}
+"""From 2 m/s this ramp would take 2 s: more than the way down is allowed."""
+
+
+def ramp_after(peer: Peer, at: float) -> list[Heard]:
+    """The lines since then, without those that were on their way."""
+    return [heard for heard in peer.lines if heard.at > at]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
+    tmp_path: Path, peer: Peer, number: signal.Signals
+) -> None:
+    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with bus.commanding(0.5):
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+            sent = time.monotonic()
+            daemon.signal(number)
+            code = daemon.ended(5.0)
+            seconds = time.monotonic() - sent
+    last = peer.last_line()
+    ramp = [wheels(heard.line)[0] for heard in ramp_after(peer, sent)]
+    print(f"{number.name} at 0.5 m/s: exit {code} after {seconds:.3f} s, ramp of {len(ramp)} lines")
+    assert code == 0
+    assert seconds < 1.0
+    assert last == ZERO_LINE, "STOP is the last line"
+    assert ramp == sorted(ramp, reverse=True), "a monotone fall"
+    # 0.5 m/s at 3 m/s2 is 17 periods: a ramp, not a cut.
+    assert len({speed for speed in ramp if 0 < speed < 10}) > 5
+    assert "Traceback" not in daemon.stderr
+    assert not daemon.stdout.count("Traceback")
+
+
+def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, peer: Peer) -> None:
+    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        sent = time.monotonic()
+        daemon.signal(signal.SIGTERM)
+        assert daemon.ended(5.0) == 0
+        print(f"SIGTERM at rest: {time.monotonic() - sent:.3f} s")
+        assert time.monotonic() - sent < 1.0
+    assert peer.last_line() == ZERO_LINE
+    assert peer.session.stream.endswith(ZERO_LINE)
+
+
+def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, peer: Peer) -> None:
+    config = {"limits": SLOW_STOP}
+    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with bus.commanding(2.0):
+            until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
+            sent = time.monotonic()
+            daemon.signal(signal.SIGTERM)
+            code = daemon.ended(5.0)
+            seconds = time.monotonic() - sent
+    last = peer.last_line()
+    ramp = ramp_after(peer, sent)
+    print(f"SIGTERM at 2 m/s with a slow ramp: {seconds:.3f} s")
+    assert code == 0
+    assert 0.55 < seconds < 1.0
+    assert last == ZERO_LINE, "STOP is the last line"
+    assert wheels(ramp[-2].line)[0] > 20.0, "it was still fast when its time was up"
+
+
+# Several times: a STOP that is thrown away behind the last line is lost once in five to ten.
+@pytest.mark.parametrize(
+    "second",
+    [signal.SIGTERM, signal.SIGINT, pytest.param(signal.SIGTERM, id="SIGTERM again")],
+)
+def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signal.Signals) -> None:
+    config = {"limits": SLOW_STOP}
+    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with bus.commanding(2.0):
+            until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
+            sent = time.monotonic()
+            daemon.signal(signal.SIGTERM)
+            until(lambda: wheels(peer.lines[-1].line)[0] < 39.0, 5.0, "the ramp has begun")
+            hurried = time.monotonic()
+            daemon.signal(second)
+            code = daemon.ended(5.0)
+            ended = time.monotonic()
+    last = peer.last_line()
+    ramp = ramp_after(peer, sent)
+    print(f"second signal {hurried - sent:.3f} s after the first -> exit {ended - hurried:.3f} s")
+    assert code == 0
+    assert last == ZERO_LINE, "STOP is the last line"
+    assert wheels(ramp[-2].line)[0] > 28.0, "the ramp alone would be below that after 0.6 s"
+    assert ramp[-1].at - hurried < 0.3
+    assert ended - sent < 1.0
+
+
+def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
+    tmp_path: Path, peer: Peer
+) -> None:
+    peer.reply = silence
+    with Daemon(tmp_path, peer.path) as daemon:
+        peer.await_lines(3)
+        sent = time.monotonic()
+        daemon.signal(signal.SIGTERM)
+        assert daemon.ended(5.0) == 0
+        assert time.monotonic() - sent < 1.0
+    assert peer.last_line() == ZERO_LINE
+
+
+def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Program(words(STUCK, daemon.endpoint), tmp_path) as client:
+            client.says("listening")
+            client.signal(signal.SIGSTOP)
+            try:
+                with bus.commanding(0.5):
+                    # Enough odometry to fill every queue towards the stopped client.
+                    until(lambda: bus.state()["x"] > 0.8, 10.0, "it drives on")
+                    sent = time.monotonic()
+                    daemon.signal(signal.SIGTERM)
+                    code = daemon.ended(5.0)
+                    seconds = time.monotonic() - sent
+            finally:
+                client.signal(signal.SIGCONT)
+    print(f"SIGTERM with a stopped subscriber: {seconds:.3f} s")
+    assert code == 0
+    assert peer.last_line() == ZERO_LINE
+    assert seconds < 1.0
+
+
+def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path) -> None:
+    # At once, so that each is interrupted anywhere: a thread left behind at the interpreter's end
+    # made one in ten of them abort on a busy machine.
+    for number in (signal.SIGTERM, signal.SIGINT) * 2:
+        with ExitStack() as stack:
+            daemons = [
+                stack.enter_context(Daemon(tmp_path, name=f"d{n}", ready=False)) for n in range(8)
+            ]
+            for daemon in daemons:
+                daemon.says("bus ")
+                daemon.signal(number)
+            codes = [daemon.ended(5.0) for daemon in daemons]
+            told = next((d.stderr for d, code in zip(daemons, codes, strict=True) if code), "")
+            assert codes == [0] * 8, told

@@ -1,0 +1,274 @@
+"""From the shell to a robot that drives, and every way a start can fail."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from tests.system.harness import (
+    START_S,
+    ZERO_LINE,
+    Bus,
+    Daemon,
+    Peer,
+    Program,
+    Tables,
+    acsard,
+    alive_at,
+    client_config,
+    finish,
+    free_endpoint,
+    until,
+    write_config,
+)
+from tests.system.strangers import DRIVE, FIRST_ODOMETRY, words
+
+
+def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with Program(words(FIRST_ODOMETRY, endpoint), tmp_path) as watcher:
+        watcher.says("ready")
+        # Nothing configured but the address, since 7448 may be in use on this machine.
+        with Program(acsard("run", "--listen", endpoint), tmp_path) as daemon:
+            first = float(watcher.says("first").split()[1])
+    seconds = first - daemon.started
+    print(f"acsard run -> first odometry in another process: {seconds:.3f} s")
+    assert seconds < 3.0
+
+
+def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with Program(acsard("--listen", endpoint), tmp_path) as daemon:
+        assert "SIMULATOR" in daemon.says("acsard ")
+        assert endpoint in daemon.says("bus ")
+        for hint in ("acsard drive", "acsard echo odom -n 1", "acsard call stop"):
+            daemon.says(hint)
+
+
+def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        driven = finish(words(DRIVE, daemon.endpoint, 0.5, 2.0), tmp_path)
+        assert driven.code == 0, driven
+        until(lambda: bus.get("odom")["twist"]["twist"]["linear"]["x"] == 0.0, 3.0, "standstill")
+        position = bus.get("odom")["pose"]["pose"]["position"]
+    print(f"0.5 m/s for 2 s: {position['x']:.4f} m ({driven.out.strip()} s)")
+    assert position["x"] == pytest.approx(1.0, rel=0.02)
+    assert position["y"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appears(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "mcu"
+    with Daemon(tmp_path, path) as daemon, Bus(daemon.endpoint) as bus:
+        with bus.follow("state") as states:
+            state = states.find(lambda state: True, 5.0, "a state").value
+        assert (state["link"], state["mode"]) == ("down", "waiting")
+        assert "port" in state["reason"]
+        said = until(lambda: daemon.events("port_waiting"), 5.0, "a word about the missing port")
+        assert str(path) in said[0]["text"]
+        with Peer(path) as peer, bus.follow("state") as states:
+            appeared = peer.session.plugged
+            until(lambda: peer.lines, 5.0, "a line")
+            print(f"port appears -> first bytes: {peer.session.raw[0].at - appeared:.3f} s")
+            assert peer.session.raw[0].at - appeared < 0.5 + 0.5
+            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
+            states.find(lambda state: state["link"] == "up", 5.0, "link up")
+        assert len(daemon.events("port_waiting")) == 1  # once, not at every attempt
+
+
+def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
+    tmp_path: Path,
+) -> None:
+    # In the first milliseconds the signal meets an attempt to open the port, later a pause.
+    for pause in (0.0, 0.0, 0.0, 0.0, 0.001, 0.003, 0.3):
+        with Daemon(tmp_path, tmp_path / "nothing") as daemon:
+            time.sleep(pause)
+            sent = time.monotonic()
+            daemon.signal(signal.SIGTERM)
+            assert daemon.ended(2.0) == 0
+            assert time.monotonic() - sent < 1.0
+
+
+def test_state_answers_as_soon_as_the_daemon_says_it_is_up(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        assert bus.state()["mode"] in ("waiting", "ready")
+
+
+# in use: 75
+
+
+def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with Daemon(tmp_path, peer.path) as first, Bus(first.endpoint) as bus:
+        bus.linked()
+        opened, heard = len(peer.session.raw), len(peer.lines)
+        with bus.commanding(0.5):
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+            config: Tables = {"mcu": {"port": str(peer.path)}, "bus": {"listen": [free_endpoint()]}}
+            path = write_config(tmp_path / "second.toml", config)
+            second = finish(acsard("run", "--config", str(path)), tmp_path)
+            peer.await_lines(10)
+            said = peer.session.said()[heard:]
+            assert bus.state()["mode"] == "driving"
+    print(f"second daemon on the port: exit {second.code} after {second.seconds:.2f} s")
+    assert second.code == 75
+    assert f"process {first.pid}" in second.err
+    assert str(peer.path) in second.err
+    assert "Traceback" not in second.err
+    # Not a byte of the second: no end of line of a new session, no zero amid the driving.
+    assert opened
+    assert b"\r\n" not in said
+    began = next(index for index, line in enumerate(said) if line != ZERO_LINE)
+    steady = said[began : said.index(b"ap10.00,bp10.00,cp10.00,dp10.00\r\n") + 60]
+    assert ZERO_LINE not in steady
+
+
+def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_own_port(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with Daemon(tmp_path) as first:
+        config: Tables = {"mcu": {"port": str(peer.path)}, "bus": {"listen": [first.endpoint]}}
+        path = write_config(tmp_path / "second.toml", config)
+        second = finish(acsard("run", "--config", str(path)), tmp_path)
+        assert first.process.poll() is None
+    print(f"second daemon on the address: exit {second.code} after {second.seconds:.2f} s")
+    assert second.code == 75
+    assert first.endpoint in second.err
+    assert "bus.listen" in second.err
+    assert "Traceback" not in second.err
+    assert peer.session.stream == b""
+
+
+def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
+    tmp_path: Path, peer: Peer
+) -> None:
+    endpoint = free_endpoint()
+    with zenoh.open(client_config(endpoint, "router")) as router:
+        connected = {"bus": {"listen": [free_endpoint()], "connect": [endpoint]}}
+        with Daemon(tmp_path, config=connected):
+            alive = router.liveliness().declare_subscriber(
+                "acsard/acsar/alive", zenoh.handlers.FifoChannel(10), history=True
+            )
+            until(alive.try_recv, 5.0, "the first daemon's alive token at the router")
+            mine: Tables = {
+                "mcu": {"port": str(peer.path)},
+                "bus": {"listen": [free_endpoint()], "connect": [endpoint]},
+            }
+            path = write_config(tmp_path / "second.toml", mine)
+            second = finish(acsard("run", "--config", str(path)), tmp_path)
+            assert second.code == 75
+            assert "acsar" in second.err
+            assert "robot.id" in second.err
+            assert "Traceback" not in second.err
+            assert peer.session.stream == b""
+            print(f"second daemon of the id: exit 75 after {second.seconds:.2f} s")
+            with Daemon(tmp_path, peer.path, mine, words=["--id", "other"], name="other") as third:
+                assert third.process.poll() is None
+
+
+# no permission: 77
+
+
+def unprivileged() -> list[str]:
+    """Words before a command that take root's rights from it; none are needed by others."""
+    if os.geteuid() != 0:
+        return []
+    drop = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
+    if shutil.which("setpriv") is None or finish([*drop, "true"], "/").code:
+        pytest.skip("root needs setpriv and the right to drop capabilities")
+    return drop
+
+
+def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, peer: Peer) -> None:
+    drop = unprivileged()
+    device = os.path.realpath(peer.path)
+    os.chmod(device, 0o000)  # not even the owner, who is root here only without root's rights
+    run = acsard("run", "--port", device, "--listen", free_endpoint())
+    ended = finish([*drop, *run], tmp_path)
+    print(f"no permission: exit {ended.code} after {ended.seconds:.2f} s")
+    assert ended.code == 77
+    assert 2.0 < ended.seconds < 8.0  # udev is given 2 s to set the group
+    assert device in ended.err
+    assert "usermod -aG dialout" in ended.err
+    assert "Traceback" not in ended.err
+    assert peer.session.stream == b""
+
+
+def test_permission_granted_within_2_s_of_the_start_is_enough(tmp_path: Path, peer: Peer) -> None:
+    drop = unprivileged()
+    device = os.path.realpath(peer.path)
+    os.chmod(device, 0o000)
+    endpoint = free_endpoint()
+    run = acsard("run", "--port", device, "--listen", endpoint)
+    with Program([*drop, *run], tmp_path) as daemon, alive_at(endpoint, daemon) as alive:
+        # The bus comes first, so the token says that the port is what is being tried now.
+        until(alive.try_recv, START_S, "the alive token")
+        os.chmod(device, 0o600)
+        until(lambda: peer.lines, 3.0, "a line after permission")
+
+
+# bad configuration: 78
+
+PLANTED = """\
+[robot]
+id = "two words"
+[mcu]
+port = "/dev/null"
+baud_rate = 1234
+trailing_coma = true
+[drive]
+wheel_radius = inf
+[limits]
+linear_speed = -1.0
+"""
+MISTAKES = {
+    "robot.id": "two words",
+    "mcu.baud_rate": "1234",
+    "mcu.trailing_coma": "trailing_comma",
+    "drive.wheel_radius": "inf",
+    "limits.linear_speed": "-1.0",
+}
+
+
+@pytest.mark.parametrize("verb", ["run", "check"])
+def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path, verb: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(PLANTED)
+    ended = finish(acsard(verb, "--config", str(path)), tmp_path)
+    print(f"{verb} with a bad configuration: {ended.seconds:.2f} s")
+    assert ended.code == 78
+    assert ended.out == ""
+    *lines, summary = ended.err.splitlines()
+    assert len(lines) == len(MISTAKES), ended.err
+    for key, told in MISTAKES.items():
+        assert [line for line in lines if key in line and told in line], (key, ended.err)
+    assert summary.startswith("acsard: 5 problems")
+    assert ended.seconds < 2.0
+
+
+def test_a_configuration_that_is_not_there_ends_with_78(tmp_path: Path) -> None:
+    ended = finish(acsard("run", "--config", str(tmp_path / "none.toml")), tmp_path)
+    assert ended.code == 78
+    assert len(ended.err.splitlines()) == 1
+    assert "none.toml" in ended.err
+
+
+def test_a_rate_the_wire_cannot_carry_is_refused_with_both_ways_out(tmp_path: Path) -> None:
+    path = write_config(tmp_path / "slow.toml", {"mcu": {"port": "sim", "baud_rate": 9600}})
+    ended = finish(acsard("run", "--config", str(path)), tmp_path)
+    assert ended.code == 78
+    for told in ("34.4 ms", "29 Hz", "23 Hz", "38400"):
+        assert told in ended.err
+
+
+def test_an_unknown_option_ends_with_2(tmp_path: Path) -> None:
+    assert finish(acsard("run", "--prot", "sim"), tmp_path).code == 2

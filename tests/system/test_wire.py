@@ -1,0 +1,290 @@
+"""The bytes on the line, against a serial peer that is not ours."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import (
+    PLAIN,
+    ZERO,
+    ZERO_LINE,
+    Bus,
+    Daemon,
+    Following,
+    Peer,
+    Reply,
+    Seen,
+    Speeds,
+    Tables,
+    form,
+    silence,
+    twist,
+    until,
+    wheels,
+)
+
+
+@contextmanager
+def running(
+    tmp_path: Path, peer: Peer, config: Tables | None = None, linked: bool = True
+) -> Iterator[Bus]:
+    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
+        if linked:
+            bus.linked()
+        yield bus
+
+
+def test_the_first_bytes_are_an_end_of_line_and_a_zero_and_every_line_has_33_bytes(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with running(tmp_path, peer) as bus, bus.commanding(0.5, 1.0):
+        until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
+    first, *lines = peer.session.said()
+    assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
+    assert first == b"\r\n"
+    assert lines[0] == ZERO_LINE
+    assert {len(line) for line in lines} == {33}
+
+
+def test_half_a_metre_per_second_straight_is_10_rad_per_s_on_every_wheel(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with running(tmp_path, peer) as bus, bus.commanding(0.5):
+        steady = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
+        until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
+        assert {heard.line for heard in peer.await_lines(30)} == {steady}
+
+
+def test_a_pure_left_turn_is_forward_on_a_and_d_and_backward_on_b_and_c(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with running(tmp_path, peer) as bus, bus.commanding(0.0, 1.0):
+        # 1 rad/s on half of 0.30 m is 0.15 m/s, over 0.05 m 3 rad/s.
+        steady = b"ap03.00,bn03.00,cn03.00,dp03.00\r\n"
+        until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
+        yaw = bus.state()["yaw"]
+        until(lambda: bus.state()["yaw"] > yaw, 5.0, "odometry turns left")
+    turning = [wheels(line) for line in peer.session.said()[1:] if line != ZERO_LINE]
+    assert turning
+    assert all(a > 0 > b and c < 0 < d for a, b, c, d in turning)
+
+
+def test_speeds_on_the_wire_grow_by_the_acceleration_limit_only(tmp_path: Path, peer: Peer) -> None:
+    with running(tmp_path, peer) as bus, bus.commanding(0.5):
+        until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+    # 1 m/s2 is 20 rad/s2; a step is at most 0.05 s however late the tick came.
+    sped = [wheels(line)[0] for line in peer.session.said()[1:]]
+    assert max(after - before for before, after in itertools.pairwise(sped)) <= 20 * 0.05 + 0.01
+
+
+def test_trailing_comma_is_on_the_wire_when_asked_for(tmp_path: Path, peer: Peer) -> None:
+    config = {"mcu": {"port": str(peer.path), "trailing_comma": True}}
+    with running(tmp_path, peer, config) as bus, bus.commanding(0.5):
+        steady = b"ap10.00,bp10.00,cp10.00,dp10.00,\r\n"
+        until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
+    first, *lines = peer.session.said()
+    assert first == b"\r\n"
+    assert lines[0] == b"ap00.00,bp00.00,cp00.00,dp00.00,\r\n"
+    assert {line[-3:] for line in lines} == {b",\r\n"}
+    assert {len(line) for line in lines} == {34}
+
+
+def test_a_wired_sign_and_letter_apply_on_the_wire(tmp_path: Path, peer: Peer) -> None:
+    config = {
+        "mcu": {"port": str(peer.path)},
+        "mcu.wheels": {
+            "front_right": "-b", "front_left": "+a", "rear_left": "+c", "rear_right": "+d",
+        },
+    }  # fmt: skip
+    with running(tmp_path, peer, config) as bus, bus.commanding(0.5):
+        steady = b"ap10.00,bn10.00,cp10.00,dp10.00\r\n"
+        until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
+        until(lambda: bus.state()["linear"] == pytest.approx(0.5), 5.0, "0.5 m/s measured")
+
+
+def mixture() -> Reply:
+    """Every accepted form in turn, and some in one line."""
+
+    def mixed(speeds: Speeds) -> bytes:
+        a, b, c, d = (f"{'n' if speed < 0 else 'p'}{abs(speed):.3f}" for speed in speeds)
+        return f"a{a[:-1]}, b{b},c{c[:-2]},  d{d},\n".encode()
+
+    def reply(speeds: Speeds) -> bytes:
+        return next(turns)(speeds)
+
+    turns = itertools.cycle([*ACCEPTED.values(), mixed])
+    return reply
+
+
+ACCEPTED: dict[str, Reply] = {
+    "plain": PLAIN,
+    "spaces": form(separator=", "),
+    "trailing_comma": form(comma=","),
+    "spaces_and_trailing_comma": form(separator=", ", comma=","),
+    "lf_only": form(end="\n"),
+    "one_integer_digit": form(pad=1),
+    "one_decimal": form(decimals=1),
+    "three_decimals": form(decimals=3),
+    "one_digit_one_decimal_spaces_comma_lf": form(", ", "\n", 1, 1, ","),
+}
+
+
+def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -> None:
+    # 0.4 m/s is 8 rad/s, which can be said with one digit and with one decimal.
+    with running(tmp_path, peer) as bus, bus.commanding(0.4):
+        until(lambda: peer.lines[-1].line.startswith(b"ap08.00"), 5.0, "steady driving")
+        for name, reply in {**ACCEPTED, "mixture": mixture()}.items():
+            peer.reply = reply
+            peer.await_lines(5)  # replies of the form before have been read by then
+            goal = bus.state()["x"] + 0.04
+            until(lambda: bus.state()["x"] > goal, 5.0, f"odometry moves by {name}")  # noqa: B023
+            after = bus.state()
+            assert after["link"] == "up", name
+            assert after["linear"] == pytest.approx(0.4, abs=0.005), name
+        rejects = {key for key in after["counters"] if key.startswith("line_")}
+        assert rejects == set(), after["counters"]
+
+
+STANDING = (0.0, 0.0, 0.0, 0.0)
+
+
+def always(data: bytes) -> Reply:
+    """The same answer to everything."""
+    return lambda speeds: data
+
+
+REFUSED: dict[str, tuple[str, Reply]] = {
+    "a wheel missing": ("malformed", always(b"ap10.00,bp10.00,cp10.00\r\n")),
+    "five wheels": ("malformed", always(b"ap10.00,bp10.00,cp10.00,dp10.00,ap10.00\r\n")),
+    "a wheel twice": ("wheel_twice", always(b"ap10.00,bp10.00,cp10.00,cp10.00\r\n")),
+    "no sign": ("malformed", always(b"a10.00,b10.00,c10.00,d10.00\r\n")),
+    "a minus": ("malformed", always(b"a-10.00,b-10.00,c-10.00,d-10.00\r\n")),
+    "another wheel": ("malformed", always(b"ap10.00,bp10.00,cp10.00,ep10.00\r\n")),
+    "upper case": ("malformed", always(b"AP10.00,BP10.00,CP10.00,DP10.00\r\n")),
+    "no decimals": ("malformed", always(b"ap10,bp10,cp10,dp10\r\n")),
+    "a bare point": ("malformed", always(b"ap10.,bp10.,cp10.,dp10.\r\n")),
+    "four decimals": ("malformed", always(b"ap10.0000,bp10.00,cp10.00,dp10.00\r\n")),
+    "three digits": ("malformed", always(b"ap100.00,bp10.00,cp10.00,dp10.00\r\n")),
+    "over 99.99": ("over_range", always(b"ap99.995,bp10.00,cp10.00,dp10.00\r\n")),
+    "nan": ("malformed", always(b"apnan,bp10.00,cp10.00,dp10.00\r\n")),
+    "inf": ("malformed", always(b"apinf,bp10.00,cp10.00,dp10.00\r\n")),
+    "an exponent": ("malformed", always(b"ap1e1,bp10.00,cp10.00,dp10.00\r\n")),
+    "a space inside": ("malformed", always(b"ap 10.00,bp10.00,cp10.00,dp10.00\r\n")),
+    "a space before the comma": ("malformed", always(b"ap10.00 ,bp10.00,cp10.00,dp10.00\r\n")),
+    "a space in front": ("malformed", always(b" ap10.00,bp10.00,cp10.00,dp10.00\r\n")),
+    "two commas": ("malformed", always(b"ap10.00,,bp10.00,cp10.00,dp10.00\r\n")),
+    "semicolons": ("malformed", always(b"ap10.00;bp10.00;cp10.00;dp10.00\r\n")),
+    "noise in front": ("malformed", always(b"\x00\xff~ap10.00,bp10.00,cp10.00,dp10.00\r\n")),
+    "half a line": ("malformed", always(b"ap10.00,bp10.0\r\n")),
+    "two lines in one": ("malformed", always(b"ap10.00,bp10.00,cap10.00,bp10.00,cp10.00\r\n")),
+    "words": ("malformed", always(b"Hello from the bootloader\r\n")),
+    "an endless line": ("too_long", always(b"ap10.00,bp10.00,cp10.00,dp10.00," * 8 + b"\r\n")),
+    "CR only": ("too_long", always(b"ap10.00,bp10.00,cp10.00,dp10.00\r")),
+}
+
+
+def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_comes(
+    tmp_path: Path, peer: Peer
+) -> None:
+    peer.reply = silence
+    with running(tmp_path, peer, linked=False) as bus:
+        bus.put("cmd/app", ZERO)
+        with bus.follow("state") as states:
+            states.find(lambda state: state["link"] == "booting", 5.0, "booting")
+        for name, (reason, reply) in REFUSED.items():
+            before = bus.count(f"line_{reason}")
+            # Said unasked, since 10 lines a second is all a silent peer gets to answer.
+            peer.say(reply(STANDING))
+            if reason == "too_long":  # may want more than one piece to be too long
+                peer.say(reply(STANDING) * 4)
+            until(
+                lambda: bus.count(f"line_{reason}") > before,  # noqa: B023
+                5.0,
+                f"{name} counted as {reason}",
+            )
+            # What came counts for nothing: not even together with a commander who insists.
+            bus.put("cmd/app", twist(0.5))
+            state = bus.state()
+            assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, 0.0), name
+            assert state["counters"]["lines"] == 0, name
+        # The next newline resynchronises: three good lines and the link is up.
+        peer.say(b"\r\n")
+        peer.reply = PLAIN
+        bus.linked()
+    assert set(peer.session.said()[1:]) == {ZERO_LINE}
+
+
+def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_short_gap(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with running(tmp_path, peer) as bus, bus.follow("state") as states, bus.commanding(0.5):
+        until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+        silent, stale, _ = _fall_silent(peer, states)
+        print(f"peer falls silent -> stale in state: {stale.at - silent:.3f} s")
+        assert stale.at - silent < 0.1 + 0.5
+        assert "silent" in stale.value["reason"]
+        pose = bus.state()["x"]
+        zeros = peer.await_lines(2)
+        assert {heard.line for heard in zeros} == {ZERO_LINE}
+        assert bus.state()["x"] == pose
+        # A silence under a second: the commander is still trusted, the ramp starts from zero.
+        peer.reply = PLAIN
+        again = until(lambda: _moving_since(peer, zeros[-1].at), 5.0, "driving again")
+        assert wheels(again)[0] <= 20 * 0.05 + 0.01
+
+
+def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with running(tmp_path, peer) as bus, bus.follow("state") as states:  # noqa: SIM117
+        with bus.commanding(0.5) as commander:
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+            _, stale, zeros_from = _fall_silent(peer, states)
+            zeros = peer.await_lines(14)
+            # 10 Hz while nothing comes back, whatever the commander wants.
+            assert {heard.line for heard in zeros} == {ZERO_LINE}
+            assert 0.08 < (zeros[-1].at - zeros[0].at) / 13 < 0.2
+            peer.reply = PLAIN
+            back = states.find(lambda state: state["link"] == "up", 5.0, "up", after=stale.at).at
+            waiting = states.find(
+                lambda state: "neutral first" in state["reason"], 5.0, "why it waits", after=back
+            )
+            assert waiting.value["mode"] == "ready"
+            peer.await_lines(50)
+            assert _moving_since(peer, zeros_from) is None
+            commander.wish = ZERO
+            peer.await_lines(30)
+            commander.wish = twist(0.5)
+            until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
+
+
+def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
+    """When the peer was muted, the state that said so, and from when on only zeros came."""
+    peer.reply = silence
+    muted = time.monotonic()
+    stale = states.find(lambda state: state["link"] == "stale", 5.0, "stale", after=muted)
+    until(lambda: peer.lines[-1].line == ZERO_LINE, 2.0, "zeros")
+    last = max(heard.at for heard in peer.lines if heard.line != ZERO_LINE)
+    return muted, stale, last
+
+
+def _moving_since(peer: Peer, after: float) -> bytes | None:
+    """The first line since then that is not zero."""
+    moving = (heard.line for heard in peer.lines if heard.at > after and heard.line != ZERO_LINE)
+    return next(moving, None)
+
+
+def test_noise_between_good_replies_costs_only_itself(tmp_path: Path, peer: Peer) -> None:
+    noise = itertools.cycle([b"\x00\xff\xfe\r\n", b"ap10.0\n", b"", b"\r\n\r\n"])
+    peer.reply = lambda speeds: next(noise) + PLAIN(speeds)
+    with running(tmp_path, peer) as bus, bus.commanding(0.5):
+        until(lambda: bus.state()["x"] > 0.3, 5.0, "it drives")
+        state = bus.state()
+    assert state["link"] == "up"
+    assert state["counters"]["line_malformed"] > 10
