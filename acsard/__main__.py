@@ -1,7 +1,5 @@
 """`python -m acsard` is `acsard`."""
 
-import sys
+from acsard.cli import entry
 
-from acsard.cli import main
-
-sys.exit(main())
+entry()

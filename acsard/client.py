@@ -38,9 +38,10 @@ ENDPOINT = "tcp/127.0.0.1:7448"
 SEND_PERIOD_S = 0.05
 """Commands are repeated at 20 Hz: five times within the default timeout."""
 
+SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 QUEUED = 1000
-"""Messages held for a slow reader; the newest are dropped beyond that."""
+"""Messages held for a slow reader; the oldest are dropped beyond that."""
 
 
 class Client:
@@ -50,6 +51,10 @@ class Client:
         self.session = session
         self._id, self._source = robot_id, source
         self._opened = False
+        self._put_s = 0.0
+        started = clock.now()
+        # The wall clock may be set while we drive; stamps that jump would be refused as stale.
+        self._wall_offset_ns = started.wall_ns - started.mono_ns
 
     def key(self, name: str) -> str:
         """The full key of a name of the topic table, for example "odom"."""
@@ -91,6 +96,8 @@ class Client:
         """The typed messages of a published key as they come; ends after `timeout` s of silence."""
         decoder = _decoder(name)
         for sample in self.samples(name, timeout):
+            if str(sample.key_expr) != self.key(name):
+                continue  # a stranger's put on a wildcard
             yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
@@ -109,8 +116,15 @@ class Client:
             subscriber.undeclare()
 
     def _subscribe(self, name: str) -> Any:
+        try:
+            return self._declare(name)
+        except zenoh.ZError:
+            raise _no_key(name) from None
+
+    def _declare(self, name: str) -> Any:
         topic = by_key(name)
-        queue: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(QUEUED)
+        # A ring: a full FIFO would hold up everything else this session receives.
+        queue: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(QUEUED)
         if topic is not None and topic.latched:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
             return zenoh.ext.declare_advanced_subscriber(
@@ -119,7 +133,11 @@ class Client:
         return self.session.declare_subscriber(self.key(name), queue)
 
     def _put(self, linear: float, angular: float) -> None:
-        stamp = schema.Time.from_ns(clock.now().wall_ns)
+        # The daemon takes 1000 commands a second on a key: a zero on the heels of another command
+        # would be lost.
+        time.sleep(max(0.0, self._put_s + SPACING_S - time.monotonic()))
+        self._put_s = time.monotonic()
+        stamp = schema.Time.from_ns(clock.now().mono_ns + self._wall_offset_ns)
         message = schema.TwistStamped(
             schema.Header(stamp),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
@@ -134,7 +152,11 @@ class Client:
 
     def _ask(self, name: str, payload: bytes | None = None) -> list[tuple[str, bytes]]:
         found = []
-        for reply in self.session.get(self.key(name), payload=payload, timeout=REPLY_TIMEOUT_S):
+        try:
+            replies = self.session.get(self.key(name), payload=payload, timeout=REPLY_TIMEOUT_S)
+        except zenoh.ZError:
+            raise _no_key(name) from None
+        for reply in replies:
             if reply.ok is not None:
                 found.append((str(reply.ok.encoding), reply.ok.payload.to_bytes()))
             elif reply.err is not None:
@@ -189,6 +211,8 @@ class AsyncClient:
                 if sample is None:
                     await asyncio.sleep(0.001)
                     continue
+                if str(sample.key_expr) != self._client.key(name):
+                    continue
                 yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
         finally:
             subscriber.undeclare()
@@ -203,7 +227,7 @@ def connect(
     try:
         yield Client(session, robot_id, source)
     finally:
-        session.close()
+        _close(session)
 
 
 @asynccontextmanager
@@ -215,17 +239,16 @@ async def connect_async(
     try:
         yield AsyncClient(Client(session, robot_id, source))
     finally:
-        await in_thread(session.close, 5.0)
+        await in_thread(lambda: _close(session), 5.0)
 
 
 def _drive(client: Client, linear: float, angular: float, seconds: float) -> Iterator[float]:
     """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
     if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
         raise ValueError("linear, angular and seconds must be finite numbers")
-    if not client._opened:
-        client.send(0.0, 0.0)
-        # Commands on one key are taken at 1000 Hz at most: the next would be lost behind this.
-        yield SEND_PERIOD_S
+    # A zero each time: the robot may have been stopped and cleared since the last drive.
+    client.send(0.0, 0.0)
+    yield SEND_PERIOD_S
     end = time.monotonic() + seconds
     try:
         while (left := end - time.monotonic()) > 0:
@@ -234,6 +257,17 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
     finally:
         # Whatever interrupts the drive, the robot is told to stop.
         client.send(0.0, 0.0)
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError:
+        pass  # the other side is stuck; we are leaving anyway
+
+
+def _no_key(name: str) -> ExitError:
+    return ExitError(Exit.USAGE, f"{name!r} is not a key; `acsard topics` lists them")
 
 
 def _decoder(name: str) -> Decoder[Any]:

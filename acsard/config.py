@@ -16,6 +16,9 @@ from acsard.settings import BusConfig, Config
 from acsard.validation import build, show
 from acsard.values import WHEELS, AcsardError
 
+LEAST_JERK = 0.01
+"""m/s3 or rad/s3; at less a robot takes over ten seconds to reach walking pace."""
+
 MAX_BYTES = 65536
 """The reference file is a tenth of this."""
 
@@ -162,6 +165,12 @@ def _limit_problems(config: Config) -> list[str]:
         stop, normal = (
             getattr(limits, f"{axis}_{kind}") for kind in ("stop_deceleration", "deceleration")
         )
+        jerk = getattr(limits, f"{axis}_jerk")
+        if 0.0 < jerk < LEAST_JERK:
+            found.append(
+                f"limits.{axis}_jerk = {jerk:g}: the robot would take minutes to start; write "
+                f"{LEAST_JERK:g} or more, or 0 for no limit"
+            )
         if stop < normal:
             found.append(
                 f"limits.{axis}_stop_deceleration = {stop:g}: lower than {axis}_deceleration; a "
@@ -201,7 +210,7 @@ def _bus_problems(bus: BusConfig) -> list[str]:
 def _host(endpoint: str) -> str | None:
     scheme, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
-    good = scheme == "tcp" and host and port.isascii() and port.isdigit() and int(port) < 65536
+    good = scheme == "tcp" and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536
     return host.strip("[]") if good else None
 
 

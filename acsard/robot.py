@@ -39,6 +39,9 @@ UNHEARD_S = 0.25
 """s without a line that left: by its contract the MCU stops by itself soon after, so start over
 from rest instead of resuming a speed it no longer has."""
 
+MAX_TEXT = 200
+"""Characters of a refusal kept: it may quote what a stranger sent."""
+
 BLIND_PERIOD_NS = NS_PER_S // 10
 """Zero lines go out at 10 Hz while nothing comes back: enough to wake the MCU, little to queue."""
 
@@ -67,6 +70,9 @@ class Robot:
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (superseded lines, missed periods)."""
         self._refused = ""
+        self._stopped_ns = -1
+        self._told_ns: dict[str, int] = {}
+        self._port_trouble = ""
         self._arbiter.require_neutral()
         self._resume()
 
@@ -119,6 +125,7 @@ class Robot:
         session, before = self.session, self.session.link
         feedback = session.update(inputs.now, inputs.port_open, inputs.opened, inputs.received)
         link = session.link
+        self._port_trouble = inputs.port_trouble
         if session.restarted:
             self._arbiter.require_neutral()
         if link != before:
@@ -143,22 +150,25 @@ class Robot:
         if inputs.leaving and self._mode is not Mode.LEAVING:
             self._fire(Trigger.LEAVE)
             events.append(Event("leaving", "ramping to zero, then STOP"))
-        return tuple([self._answer(request, events) for request in inputs.requests])
+        return tuple([self._answer(r, inputs.now.mono_ns, events) for r in inputs.requests])
 
-    def _answer(self, request: Request, events: list[Event]) -> Answer:
+    def _answer(self, request: Request, now_ns: int, events: list[Event]) -> Answer:
         before = self._mode
         try:
-            message = self._obey(request)
+            message = self._obey(request, now_ns)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
-        if request.verb != "stop" or self._mode is not before:
-            # A stop that is repeated as fast as it can be sent is still one line of log.
+        last_ns = self._told_ns.get(request.verb)
+        if self._mode is not before or last_ns is None or now_ns - last_ns > NS_PER_S:
+            # What is repeated as fast as it can be sent is still a line of log a second.
+            self._told_ns[request.verb] = now_ns
             events.append(Event(request.verb, message))
         return Answer(request.id, True, message)
 
-    def _obey(self, request: Request) -> str:
+    def _obey(self, request: Request, now_ns: int) -> str:
         match request.verb:
             case "stop":
+                self._stopped_ns = now_ns
                 self._mode = next_mode(self._mode, Trigger.STOP)
                 if self._mode is Mode.LEAVING:
                     return "the daemon is going down: ramping to zero"
@@ -167,6 +177,9 @@ class Robot:
                 self._latch = "stopped by request"
                 return "stopped and latched; srv/clear releases it"
             case "clear":
+                asked_ns = now_ns if request.asked_ns is None else request.asked_ns
+                if asked_ns <= self._stopped_ns or now_ns == self._stopped_ns:
+                    raise RefusedError("a stop came at the same time or after; call it again")
                 self._mode = next_mode(self._mode, Trigger.CLEAR)
                 self._latch = ""
                 self._arbiter.require_neutral()
@@ -224,7 +237,7 @@ class Robot:
 
     def _refuse(self, refusal: Refusal) -> None:
         self.counters[f"command_{refusal.reason}"] += 1
-        self._refused = refusal.text
+        self._refused = refusal.text[:MAX_TEXT]
 
     # choose, gate, limit, invert
 
@@ -267,13 +280,24 @@ class Robot:
             case Mode.READY:
                 return self._choice.reason
             case Mode.WAITING:
-                return _LINK_WORDS[self.session.link]
+                return self._waiting()
             case Mode.STOPPED | Mode.FAULT:
                 return f"{self._latch}; call srv/clear"
             case Mode.INACTIVE:
                 return "switched off; call srv/activate"
             case Mode.LEAVING:
                 return "the daemon is going down"
+
+    def _waiting(self) -> str:
+        session = self.session
+        if session.link == "down" and self._port_trouble:
+            return self._port_trouble
+        if session.link in ("booting", "stale") and session.sparse_s:
+            return (
+                f"the microcontroller's lines come {session.sparse_s:.2f} s apart; if it reports "
+                f"by its own clock, set mcu.reply_period = {session.sparse_s:.2f}"
+            )
+        return _LINK_WORDS[session.link]
 
 
 _LINK_WORDS = {

@@ -27,7 +27,11 @@ Frame = Annotated[
     ),
 ]
 Text = Annotated[
-    str, Meta(min_length=1, max_length=256, extra={"unit": "a text of 1 to 256 characters"})
+    str,
+    Meta(
+        pattern=r"^[^\x00]{1,256}\Z",
+        extra={"unit": "a text of 1 to 256 characters"},
+    ),
 ]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
 Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
@@ -69,7 +73,7 @@ class McuConfig(Struct, frozen=True):
 
 
 class ControlConfig(Struct, frozen=True):
-    rate: Annotated[float, Meta(ge=5.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
+    rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
     auto_activate: bool = True
 
 

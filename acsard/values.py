@@ -100,6 +100,8 @@ class Request(Struct, frozen=True):
     verb: Verb
     id: int = 0
     pose: Pose | None = None
+    asked_ns: int | None = None
+    """When it arrived, monotonic: a clear must not undo a stop that came after it."""
 
 
 class Answer(Struct, frozen=True):
@@ -157,6 +159,8 @@ class Inputs(Struct, frozen=True):
     tick: bool
     port_open: bool
     opened: int = 0
+    port_trouble: str = ""
+    """Why the port is closed, in words."""
     received: tuple[Received, ...] = ()
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()

@@ -6,8 +6,11 @@ Verbs import what is heavy inside `main`, so that `acsard --help` is quick.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
+import traceback
+from typing import NoReturn
 
 from acsard import __version__
 from acsard.cli import call, check, drive, echo, hz, run, sim, topics
@@ -27,7 +30,6 @@ try:  acsard run                (the robot, on the built-in simulator)
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `acsard` command; returns the exit code."""
-    _fill_closed_streams()
     parser = argparse.ArgumentParser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
@@ -43,18 +45,45 @@ def main(argv: list[str] | None = None) -> int:
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
-    args = parser.parse_args(words)
     try:
-        return int(args.main(args))
-    except ExitError as error:
-        print(f"acsard: {error}", file=sys.stderr)
-        return int(error.code)
-    except BrokenPipeError:
-        # The reader (head, less) has left; writing the rest at exit must not fail again.
+        try:
+            args = parser.parse_args(words)
+            return int(args.main(args))
+        except ExitError as error:
+            print(f"acsard: {error}", file=sys.stderr)
+            return int(error.code)
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
+            raise
+        # The reader (head, less) has left, or there is no room: nobody to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return int(Exit.OK)
+        return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
+
+
+def entry() -> NoReturn:
+    """What the `acsard` script runs: `main`, and an end that nothing can hold up.
+
+    Zenoh's threads may still be calling into Python while the interpreter takes itself apart,
+    which aborts the process; all that matters has been closed and flushed by now.
+    """
+    _fill_closed_streams()
+    try:
+        code = main()
+    except SystemExit as end:  # argparse: --help, --version, usage
+        code = end.code if isinstance(end.code, int) else int(Exit.FAILURE)
+    except BaseException:  # noqa: BLE001 - what Python would do with it, then the same end
+        traceback.print_exc()
+        code = int(Exit.FAILURE)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            pass  # closed, or full
+    os._exit(code)
 
 
 def _fill_closed_streams() -> None:

@@ -36,6 +36,14 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)")
 
 
+def count(text: str) -> int:
+    """An argparse type: a whole number of at least 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
+    return number
+
+
 def find(path: str | None) -> tuple[str, bytes]:
     """Where the configuration is and what it holds; ("built-in defaults", b"") without a file."""
     named = path or os.environ.get("ACSARD_CONFIG")

@@ -16,6 +16,7 @@ HOLD_S = 0.6
 """Longer than a keyboard's delay before its first repeat (0.25 to 0.5 s), or it would stutter."""
 
 ZEROS = 3
+SILENT_S = 1.0
 PERIOD_S = 0.05
 
 _MOVES = {
@@ -43,6 +44,7 @@ class Teleop:
         self._move = (0, 0)
         self._until = 0.0
         self._zeros = ZEROS
+        self._lead = False
 
     def press(self, key: str, now: float) -> None:
         """A key (or an arrow's escape sequence) was pressed at `now` s."""
@@ -50,6 +52,8 @@ class Teleop:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
         elif key in _MOVES:
+            # After a silence the robot may want neutral first (it was stopped and cleared, say).
+            self._lead = self._lead or (now >= self._until and not self._zeros)
             self._move, self._until, self._zeros = _MOVES[key], now + HOLD_S, ZEROS
         else:
             # Like the tool people know: any other key stops.
@@ -57,6 +61,9 @@ class Teleop:
 
     def send(self, now: float) -> Twist | None:
         """The command to send at `now`, or None for silence."""
+        if self._lead:
+            self._lead = False
+            return REST
         if now < self._until:
             return Twist(self.linear * self._move[0], self.angular * self._move[1])
         if self._zeros:
@@ -82,6 +89,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C."""
+    import signal
     import termios
     import tty
 
@@ -94,6 +102,8 @@ def main(args: argparse.Namespace) -> int:
     with connect(endpoint, robot_id=robot_id, source=args.source) as robot:
         print(HELP)
         before = termios.tcgetattr(sys.stdin)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
         tty.setcbreak(sys.stdin)
         try:
             _loop(robot, Teleop(args.linear, args.angular))
@@ -102,8 +112,11 @@ def main(args: argparse.Namespace) -> int:
         finally:
             for _ in range(ZEROS):
                 robot.send(0.0, 0.0)
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-            print()
+            try:
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+                print()
+            except (OSError, termios.error):
+                pass  # the terminal has been closed
     return 0
 
 
@@ -118,7 +131,7 @@ def _loop(robot: object, teleop: Teleop) -> None:
 
     assert isinstance(robot, Client)
     decoder, states = Decoder(RobotState), robot._subscribe("state")
-    shown = ""
+    shown, heard = "", time.monotonic()
     while True:
         ready, _, _ = select.select([sys.stdin], [], [], PERIOD_S)
         if ready:
@@ -128,8 +141,13 @@ def _loop(robot: object, teleop: Teleop) -> None:
         if wish is not None:
             robot.send(wish.linear, wish.angular)
         while (sample := states.try_recv()) is not None:
+            if str(sample.key_expr) != robot.key("state"):
+                continue  # a stranger's put on a wildcard
+            heard = time.monotonic()
             state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
             shown = f"x {state.x:7.2f}  y {state.y:7.2f}  yaw {state.yaw:6.2f}  {state.reason}"
+        if time.monotonic() - heard > SILENT_S:
+            shown = "no word from the daemon"
         line = f"{teleop.linear:.2f} m/s {teleop.angular:.2f} rad/s   {shown}"
         print(f"\r{line[:118]:<118}", end="", flush=True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from acsard.cli.common import add_bus, robot_address
+from acsard.cli.common import add_bus, count, robot_address
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -16,7 +16,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "below the robot's id works, also `cmd/teleop`.",
     )
     parser.add_argument("topic", help="for example odom, state, wheel_states, cmd/teleop")
-    parser.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    parser.add_argument("-n", type=count, metavar="N", help="end after N messages")
     parser.add_argument(
         "--timeout", type=float, metavar="S", help="end after S seconds of silence, with exit 1"
     )
@@ -30,6 +30,7 @@ def main(args: argparse.Namespace) -> int:
 
     endpoint, robot_id = robot_address(args)
     left = args.n
+    _hint(args.topic)
     with connect(endpoint, robot_id=robot_id) as robot:
         try:
             for sample in robot.samples(args.topic, args.timeout):
@@ -40,6 +41,20 @@ def main(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             return 0
     return 1
+
+
+def _hint(topic: str) -> None:
+    """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
+    import difflib
+    import sys
+
+    from acsard.messages.topics import TOPICS, by_key
+
+    prefix = topic.partition("/")[0]
+    if by_key(topic) is None and prefix not in ("cmd", "wheel_cmd"):
+        near = difflib.get_close_matches(topic, [t.key for t in TOPICS], n=1)
+        hint = f"did you mean {near[0]}?" if near else "`acsard topics` lists the keys"
+        print(f"acsard: {topic} is not in the topic table; {hint} Waiting.", file=sys.stderr)
 
 
 def json_line(encoding: str, payload: bytes) -> str:

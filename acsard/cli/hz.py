@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from acsard.cli.common import add_bus, robot_address
+from acsard.cli.common import add_bus, count, robot_address
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,7 +17,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "line a second until Ctrl-C, each over the last 10 s.",
     )
     parser.add_argument("topic", help="for example odom")
-    parser.add_argument("-n", type=int, metavar="N", help="end after N lines")
+    parser.add_argument("-n", type=count, metavar="N", help="end after N lines")
     parser.add_argument("--json", action="store_true", help="print JSON lines")
     add_bus(parser)
     parser.set_defaults(main=main)

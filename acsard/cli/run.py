@@ -61,11 +61,11 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, overrides(args))
     log = Log(config.log)
 
-    def announce(device: str) -> None:
+    def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.port == daemon.SIMULATOR
         if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
             try:
-                print(banner(config, where, device, simulated), flush=True)
+                print(banner(config, where, device, trouble), flush=True)
             except OSError:
                 pass  # standard output is closed or full; nobody needs the banner there
         log.info(
@@ -88,13 +88,16 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def banner(config: Config, where: str, device: str, simulated: bool) -> str:
+def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
     """What a person sees first."""
     from acsard import __version__
     from acsard.messages.topics import ROOT
+    from acsard.runtime.daemon import SIMULATOR
 
     port = f"{device} at {config.mcu.baud_rate} baud"
-    if simulated:
+    if trouble:
+        port = f"no port yet: {trouble}"
+    if config.mcu.port == SIMULATOR:
         port = f"the built-in SIMULATOR ({device}); no real robot will move"
     return _BANNER.format(
         version=__version__,

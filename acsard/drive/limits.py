@@ -2,7 +2,7 @@
 
 Two ways to move: `follow` a commander, each axis by its own limits; `coast` to rest without one,
 both axes falling together so that no wheel's speed ever grows on the way down (invariant 2).
-Jerk shapes commanded motion only: what brakes the robot is never later for the sake of comfort.
+Jerk shapes speeding up only: what brakes the robot is never later for the sake of comfort.
 """
 
 from __future__ import annotations
@@ -115,9 +115,8 @@ def _approach(
     target = 0.0 if speed * goal < 0 else goal
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
-    if axis.jerk:
-        # A slope the other way is dropped at once: turning a push into braking never waits.
-        slope = slope if slope * wanted > 0 else 0.0
+    if axis.jerk and abs(target) > abs(speed):
+        slope = slope if slope * wanted > 0 else 0.0  # left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
         # The slope may not fall faster than jerk either, as far as the goal is not passed.

@@ -55,6 +55,8 @@ class McuSession:
         self.link: Link = "down"
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
+        self.sparse_s = 0.0
+        """Time between the last two good lines when it was too long for the link, else 0."""
         self.restarted = False
         """The last `update` saw a new session with the MCU: reopened, or back from a long gap."""
         self._opened = 0
@@ -95,6 +97,7 @@ class McuSession:
         self._lines.clear()
         self._good_in_row = 0
         self._heard_ns = None
+        self.sparse_s = 0.0
         self.link = "booting"
         self.restarted = opened != self._opened
         self._opened = opened
@@ -120,6 +123,10 @@ class McuSession:
             return None
         if self.silent(read_at.mono_ns):
             self._miss()
+            if self._heard_ns is not None:
+                self.sparse_s = (read_at.mono_ns - self._heard_ns) / NS_PER_S
+        else:
+            self.sparse_s = 0.0
         self.good_lines += 1
         self._good_in_row += 1
         # Bytes that followed in the same read were on the wire after this line was complete.

@@ -106,14 +106,18 @@ class Receiver:
         return twist, got.header
 
     @staticmethod
-    def request(verb: Verb, number: int, encoding: str, payload: bytes) -> Request:
+    def request(
+        verb: Verb, number: int, encoding: str, payload: bytes, asked_ns: int | None = None
+    ) -> Request:
         """The request in a service query, to be answered as `number`; raises `DecodeError`."""
         if verb != "set_pose":
-            return Request(verb, number)
+            return Request(verb, number, asked_ns=asked_ns)
+        if len(payload) > MAX_COMMAND_BYTES:
+            raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
         got = _poses.decode(encoding, payload)
         if (
             not all(map(math.isfinite, (got.x, got.y, got.yaw)))
             or max(abs(got.x), abs(got.y)) > 1e6
         ):
             raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
-        return Request(verb, number, Pose(got.x, got.y, got.yaw))
+        return Request(verb, number, Pose(got.x, got.y, got.yaw), asked_ns)

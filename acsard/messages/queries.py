@@ -44,6 +44,7 @@ class Query(Struct, frozen=True):
     """The `fmt` parameter, "" when there is none."""
     payload: bytes
     encoding: str
+    arrived_ns: int | None = None
 
 
 class Reply(Struct, frozen=True):
@@ -99,7 +100,11 @@ class Queries:
             return []
         try:
             request = Receiver.request(
-                cast(Verb, verb), query.number, query.encoding, query.payload
+                cast(Verb, verb),
+                query.number,
+                query.encoding,
+                query.payload,
+                query.arrived_ns,
             )
         except DecodeError as error:
             message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')

@@ -49,7 +49,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("tf", "out", "TFMessage", "with odom", "transform odom -> base"),
     Topic("tf_static", "out", "TFMessage", "latched", "transform base -> lidar", latched=True),
     Topic("wheel_states", "out", "JointState", "every feedback", "wheel angles and speeds"),
-    Topic("cmd_vel_out", "out", "TwistStamped", "every command", "the twist applied after limits"),
+    Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
     Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),

@@ -43,6 +43,7 @@ class Port(Protocol):
 
     is_open: bool
     opened: int
+    trouble: str
 
     def take(self) -> tuple[Received, ...]:
         """What was received since the last call."""
@@ -126,6 +127,7 @@ class ControlLoop:
             tick=tick,
             port_open=port.is_open,
             opened=port.opened,
+            port_trouble=port.trouble,
             received=port.take(),
             commands=commands,
             requests=requests,
@@ -149,13 +151,16 @@ class ControlLoop:
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         for arrival in got.arrivals:
-            if arrival.key == "stop" and arrival.put:
-                requests.append(Request("stop"))
+            if arrival.key == "stop":
+                if arrival.put:
+                    requests.append(Request("stop"))
+                else:
+                    refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
                 continue
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
-                refusals.append(Refusal(error.reason, f"{arrival.key}: {error}"[:200]))
+                refusals.append(Refusal(error.reason, f"{arrival.key}: {error}"))
         for query in got.queries:
             served = self._queries.serve(query, self._current, self.outputs)
             if isinstance(served, Request):

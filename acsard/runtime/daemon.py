@@ -57,20 +57,27 @@ class _Departure:
 
     def __init__(self, log: Log, wake: Callable[[], None]) -> None:
         self._log, self._wake = log, wake
+        self._starting = asyncio.current_task()
         self.begun_ns: int | None = None
         self.hurried = False
 
     def watch(self) -> None:
-        """Take over SIGTERM and SIGINT."""
+        """Take over the signals; those of a closed terminal must not leave the wheels turning."""
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
+
+    def started(self) -> None:
+        """From now on there is a robot to ramp down; until now a signal just ended the start."""
+        self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:
         self.hurried = self.begun_ns is not None
         if self.begun_ns is None:
             self.begun_ns = clock.now().mono_ns
         self._log.info("signal", signal=number.name, hurried=self.hurried)
+        if self._starting is not None:
+            self._starting.cancel()
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
@@ -80,15 +87,26 @@ class _Departure:
         return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
 
 
-async def run(config: Config, log: Log, announce: Callable[[str], None]) -> None:
-    """Run until a signal; raises `ExitError` when it cannot start.
+Announce = Callable[[str, str], None]
+"""Called once when everything is up, with the serial device and what is wrong with it, if it is."""
 
-    `announce` is called once with the serial device when everything is up.
-    """
+
+async def run(config: Config, log: Log, announce: Announce) -> None:
+    """Run until a signal; raises `ExitError` when it cannot start."""
     wake = _Wakeup()
     departure = _Departure(log, wake)
     departure.watch()
     log_from_environment()
+    try:
+        await _run(config, log, announce, departure, wake)
+    except asyncio.CancelledError:
+        if departure.begun_ns is None:
+            raise
+
+
+async def _run(
+    config: Config, log: Log, announce: Announce, departure: _Departure, wake: _Wakeup
+) -> None:
     async with AsyncExitStack() as stack:
         path = config.mcu.port
         if path == SIMULATOR:
@@ -101,7 +119,8 @@ async def run(config: Config, log: Log, announce: Callable[[str], None]) -> None
         await stack.enter_async_context(bus)
         await stack.enter_async_context(port)
         control = ControlLoop(config, _info(config, path), port, bus, clock.now(), log.event)
-        announce(path)
+        announce(path, port.trouble)
+        departure.started()
         async with asyncio.TaskGroup() as tasks:
             helpers = [
                 tasks.create_task(port.keep_open()),

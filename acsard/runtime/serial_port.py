@@ -14,6 +14,7 @@ import fcntl
 import itertools
 import os
 import termios
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -62,7 +63,8 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._waiting = array.array("i", [0])
-        self._complaint = ""
+        self.trouble = ""
+        """Why the port is closed, in words; "" while it is open."""
 
     # the control loop's view
 
@@ -149,15 +151,15 @@ class SerialPort:
         self._transport, _ = await serial_asyncio.connection_for_serial(
             loop, lambda: _Reader(self), device
         )
-        self.is_open, self._complaint = True, ""
+        self.is_open, self.trouble = True, ""
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
     def _complain(self, error: OSError) -> None:
         """Say once why the port cannot be opened, not at every attempt."""
         text = _why(self._path, error)
-        if text != self._complaint:
-            self._complaint = text
+        if text != self.trouble:
+            self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
 
     # the reader's view
@@ -179,9 +181,10 @@ class SerialPort:
                     transport.serial.reset_output_buffer()
                 except (OSError, termios.error):
                     pass  # the device is gone, and with it what was queued
-            transport.abort()
+            _close_elsewhere(transport)
         if error is not None:
-            self._log(Event("port_lost", f"{self._path}: {error}; reopening", "warning"))
+            self.trouble = f"the serial port {self._path} was lost ({error}); reopening it"
+            self._log(Event("port_lost", self.trouble, "warning"))
         self._lost.set()
         self._wake()
 
@@ -224,11 +227,39 @@ class _Reader(asyncio.Protocol):
             self._port._leave(exc or OSError(errno.EIO, "closed"))
 
 
+def _close_elsewhere(transport: serial_asyncio.SerialTransport) -> None:
+    """End the transport, but close the device in a thread: a driver may drain for 30 s first.
+
+    The transport itself would drain and close on the event loop, so it is given /dev/null to do
+    that to.
+    """
+    transport.pause_reading()
+    fd = transport.serial.fileno()
+    device, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    os.dup2(null, fd, inheritable=False)
+    os.close(null)
+    transport.abort()
+
+    def close() -> None:
+        try:
+            # A pty outlives us with this flag, and nobody else could open it.
+            fcntl.ioctl(device, termios.TIOCNXCL)
+        except OSError:
+            pass  # the device is gone
+        os.close(device)
+
+    threading.Thread(target=close, name="close port", daemon=True).start()
+
+
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
     """The port opened, locked for us alone, raw, flushed; raises OSError."""
     device = serial.Serial(baudrate=baud_rate, timeout=0, write_timeout=0, exclusive=True)
     device.port = path
-    device.open()
+    try:
+        device.open()
+    except serial.SerialException as error:
+        # Only a device that is no tty fails without a number.
+        raise OSError(error.errno or errno.ENOTTY, str(error)) from error
     try:
         fd = device.fileno()
         fcntl.ioctl(fd, termios.TIOCEXCL)
@@ -287,5 +318,7 @@ def _why(path: str, error: OSError) -> str:
             return _no_permission(path) + "; retrying"
         case errno.EBUSY | errno.EAGAIN:
             return _in_use(path) + "; retrying"
+        case errno.ENOTTY | errno.EISDIR:
+            return f"{path} is not a serial device; correct mcu.port"
         case _:
             return f"cannot open {path}: {error}; retrying"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import fcntl
 import os
 import pty
+import termios
 import tty
 from types import TracebackType
 
@@ -55,6 +57,8 @@ class SimPty:
             if error.errno in (errno.EAGAIN, errno.EIO):
                 return
             raise
+        # A host that was killed leaves its exclusive mark on the pty, as no real port would.
+        fcntl.ioctl(self._slave, termios.TIOCNXCL)
         self.mcu.receive(clock.now().mono_ns, data)
         self._arm()
 

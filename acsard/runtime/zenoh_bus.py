@@ -14,7 +14,7 @@ from collections import deque
 from functools import partial
 from itertools import count
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import zenoh
 import zenoh.ext
@@ -34,8 +34,16 @@ from acsard.settings import BusConfig
 ARRIVALS = 256
 """Samples held between two steps; at 1000 Hz a key and 100 steps a second, 10 is usual."""
 
+STOPS = 16
+"""Stops held, apart from all else: no flood of anything can push one out."""
+
 QUERIES = 64
-"""Queries held; the next one is turned away with an error instead of growing the queue."""
+"""Queries held, and as many service calls; the next one is turned away with an error."""
+
+OPEN_QUERIES = 512
+"""Queries whose replies are still being sent; more are let go unanswered."""
+
+T = TypeVar("T")
 
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
@@ -52,9 +60,10 @@ class ZenohBus:
         self._settings, self._id, self._sources = bus, robot_id, sources
         self._prefix = f"{ROOT}/{robot_id}/"
         self._arrivals: deque[Arrival] = deque(maxlen=ARRIVALS)
-        self._queries: deque[Query] = deque()
+        self._stops: deque[Arrival] = deque(maxlen=STOPS)
+        self._services: deque[Query] = deque()
+        self._questions: deque[Query] = deque()
         self._overrun = 0
-        self._stop_arrival: Arrival | None = None
         self._session: zenoh.Session | None = None
         self._own_id: zenoh.TimestampId | None = None
         self._publishers: dict[str, Any] = {}
@@ -68,13 +77,9 @@ class ZenohBus:
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
-        stop, self._stop_arrival = self._stop_arrival, None
-        arrivals = [stop] if stop is not None else []
-        while self._arrivals:
-            arrivals.append(self._arrivals.popleft())
-        asked: list[Query] = []
-        while self._queries and len(asked) < queries:
-            asked.append(self._queries.popleft())
+        arrivals = _drained(self._stops, STOPS) + _drained(self._arrivals, ARRIVALS)
+        asked = _drained(self._services, queries)
+        asked += _drained(self._questions, queries - len(asked))
         overrun, self._overrun = self._overrun, 0
         return BusInput(tuple(arrivals), tuple(asked), overrun)
 
@@ -173,31 +178,39 @@ class ZenohBus:
             stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
         arrival = Arrival(key, put, data, str(sample.encoding), arrived.mono_ns, stamp_ns, sender)
         if key == "stop":
-            # Not in the queue that a flood of commands could fill.
-            if put:
-                self._stop_arrival = arrival
+            self._stops.append(arrival)
             return
         if len(self._arrivals) == ARRIVALS:
             self._overrun += 1
         self._arrivals.append(arrival)
 
     def _on_query(self, topic: str, query: zenoh.Query) -> None:
+        arrived_ns = clock.now().mono_ns
+        asked = str(query.key_expr).removeprefix(self._prefix)
+        service = topic.startswith("srv/")
+        if (service and asked != topic) or len(self._open_queries) > OPEN_QUERIES:
+            return  # letting go of it ends it
+        if topic == "srv/stop":
+            # The stop itself never waits in a line with other questions.
+            self._stops.append(Arrival("stop", True, b"", "", arrived_ns, None, ""))
         number = next(self._query_numbers)
         self._open_queries[number] = query
-        if len(self._queries) >= QUERIES:
+        waiting = self._services if service else self._questions
+        if len(waiting) >= QUERIES:
             busy = b"busy: too many queries at once; ask again"
             self._replies.put(Reply(number, topic, busy, "text/plain", ok=False))
             self._replies.put(number)
             return
         payload, encoding = query.payload, query.encoding
-        self._queries.append(
+        waiting.append(
             Query(
                 number,
                 topic,
-                str(query.key_expr).removeprefix(self._prefix),
+                asked,
                 query.parameters.get("fmt", "") or "",
                 payload.to_bytes()[: MAX_COMMAND_BYTES + 1] if payload else b"",
                 str(encoding) if encoding else "",
+                arrived_ns,
             )
         )
 
@@ -235,3 +248,11 @@ class ZenohBus:
                 await in_thread(session.close, CLOSE_TIMEOUT_S)
             except TimeoutError:
                 pass  # a stuck remote; the process ends without its good-bye
+
+
+def _drained(held: deque[T], most: int) -> list[T]:
+    """Take up to `most` out; another thread may be putting in."""
+    taken: list[T] = []
+    while held and len(taken) < most:
+        taken.append(held.popleft())
+    return taken

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 
 import zenoh
 
@@ -16,6 +17,9 @@ from acsard.settings import BusConfig
 
 COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
+
+MAX_SESSIONS = 32
+"""Clients at once; idle connections of strangers must not keep a person out for long."""
 
 MESSAGE_BYTES = 65536
 """Largest message taken from a link; commands are held to far less in code."""
@@ -38,7 +42,7 @@ def daemon_session(bus: BusConfig, robot_id: str, sources: tuple[str, ...]) -> z
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
         "transport/unicast/accept_pending": 32,
-        "transport/unicast/max_sessions": 32,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
         "queries_default_timeout": 3000,
         "downsampling": [_command_limits(robot_id, sources)],
@@ -61,6 +65,10 @@ def client_session(endpoint: str) -> zenoh.Session:
 
     A client, because peers behind one hub do not reach each other.
     """
+    if "/" not in endpoint:
+        raise ExitError(
+            Exit.USAGE, f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"'
+        )
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
         "timestamping/enabled": True,
@@ -71,8 +79,8 @@ def client_session(endpoint: str) -> zenoh.Session:
     except zenoh.ZError as error:
         raise ExitError(
             Exit.UNREACHABLE,
-            f"no daemon answers at {endpoint} ({_first_line(error)}); "
-            "is `acsard run` running, and is this its bus.listen?",
+            f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
+            f"is this its bus.listen, and has it room (at most {MAX_SESSIONS} connections)?",
         ) from error
 
 
@@ -110,7 +118,9 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+    """What a Zenoh error says, without the source paths it carries."""
+    text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
+    return text[0][:200].strip() if text else type(error).__name__
 
 
 def log_from_environment() -> None:

@@ -31,6 +31,7 @@ class VirtualPort:
         self.is_open = False
         self.opened = 0
         self.blocked = False
+        self.trouble = ""
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._baud_rate = baud_rate
@@ -203,7 +204,8 @@ class World:
     ) -> list[Reply]:
         """The replies to a query after one period."""
         self._queries += 1
-        query = Query(self._queries, key, key if asked is None else asked, fmt, payload, "")
+        name = key if asked is None else asked
+        query = Query(self._queries, key, name, fmt, payload, "", self.now_ns)
         self.bus.queries.append(query)
         self.run(2 / self.config.rate_hz)
         return self.bus.replies.get(query.number, [])

@@ -150,7 +150,7 @@ PLANTED = [
     ("[mcu]\nbaud_rate = 14400", "mcu.baud_rate", "14400", "115200"),
     ("[mcu]\nreply_period = -0.1", "mcu.reply_period", "-0.1", "from 0 to 2 s"),
     ('[mcu.wheels]\nrear_left = "c"', "mcu.wheels.rear_left", '"c"', '"+c"'),
-    ("[control]\nrate = 0", "control.rate", "0", 'from 5 to 1000 Hz or one of "auto"'),
+    ("[control]\nrate = 0", "control.rate", "0", 'from 10 to 1000 Hz or one of "auto"'),
     ('[control]\nrate = "fast"', "control.rate", '"fast"', "the default is rate = 100.0"),
     ("[drive]\nwheel_radius = 0.0", "drive.wheel_radius", "0.0", "from 0.001 to 10 m"),
     ("[drive]\nwheel_separation = -0.3", "drive.wheel_separation", "-0.3", "from 0.001 to 10 m"),

@@ -590,13 +590,42 @@ def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:
 def test_several_requests_of_one_step_are_answered_in_order() -> None:
     bench = Bench().linked()
     bench.now_ns += 10 * MS
-    requests = (Request("stop", 1), Request("clear", 2), Request("clear", 3))
+    requests = (Request("deactivate", 1), Request("activate", 2), Request("clear", 3))
     out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests))
     assert [(answer.id, answer.success) for answer in out.answers] == [
         (1, True),
         (2, True),
         (3, False),
     ]
+
+
+@pytest.mark.parametrize("order", [("stop", "clear"), ("clear", "stop")])
+def test_a_clear_that_came_with_a_stop_does_not_undo_it(order: tuple[Verb, Verb]) -> None:
+    bench = Bench().linked()
+    bench.step(ask="stop")
+    bench.now_ns += 10 * MS
+    requests = tuple(Request(verb) for verb in order)
+    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
+
+
+def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
+    bench = Bench().linked()
+    asked_ns = bench.now_ns + 5 * MS
+    bench.step(ask="stop")
+    bench.now_ns += 10 * MS
+    late = (Request("clear", 7, asked_ns=asked_ns),)
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
+    assert (out.mode, out.answers[0].success) == ("stopped", False)
+    assert "call it again" in out.answers[0].message
+    bench.now_ns += 10 * MS
+    again = (Request("clear", 8, asked_ns=bench.now_ns),)
+    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
+
+
+def test_a_service_called_as_fast_as_can_be_is_a_line_of_log_a_second() -> None:
+    bench = Bench().linked()
+    said = [bench.step(ask="reset_odometry").events for _ in range(250)]
+    assert sum(map(len, said)) == 3
 
 
 # fault

@@ -32,6 +32,14 @@ def silent() -> Teleop:
     return teleop
 
 
+def pressed(key: str, now: float) -> Teleop:
+    """A teleop after a silence, that key, and the zero that leads every drive."""
+    teleop = silent()
+    teleop.press(key, now)
+    assert teleop.send(now) == REST
+    return teleop
+
+
 def test_it_opens_with_three_zeros_and_falls_silent() -> None:
     teleop = Teleop(0.5, 2.0)
     assert [teleop.send(n / 20) for n in range(6)] == [REST] * 3 + [None] * 3
@@ -40,14 +48,18 @@ def test_it_opens_with_three_zeros_and_falls_silent() -> None:
 
 @pytest.mark.parametrize(("key", "linear", "angular"), MOVES)
 def test_each_key_drives_its_way(key: str, linear: int, angular: int) -> None:
-    teleop = silent()
-    teleop.press(key, 10.0)
+    teleop = pressed(key, 10.0)
     assert teleop.send(10.0) == Twist(0.5 * linear, 2.0 * angular)
 
 
+def test_only_a_drive_after_a_silence_is_led_by_a_zero() -> None:
+    teleop = pressed("i", 10.0)
+    teleop.press("j", 10.0 + HOLD_S)
+    assert teleop.send(10.0 + HOLD_S) == Twist(0.0, 2.0)
+
+
 def test_a_press_drives_for_its_hold_then_come_three_zeros_then_silence() -> None:
-    teleop = silent()
-    teleop.press("i", 10.0)
+    teleop = pressed("i", 10.0)
     assert teleop.send(10.0 + HOLD_S - 0.001) == Twist(0.5, 0.0)
     assert [teleop.send(10.0 + HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
 
@@ -57,7 +69,7 @@ def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_se
 
 
 def test_a_repeated_press_extends_the_hold() -> None:
-    teleop = silent()
+    teleop = pressed("i", 10.0)
     for n in range(20):
         teleop.press("i", 10.0 + n * 0.5)
         assert teleop.send(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
@@ -65,8 +77,7 @@ def test_a_repeated_press_extends_the_hold() -> None:
 
 
 def test_another_key_changes_the_way_at_once() -> None:
-    teleop = silent()
-    teleop.press("i", 10.0)
+    teleop = pressed("i", 10.0)
     teleop.press("j", 10.1)
     assert teleop.send(10.1) == Twist(0.0, 2.0)
     assert teleop.send(10.0 + HOLD_S) == Twist(0.0, 2.0)
@@ -74,8 +85,7 @@ def test_another_key_changes_the_way_at_once() -> None:
 
 @pytest.mark.parametrize("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
 def test_any_other_key_stops_at_once(key: str) -> None:
-    teleop = silent()
-    teleop.press("i", 10.0)
+    teleop = pressed("i", 10.0)
     teleop.press(key, 10.1)
     assert [teleop.send(10.1) for _ in range(4)] == [REST] * 3 + [None]
 
@@ -97,8 +107,7 @@ def test_speed_keys_change_ten_percent_and_do_not_move(
 
 
 def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> None:
-    teleop = silent()
-    teleop.press("u", 10.0)
+    teleop = pressed("u", 10.0)
     teleop.press("w", 10.5)
     assert teleop.send(10.5) == Twist(0.5 * 1.1, 2.0)
     assert teleop.send(10.0 + HOLD_S) == REST

@@ -8,7 +8,7 @@ import pytest
 
 from acsard.cli import run
 from acsard.config import parse
-from acsard.settings import Config
+from acsard.settings import Config, McuConfig
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
@@ -43,10 +43,13 @@ def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> 
 
 
 def test_the_banner_tells_a_simulator_from_a_robot() -> None:
-    simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3", True)
-    real = run.banner(Config(), "acsard.toml", "/dev/ttyUSB0", False)
+    simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3")
+    config = Config(mcu=McuConfig(port="/dev/ttyUSB0"))
+    real = run.banner(config, "acsard.toml", "/dev/ttyUSB0")
+    missing = run.banner(config, "acsard.toml", "/dev/ttyUSB0", "/dev/ttyUSB0 is not there")
     assert "SIMULATOR" in simulated
     assert "no real robot will move" in simulated
     assert "SIMULATOR" not in real
+    assert "no port yet: /dev/ttyUSB0 is not there" in missing
     assert "/dev/ttyUSB0 at 115200 baud" in real
     assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))

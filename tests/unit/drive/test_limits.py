@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from acsard.drive.kinematics import Kinematics
@@ -236,13 +236,23 @@ def slopes(speeds: list[float]) -> list[float]:
     return [(after - before) / DT for before, after in pairwise(speeds)]
 
 
+def rising(speeds: list[float]) -> list[tuple[float, float]]:
+    """The slope of each step that speeds up, with the slope before it."""
+    found = []
+    for (a, b), (_, c) in pairwise(pairwise([speeds[0], *speeds])):
+        if abs(c) > abs(b):
+            found.append(((b - a) / DT, (c - b) / DT))
+    return found
+
+
 @given(start=millimetres, goal=millimetres)
 def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(start: float, goal: float) -> None:
     # 5 m/s3 x 10 ms
+    assume(start * goal >= 0.0 and abs(goal) > abs(start))
     found = moving(start, 0.0, JERKY)
     path = [start, *(twist.linear for twist in followed(found, Twist(goal, 0.0), 400))]
     assert path[-1] == goal
-    for before, after in pairwise([0.0, *slopes(path)]):
+    for before, after in rising(path):
         assert abs(after - before) <= 0.05 + 1e-9
 
 
@@ -258,7 +268,7 @@ def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_wished(
         (0.05, [twist.linear for twist in path]),
         (0.2, [twist.angular for twist in path]),
     ):
-        for before, after in pairwise([0.0, *slopes(speeds)]):
+        for before, after in rising(speeds):
             kept = abs(before) if before * after > 0.0 else 0.0
             assert abs(after) <= kept + step + 1e-9
 
@@ -273,15 +283,14 @@ def test_jerk_bounds_how_fast_a_slope_levels_out_short_of_the_goal(
         for twist in followed(found, Twist(goal, 0.0), steps):
             before, slope = slope, (twist.linear - speed) / DT
             speed = twist.linear
-            if speed not in (goal, 0.0) and slope * before > 0.0:
+            if speed not in (goal, 0.0) and slope * before > 0.0 and slope * speed > 0.0:
                 assert abs(slope) >= abs(before) - 0.05 - 1e-9
 
 
 def test_jerk_never_delays_braking() -> None:
     found = limiter(JERKY)
     fast = followed(found, Twist(1.0, 0.0), 30)[-1].linear
-    # the push of 1 m/s2 ends at once; braking begins with 5 m/s3 x 10 ms = 0.05 m/s2
-    assert found.follow(REST, DT).linear == pytest.approx(fast - 0.0005)
+    assert found.follow(REST, DT).linear == pytest.approx(fast - 0.01)
 
 
 @given(wishes=st.lists(st.tuples(mixed, st.integers(1, 60), periods), max_size=8))
