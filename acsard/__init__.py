@@ -17,7 +17,8 @@ Where to look, in the order the modules may import each other:
     values.py         the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
     settings.py       the keys of acsard.toml; validation.py, config.py: file -> Config, or why not
     mcu/              wire time, lines, frames (the protocol), session (is the MCU there?)
-    drive/            kinematics, odometry, arbiter (who commands?), limits, modes (the table)
+    drive/            kinematics, odometry, sanity (can this feedback be true?), arbiter (who
+                      commands?), limits, modes (the table), lifecycle (what latched it)
     messages/         schema (the published structs), topics (**the** key table), encodings,
                       incoming (sample -> command), report (outputs -> messages), queries
     robot.py          the order; guard.py: the last look at every outgoing line

@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from collections import Counter
 
+from msgspec.structs import replace
+
 from acsard.drive.arbiter import REASONS, Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
-from acsard.drive.modes import Mode, RefusedError, Trigger, next_mode
+from acsard.drive.modes import Mode, RefusedError, Trigger
 from acsard.drive.odometry import Odometry
-from acsard.mcu.session import McuSession
+from acsard.drive.sanity import Sanity
+from acsard.mcu.session import LINK_WORDS, Feedback, Link, McuSession
 from acsard.settings import Config
 from acsard.values import (
     NS_PER_S,
@@ -56,9 +60,7 @@ class Robot:
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
-        self._active = config.control.auto_activate
-        self._mode = Mode.INACTIVE
-        self._latch = ""
+        self._life = Lifecycle(config.control.auto_activate)
         self._choice = Choice("", None, "")
         self._speeds = STILL
         self._limited_ns = 0
@@ -70,11 +72,11 @@ class Robot:
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (superseded lines, missed periods)."""
         self._refused = ""
-        self._stopped_ns = -1
+        self._sanity = Sanity(config.feedback)
+        self._lost_dt = 0.0
         self._told_ns: dict[str, int] = {}
         self._port_trouble = ""
         self._arbiter.require_neutral()
-        self._resume()
 
     def snapshot(self, now_ns: int, lateness_us: Spread) -> Snapshot:
         """What `state` and `diagnostics` show; costs too much for every step."""
@@ -99,7 +101,7 @@ class Robot:
         self._hear(inputs)
         line = self._drive(inputs) if inputs.tick else None
         applied = self._limiter.twist
-        status = (self._mode.value, self._reason(), self.session.link, self._choice.source)
+        status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
         changed, self._status = status != self._status, status
         return Outputs(
             now=inputs.now,
@@ -125,6 +127,8 @@ class Robot:
         session, before = self.session, self.session.link
         feedback = session.update(inputs.now, inputs.port_open, inputs.opened, inputs.received)
         link = session.link
+        if link != "up":
+            self._sanity.forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
             self._arbiter.require_neutral()
@@ -135,68 +139,71 @@ class Robot:
             self._limiter.cut()
             self._speeds = STILL
             self._before = (self._limiter.state, inputs.now.mono_ns)
-            self._fire(Trigger.LINK_LOST)
+            self._life.link(up=False)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral()
         else:
-            self._fire(Trigger.LINK_UP)
-        return tuple([self._odometry.fold(line) for line in feedback])
+            self._life.link(up=True)
+        return tuple([sample for line in feedback if (sample := self._believe(line, events))])
+
+    def _believe(self, line: Feedback, events: list[Event]) -> Sample | None:
+        """Fold a line that can be true; None for one that cannot, or is the last straw."""
+        why = self._sanity.impossible(line)
+        if why:
+            self.counters["line_impossible"] += 1
+            self._lost_dt += line.dt
+            if self._sanity.doubtful:
+                self._fault(f"impossible feedback: {why}", events)
+            return None
+        fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
+        if fault:
+            self._fault(fault, events)
+        # The distance of the lines that were dropped is made up at this line's speed.
+        line = replace(line, dt=line.dt + self._lost_dt) if self._lost_dt else line
+        self._lost_dt = 0.0
+        return self._odometry.fold(line)
 
     # requests
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
+            self._limiter.cut()  # STOP went out in the line's place
             self._fault(f"the guard replaced a line: {inputs.guard_trip}", events)
-        if inputs.leaving and self._mode is not Mode.LEAVING:
-            self._fire(Trigger.LEAVE)
+        if inputs.leaving and self._life.mode is not Mode.LEAVING:
+            self._life.fire(Trigger.LEAVE)
             events.append(Event("leaving", "ramping to zero, then STOP"))
         return tuple([self._answer(r, inputs.now.mono_ns, events) for r in inputs.requests])
 
     def _answer(self, request: Request, now_ns: int, events: list[Event]) -> Answer:
-        before = self._mode
+        before = self._life.mode
         try:
             message = self._obey(request, now_ns)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         last_ns = self._told_ns.get(request.verb)
-        if self._mode is not before or last_ns is None or now_ns - last_ns > NS_PER_S:
+        if self._life.mode is not before or last_ns is None or now_ns - last_ns > NS_PER_S:
             # What is repeated as fast as it can be sent is still a line of log a second.
             self._told_ns[request.verb] = now_ns
             events.append(Event(request.verb, message))
         return Answer(request.id, True, message)
 
     def _obey(self, request: Request, now_ns: int) -> str:
+        life, linked = self._life, self.session.link == "up"
         match request.verb:
             case "stop":
-                self._stopped_ns = now_ns
-                self._mode = next_mode(self._mode, Trigger.STOP)
-                if self._mode is Mode.LEAVING:
-                    return "the daemon is going down: ramping to zero"
-                if self._mode is Mode.FAULT:
-                    return "in fault, which holds the robot already; srv/clear releases it"
-                self._latch = "stopped by request"
-                return "stopped and latched; srv/clear releases it"
+                return life.stop(now_ns)
             case "clear":
                 asked_ns = now_ns if request.asked_ns is None else request.asked_ns
-                if asked_ns <= self._stopped_ns or now_ns == self._stopped_ns:
-                    raise RefusedError("a stop came at the same time or after; call it again")
-                self._mode = next_mode(self._mode, Trigger.CLEAR)
-                self._latch = ""
+                message = life.clear(asked_ns, now_ns, linked)
+                self._sanity.forget()
                 self._arbiter.require_neutral()
-                self._resume()
-                return "cleared; each source must be neutral once before it drives"
+                return message
             case "activate":
-                self._mode = next_mode(self._mode, Trigger.ACTIVATE)
-                if not self._active:
+                if life.activate(linked):
                     self._arbiter.require_neutral()
-                self._active = True
-                if self.session.link == "up":
-                    self._fire(Trigger.LINK_UP)
                 return "active"
             case "deactivate":
-                self._mode = next_mode(self._mode, Trigger.DEACTIVATE)
-                self._active = False
-                return "inactive: ramping to zero; srv/activate switches it on"
+                return life.deactivate()
             case "reset_odometry":
                 self._odometry.set_pose(Pose())
                 return "pose is x 0, y 0, yaw 0"
@@ -205,23 +212,10 @@ class Robot:
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
-    def _resume(self) -> None:
-        if self._active:
-            self._mode = next_mode(self._mode, Trigger.ACTIVATE)
-            if self.session.link == "up":
-                self._fire(Trigger.LINK_UP)
-
     def _fault(self, why: str, events: list[Event]) -> None:
-        self._limiter.cut()  # STOP went out in the line's place
-        if self._mode in (Mode.FAULT, Mode.LEAVING):
-            return
-        self._fire(Trigger.FAULT)
-        self._latch = why
-        self._arbiter.require_neutral()
-        events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
-
-    def _fire(self, trigger: Trigger) -> None:
-        self._mode = next_mode(self._mode, trigger)
+        if self._life.fault(why):
+            self._arbiter.require_neutral()
+            events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
     # commands
 
@@ -245,7 +239,7 @@ class Robot:
         now_ns = inputs.now.mono_ns
         self._choice = self._arbiter.choose(now_ns)
         twist = self._choice.twist
-        self._fire(Trigger.NO_COMMAND if twist is None else Trigger.COMMAND)
+        self._life.fire(Trigger.NO_COMMAND if twist is None else Trigger.COMMAND)
         limiter = self._limiter
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
@@ -254,10 +248,10 @@ class Robot:
         self._limited_ns = now_ns
         if self.session.link != "up" or since > UNHEARD_S:
             limiter.cut()
-        elif self._mode is Mode.DRIVING and twist is not None:
+        elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))
         else:
-            limiter.coast(since, stop=self._mode in (Mode.STOPPED, Mode.FAULT, Mode.LEAVING))
+            limiter.coast(since, stop=self._life.mode in (Mode.STOPPED, Mode.FAULT, Mode.LEAVING))
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)
         return self._line(now_ns)
 
@@ -274,41 +268,22 @@ class Robot:
     # report
 
     def _reason(self) -> str:
-        match self._mode:
+        match self._life.mode:
             case Mode.DRIVING:
                 return f"driving: {self._choice.reason}"
             case Mode.READY:
                 return self._choice.reason
             case Mode.WAITING:
-                return self._waiting()
+                return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT:
-                return f"{self._latch}; call srv/clear"
+                return f"{self._life.latched}; call srv/clear"
             case Mode.INACTIVE:
                 return "switched off; call srv/activate"
             case Mode.LEAVING:
                 return "the daemon is going down"
 
-    def _waiting(self) -> str:
-        session = self.session
-        if session.link == "down" and self._port_trouble:
-            return self._port_trouble
-        if session.link in ("booting", "stale") and session.sparse_s:
-            return (
-                f"the microcontroller's lines come {session.sparse_s:.2f} s apart; if it reports "
-                f"by its own clock, set mcu.reply_period = {session.sparse_s:.2f}"
-            )
-        return _LINK_WORDS[session.link]
 
-
-_LINK_WORDS = {
-    "down": "the serial port is closed; it is being reopened",
-    "booting": "the port is open; waiting for the microcontroller's first good lines",
-    "up": "linked",
-    "stale": "the microcontroller has fallen silent",
-}
-
-
-def _link_event(link: str) -> Event:
+def _link_event(link: Link) -> Event:
     return Event(
-        f"link_{link}", _LINK_WORDS[link], "info" if link in ("up", "booting") else "warning"
+        f"link_{link}", LINK_WORDS[link], "info" if link in ("up", "booting") else "warning"
     )

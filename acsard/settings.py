@@ -96,6 +96,13 @@ class JointsConfig(Struct, frozen=True):
         return self.front_right, self.front_left, self.rear_left, self.rear_right
 
 
+class FeedbackConfig(Struct, frozen=True):
+    wheel_speed: WheelSpeed = 80.0
+    wheel_acceleration: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "rad/s2"})] = 1500.0
+    response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
+    fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
+
+
 class LimitsConfig(Struct, frozen=True):
     linear_speed: LinearSpeed = 1.0
     angular_speed: AngularSpeed = 4.0
@@ -186,6 +193,7 @@ class Config(Struct, frozen=True):
     drive: DriveConfig = DriveConfig()
     joints: JointsConfig = JointsConfig()
     limits: LimitsConfig = LimitsConfig()
+    feedback: FeedbackConfig = FeedbackConfig()
     commands: CommandsConfig = CommandsConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()

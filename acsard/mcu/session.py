@@ -24,6 +24,13 @@ from acsard.values import NS_PER_S, Instant, Received, WheelSpeeds
 
 Link = Literal["down", "booting", "up", "stale"]
 
+LINK_WORDS: dict[Link, str] = {
+    "down": "the serial port is closed; it is being reopened",
+    "booting": "the port is open; waiting for the microcontroller's first good lines",
+    "up": "linked",
+    "stale": "the microcontroller has fallen silent",
+}
+
 GOOD_LINES = 3
 """Good lines before the link is trusted: a board that just reset prints anything for a while."""
 
@@ -92,6 +99,17 @@ class McuSession:
     def silent(self, now_ns: int) -> bool:
         """No good line within `quiet`, or none at all in this session."""
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
+
+    def words(self, port_trouble: str = "") -> str:
+        """How the link is, for people; `port_trouble` is why the port is closed."""
+        if self.link == "down" and port_trouble:
+            return port_trouble
+        if self.link in ("booting", "stale") and self.sparse_s:
+            return (
+                f"the microcontroller's lines come {self.sparse_s:.2f} s apart; if it reports "
+                f"by its own clock, set mcu.reply_period = {self.sparse_s:.2f}"
+            )
+        return LINK_WORDS[self.link]
 
     def _begin(self, opened: int) -> None:
         self._lines.clear()

@@ -160,8 +160,11 @@ def test_a_comma_latched_mcu_keeps_its_last_wheel_without_the_trailing_comma(
     world: World,
 ) -> None:
     with world.mcu.comma_latched():
-        world.drive(0.5, seconds=1.0)
+        world.drive(0.5, seconds=0.6)
         assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 0.0]
+        world.hold(0.5, seconds=0.5)
+        assert world.state.mode == "fault"
+        assert "rear_right wheel does not turn" in world.state.reason
 
 
 def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu() -> None:

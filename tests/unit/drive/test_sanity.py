@@ -1,0 +1,162 @@
+"""Impossible feedback is named, and a wheel that contradicts its command is a fault in time."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.drive.sanity import REPEATED, Sanity
+from acsard.mcu.session import Feedback
+from acsard.settings import FeedbackConfig
+from acsard.values import STILL, WHEELS, Instant, WheelSpeeds
+
+DT = 0.01
+AT = Instant(0, 0)
+TEN = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+
+
+def line(speeds: WheelSpeeds, dt: float = DT, gap: float = 0.0) -> Feedback:
+    return Feedback(AT, speeds, dt, gap)
+
+
+def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
+    return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
+
+
+def watched(
+    sent: WheelSpeeds, seen: WheelSpeeds, seconds: float = 3.0, jitter: float = 0.0
+) -> tuple[float, str]:
+    """When the fault came, and its words; (inf, "") when none did."""
+    sanity = Sanity(FeedbackConfig())
+    for step in range(round(seconds / DT)):
+        noisy = WheelSpeeds(*(s + jitter * (step % 2) for s in seen.as_tuple()))
+        fault = sanity.watch(sent, noisy, DT)
+        if fault:
+            return (step + 1) * DT, fault
+    return math.inf, ""
+
+
+# impossible lines
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_a_speed_no_wheel_reaches_is_impossible_and_names_the_wheel(wheel: int) -> None:
+    sanity = Sanity(FeedbackConfig())
+    assert WHEELS[wheel] in sanity.impossible(line(only(wheel, -80.01)))
+    assert sanity.impossible(line(only(wheel, 80.0))) == ""
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_a_change_no_wheel_makes_is_impossible_and_names_the_wheel(wheel: int) -> None:
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    assert sanity.impossible(line(STILL)) == ""
+    assert WHEELS[wheel] in sanity.impossible(line(only(wheel, 3.5)))
+    assert sanity.impossible(line(only(wheel, 2.9))) == ""
+
+
+def test_a_real_step_is_believed_as_soon_as_it_could_have_happened() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=400.0))
+    sanity.impossible(line(STILL))
+    verdicts = [sanity.impossible(line(TEN)) == "" for _ in range(3)]
+    assert verdicts == [False, True, True]
+
+
+def test_the_first_line_and_the_first_after_a_gap_have_no_slew() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
+    assert sanity.impossible(line(TEN, dt=0.0)) == ""
+    assert sanity.impossible(line(STILL, dt=0.0, gap=0.5)) == ""
+
+
+def test_three_impossible_lines_in_a_row_are_doubtful_and_two_are_not() -> None:
+    sanity = Sanity(FeedbackConfig())
+    fast = line(only(0, 99.0))
+    found = []
+    for _ in range(REPEATED - 1):
+        sanity.impossible(fast)
+        found.append(sanity.doubtful)
+    sanity.impossible(line(STILL))
+    for _ in range(REPEATED):
+        sanity.impossible(fast)
+        found.append(sanity.doubtful)
+    assert found == [False, False, False, False, True]
+
+
+def test_forgetting_starts_over() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
+    sanity.impossible(line(STILL))
+    for _ in range(REPEATED):
+        sanity.impossible(line(TEN))
+    sanity.forget()
+    assert not sanity.doubtful
+    assert sanity.impossible(line(TEN)) == ""
+
+
+# contradictions
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize(
+    ("sent", "seen", "word"),
+    [
+        (10.0, 0.0, "does not turn"),
+        (-10.0, 0.0, "does not turn"),
+        (10.0, -9.0, "against its command"),
+        (-10.0, 9.0, "against its command"),
+        (10.0, 18.0, "faster than commanded"),
+        (0.0, 5.0, "faster than commanded"),
+        (0.0, -5.0, "faster than commanded"),
+        (10.0, 3.0, "one and the same speed"),
+    ],
+)
+def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
+    wheel: int, sent: float, seen: float, word: str
+) -> None:
+    jitter = 0.0 if "one and the same" in word else 0.05
+    after, fault = watched(only(wheel, sent), only(wheel, seen), jitter=jitter)
+    assert 0.49 < after < 1.0
+    assert fault.startswith(f"{WHEELS[wheel]} wheel")
+    assert word in fault
+
+
+def test_a_contradiction_that_does_not_last_is_none() -> None:
+    sanity = Sanity(FeedbackConfig())
+    for _ in range(20):
+        assert not any(sanity.watch(TEN, STILL, DT) for _ in range(45))
+        assert not sanity.watch(TEN, WheelSpeeds(9.9, 10.1, 9.8, 10.2), DT)
+
+
+def test_a_robot_pushed_gently_by_hand_is_no_fault() -> None:
+    assert watched(STILL, WheelSpeeds(1.9, 1.9, 1.9, 1.9))[1] == ""
+
+
+def test_a_wheel_slowed_by_half_under_load_is_no_fault() -> None:
+    sanity = Sanity(FeedbackConfig())
+    dice = random.Random(1)
+    for _ in range(500):
+        seen = WheelSpeeds(*(5.0 + dice.uniform(-0.2, 0.2) for _ in range(4)))
+        assert sanity.watch(TEN, seen, DT) == ""
+
+
+def test_fault_time_zero_switches_it_off() -> None:
+    sanity = Sanity(FeedbackConfig(fault_time=0.0))
+    assert not any(sanity.watch(TEN, STILL, DT) for _ in range(1000))
+
+
+@given(
+    st.lists(st.tuples(st.floats(-20, 20), st.integers(1, 150)), min_size=1, max_size=12),
+    st.floats(0.0, 0.15),
+    st.floats(0.8, 1.1),
+)
+def test_a_healthy_wheel_is_never_a_fault_whatever_it_is_told(
+    wishes: list[tuple[float, int]], lag: float, gain: float
+) -> None:
+    sanity, speed, dice = Sanity(FeedbackConfig()), 0.0, random.Random(2)
+    for told, steps in wishes:
+        for _ in range(steps):
+            speed += (told * gain - speed) * (DT / (lag + DT))
+            seen = speed + dice.uniform(-0.2, 0.2)
+            assert sanity.watch(only(0, told), only(0, seen), DT) == ""
