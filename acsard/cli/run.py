@@ -9,7 +9,8 @@ from acsard.cli.common import Overrides, add_config, load
 from acsard.settings import Config
 
 _BANNER = """\
-acsard {version}: {robot} on {port}
+acsard {version}, robot {robot}
+  port    {port}
   bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
   config  {where}
   try, in a second terminal:
@@ -96,7 +97,7 @@ def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
 
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:
-        port = f"no port yet: {trouble}"
+        port = f"none yet: {trouble}"
     if config.mcu.port == SIMULATOR:
         port = f"the built-in SIMULATOR ({device}); no real robot will move"
     return _BANNER.format(

@@ -45,7 +45,7 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
 def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with Program(acsard("--listen", endpoint), tmp_path) as daemon:
-        assert "SIMULATOR" in daemon.says("acsard ")
+        assert "SIMULATOR" in daemon.says("port ")
         assert endpoint in daemon.says("bus ")
         for hint in ("acsard drive", "acsard echo odom -n 1", "acsard call stop"):
             daemon.says(hint)

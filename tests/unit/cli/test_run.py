@@ -50,6 +50,6 @@ def test_the_banner_tells_a_simulator_from_a_robot() -> None:
     assert "SIMULATOR" in simulated
     assert "no real robot will move" in simulated
     assert "SIMULATOR" not in real
-    assert "no port yet: /dev/ttyUSB0 is not there" in missing
+    assert "none yet: /dev/ttyUSB0 is not there" in missing
     assert "/dev/ttyUSB0 at 115200 baud" in real
     assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))
