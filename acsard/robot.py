@@ -61,7 +61,7 @@ class Robot:
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate)
-        self._choice = Choice("", None, "")
+        self._choice = Choice("", None, "no commands: no source has sent one yet")
         self._speeds = STILL
         self._limited_ns = 0
         self._before = (self._limiter.state, 0)
@@ -158,9 +158,11 @@ class Robot:
         fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
         if fault:
             self._fault(fault, events)
-        # The distance of the lines that were dropped is made up at this line's speed.
-        line = replace(line, dt=line.dt + self._lost_dt) if self._lost_dt else line
-        self._lost_dt = 0.0
+        lost, self._lost_dt = self._lost_dt, 0.0
+        if lost > MAX_DT:
+            line = replace(line, gap=line.gap + lost)  # too long to guess how it moved
+        elif lost:
+            line = replace(line, dt=line.dt + lost)  # it went on at about this speed
         return self._odometry.fold(line)
 
     # requests

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 
 from acsard.cli.common import Overrides, add_config, load
 from acsard.settings import Config
@@ -56,19 +57,17 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.config import warnings
     from acsard.runtime import daemon
-    from acsard.runtime.logs import Log
+    from acsard.runtime.logs import Log, Writer
     from acsard.values import Event
 
     where, config = load(args.config, overrides(args))
-    log = Log(config.log)
+    log, screen = Log(config.log), Writer(sys.stdout)
 
     def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.port == daemon.SIMULATOR
         if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
-            try:
-                print(banner(config, where, device, trouble), flush=True)
-            except OSError:
-                pass  # standard output is closed or full; nobody needs the banner there
+            # Not print: a full pipe that nobody reads would hold up the robot.
+            screen.write(banner(config, where, device, trouble) + "\n")
         log.info(
             "started",
             robot=config.robot.id,
@@ -86,6 +85,7 @@ def main(args: argparse.Namespace) -> int:
     finally:
         log.info("ended")
         log.close()
+        screen.close(0.2)
     return 0
 
 

@@ -16,7 +16,11 @@ from acsard.settings import CommandsConfig, Source
 from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
 
 FORGET_NS = 10 * NS_PER_S
-"""A sender silent for this long starts with a fresh minimum: its clock may have been set."""
+"""A sender silent for this long may prove a new minimum: its clock may have been set."""
+
+PROVEN_NS = 2 * NS_PER_S
+STEADY_NS = NS_PER_S // 10
+"""It has when its delays stay within 0.1 s of each other for 2 s; a backlog's fall faster."""
 
 DRIFT = 2e-4
 """How much faster than the sender's clock ours may run; twice what a bad crystal does."""
@@ -29,7 +33,7 @@ REASONS = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
     "stale": "held up on the way for longer than the source's timeout (or the sender's clock was "
-    "set back: let it pause for 10 s)",
+    "set back: let it pause for 10 s, then send on)",
 }
 """What `accept` refuses for, in words."""
 
@@ -43,24 +47,45 @@ class Choice(Struct, frozen=True):
     arrived_ns: int | None = None
 
 
+class _Clock(Struct, frozen=True):
+    """What is known of one sender: its least delay, when it was heard, and a proof under way."""
+
+    least: float
+    heard_ns: int
+    proof: tuple[float, float, int] | None = None
+    """Least and greatest delay since a long silence, and since when."""
+
+
 class Freshness:
     """Relative age of stamped commands: is this one late compared with the sender's best one?
 
     d = arrival - stamp holds the unknown clock offset and the delay; d - min(d) is the extra
     delay alone. No clock has to be synchronised, and a clock step here does not matter because
     the arrival is monotonic.
+
+    A sender that returns from a long silence with much greater delays has either set its clock
+    back or pours out what the network held: only delays that stay the same tell the first.
     """
 
     def __init__(self) -> None:
-        self._senders: dict[str, tuple[float, int]] = {}
+        self._senders: dict[str, _Clock] = {}
 
     def extra_delay_ns(self, sender: str, stamp_ns: int, arrived_ns: int) -> float:
         """By how much this command came later than the sender's promptest one, ns."""
         delay = float(arrived_ns - stamp_ns)
-        least, heard_ns = self._senders.pop(sender, (delay, arrived_ns))
-        silence = arrived_ns - heard_ns
-        least = delay if silence > FORGET_NS else min(delay, least + DRIFT * silence)
-        self._senders[sender] = (least, arrived_ns)
+        known = self._senders.pop(sender, None) or _Clock(delay, arrived_ns)
+        silence = arrived_ns - known.heard_ns
+        least = min(delay, known.least + DRIFT * silence)
+        proof = (delay, delay, arrived_ns) if silence > FORGET_NS else known.proof
+        if proof is not None:
+            low, high = min(proof[0], delay), max(proof[1], delay)
+            if high - low > STEADY_NS:
+                proof = (delay, delay, arrived_ns)
+            elif arrived_ns - proof[2] >= PROVEN_NS or delay - least <= STEADY_NS:
+                least, proof = low, None
+            else:
+                proof = (low, high, proof[2])
+        self._senders[sender] = _Clock(least, arrived_ns, proof)
         if len(self._senders) > MAX_SENDERS:
             del self._senders[next(iter(self._senders))]
         return delay - least

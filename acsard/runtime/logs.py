@@ -7,6 +7,7 @@ terminal someone has scrolled must not hold up the control loop. What does not f
 from __future__ import annotations
 
 import logging
+import os
 import queue
 import sys
 import threading
@@ -22,8 +23,8 @@ QUEUED_LINES = 1000
 """More than the daemon says in an hour of trouble."""
 
 
-class _Writer:
-    """A file for structlog that never blocks and never raises."""
+class Writer:
+    """A file that never blocks and never raises."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -52,17 +53,32 @@ class _Writer:
     def _work(self) -> None:
         while (text := self._lines.get()) is not None:
             try:
-                self._stream.write(text)
-                self._stream.flush()
+                write_through(self._stream, text)
             except (OSError, ValueError):
                 pass  # disk full or stream closed: logging degrades, control goes on
+
+
+def write_through(stream: TextIO, text: str) -> None:
+    """Write to the stream's descriptor, past its buffer.
+
+    A thread that is stuck in a buffered write holds the buffer's lock, and then nobody could
+    flush it at the end.
+    """
+    try:
+        fd = stream.fileno()
+    except (OSError, ValueError):  # a stream in memory
+        stream.write(text)
+        return
+    data = text.encode(errors="replace")
+    while data:
+        data = data[os.write(fd, data) :]
 
 
 class Log:
     """What the daemon writes about itself."""
 
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
-        self._writer = _Writer(stream)
+        self._writer = Writer(stream)
         form = settings.format
         if form == "auto":
             form = "console" if stream.isatty() else "json"

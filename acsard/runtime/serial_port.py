@@ -90,7 +90,8 @@ class SerialPort:
         except OSError as error:
             self._leave(error)
             return "down"
-        self._gate.note_sent(now.mono_ns, len(data), taken)
+        # From the moment it went, not from the start of the step that made it.
+        self._gate.note_sent(clock.now().mono_ns, len(data), taken)
         return "sent" if taken == len(data) else "superseded"
 
     def _kernel_bytes(self) -> int:

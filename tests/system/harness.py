@@ -333,6 +333,8 @@ class Peer:
         self._ends: tuple[int, int] | None = None
         self._thread: threading.Thread | None = None
         self._leave = threading.Event()
+        self._listens = threading.Event()
+        self._listens.set()
         self._idle = 0
 
     @property
@@ -376,6 +378,28 @@ class Peer:
         self._ends = None
         return time.monotonic()
 
+    @contextmanager
+    def deaf(self) -> Iterator[None]:
+        """Reads nothing while entered, so that the kernel keeps what comes."""
+        self._listens.clear()
+        idle = self._idle
+        until(lambda: self._idle > idle, 5.0, "it has stopped to listen")
+        try:
+            yield
+        finally:
+            self._listens.set()
+
+    def stuff(self) -> int:
+        """Fill what the kernel holds for us to read with ends of line; how many bytes it took."""
+        assert self._ends is not None
+        os.set_blocking(self._ends[1], False)
+        taken = 0
+        try:
+            while True:
+                taken += os.write(self._ends[1], b"\r\n")
+        except BlockingIOError:
+            return taken
+
     def say(self, data: bytes) -> None:
         """Send bytes unasked."""
         assert self._ends is not None
@@ -396,6 +420,10 @@ class Peer:
     def _serve(self, master: int, session: Session) -> None:
         held = b""
         while not self._leave.is_set():
+            if not self._listens.is_set():
+                self._idle += 1
+                self._listens.wait(0.01)
+                continue
             if not select.select([master], [], [], 0.05)[0]:
                 self._idle += 1
                 continue
@@ -410,6 +438,66 @@ class Peer:
                     answer = self.reply(speeds)
                     if answer:
                         os.write(master, answer)
+
+
+_FAR = """\
+import os, pty, sys, time, tty
+try:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+except OSError:
+    pass  # not root: its times are as good as the machine is idle
+master, slave = pty.openpty()
+tty.setraw(slave)
+os.symlink(os.ttyname(slave), sys.argv[1])
+print("plugged", flush=True)
+held = b""
+while True:
+    data = os.read(master, 4096)
+    now = time.monotonic()
+    *lines, held = (held + data).split(b"\\n")
+    for line in lines:
+        if line.startswith(b"a"):
+            os.write(master, line + b"\\n")
+        print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
+"""
+
+
+class FarPeer(Program):
+    """A serial peer in a process of its own, ahead of all others: its times can be trusted.
+
+    Nothing this test run does (its interpreter lock, its load) makes a line look late. It answers
+    each command with the speeds asked for.
+    """
+
+    def __init__(self, where: Path, name: str = "far_mcu") -> None:
+        self.path = where / name
+        self._heard: list[Heard] = []
+        super().__init__([sys.executable, "-c", _FAR, str(self.path)], where)
+
+    def __enter__(self) -> FarPeer:
+        super().__enter__()
+        self.says("plugged")
+        return self
+
+    @property
+    def lines(self) -> list[Heard]:
+        """All lines so far, without their ends; "-" for an empty one."""
+        for text in self.out[1 + len(self._heard) :]:
+            at, _, line = text.partition(" ")
+            self._heard.append(Heard(float(at), line.encode()))
+        return list(self._heard)
+
+    def since(self, at: float, to: float = float("inf")) -> list[Heard]:
+        """The lines between two times."""
+        return [heard for heard in self.lines if at < heard.at <= to]
+
+    def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> Heard:
+        """The first line that starts so after then."""
+        return until(
+            lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
+            within,
+            f"{line!r} on the wire",
+        )
 
 
 def _speeds(line: bytes) -> Speeds | None:

@@ -93,6 +93,86 @@ session.close()
 """One zero, then `speed` m/s as fast as one process can for `seconds`."""
 
 
+COMMANDER = (
+    _OPEN
+    + """
+session = open_session(sys.argv[1])
+source, speed, zeros = sys.argv[2], float(sys.argv[3]), int(sys.argv[4])
+
+def put(linear):
+    sec, nanosec = divmod(time.time_ns(), 10**9)
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}}
+    twist = {"linear": {"x": linear}, "angular": {"z": 0}}
+    print("put", repr(time.monotonic()), flush=True)
+    session.put("acsard/acsar/cmd/" + source, json.dumps({"header": header, "twist": twist}))
+
+for _ in range(zeros):
+    put(0.0)
+    time.sleep(0.05)
+start, step = time.monotonic(), 0
+while True:
+    put(speed)
+    step += 1
+    time.sleep(max(0.0, start + step / 20 - time.monotonic()))
+"""
+)
+"""So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put."""
+
+CODED_FLOOD = (
+    _OPEN
+    + """
+session = open_session(sys.argv[1])
+base, slope, seconds = (float(word) for word in sys.argv[2:5])
+key = "acsard/acsar/cmd/app"
+text = '{"linear": {"x": %.5f}, "angular": {"z": 0}}'
+session.put(key, text % 0)
+time.sleep(0.05)
+publisher, count, payload, until = session.declare_publisher(key), 0, "", 0.0
+start = time.monotonic()
+print("flooding", repr(start), flush=True)
+while (now := time.monotonic()) < start + seconds:
+    if now >= until:
+        payload, until = text % (base + slope * (now - start)), now + 0.0005
+    publisher.put(payload)
+    count += 1
+print("flooded", count, flush=True)
+session.close()
+"""
+)
+"""One zero, then as fast as one process can: each command says when it was sent, by its speed
+`base + slope * t` m/s."""
+
+HOARDER = (
+    _OPEN.replace(
+        "    while True:",
+        "    config.insert_json5('transport/link/tx/lease', '600000')\n    while True:",
+    )
+    + """
+session = open_session(sys.argv[1])
+subscriber = session.declare_subscriber("acsard/acsar/**", lambda sample: None)
+print("listening", flush=True)
+time.sleep(600)
+"""
+)
+"""Subscribes to everything and promises to live for ten minutes, to be stopped with SIGSTOP."""
+
+ROUTER = """\
+import json, sys, time
+import zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+session = zenoh.open(config)
+print("routing", repr(time.monotonic()), flush=True)
+time.sleep(600)
+"""
+"""A Zenoh router at an address."""
+
+BUSY = "while True: pass"
+"""Uses up a core."""
+
+
 def words(program: str, *arguments: object) -> list[str]:
     """The words that run such a program."""
     return [sys.executable, "-c", program, *map(str, arguments)]

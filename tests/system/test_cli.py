@@ -89,7 +89,7 @@ def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
     shared: Daemon,
 ) -> None:
     until(lambda: len(shared.out) >= 7, 5.0, "the whole banner")
-    assert "SIMULATOR" in shared.out[0]
+    assert "SIMULATOR" in shared.out[1]
     assert shared.endpoint in shared.out[1]
     assert "acsard/acsar/" in shared.out[1]
     assert str(shared.config) in shared.out[2]

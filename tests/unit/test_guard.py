@@ -239,6 +239,16 @@ def test_without_a_command_no_wheel_may_turn_round(guard: Guard, wheel: int, sig
     assert objection(guard, coasting(line(*speeds))) == GROWS
 
 
+def test_without_a_command_the_slowest_wheel_may_not_turn_round_either(guard: Guard) -> None:
+    sent(guard, 0.01)
+    assert objection(guard, coasting(line(0.01, 0.01, 0.01, -0.01))) == GROWS
+
+
+def test_a_wheel_that_stands_may_go_on_standing_while_others_slow_down(guard: Guard) -> None:
+    sent(guard, 5.0, 0.0, -5.0, 0.0)
+    assert objection(guard, coasting(line(4.0, 0.0, -4.0, 0.0))) == ""
+
+
 def test_from_rest_nothing_moves_without_a_command(guard: Guard) -> None:
     assert objection(guard, coasting(line(0.01))) == GROWS
 

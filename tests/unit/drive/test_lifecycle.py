@@ -43,6 +43,13 @@ def test_a_clear_that_did_not_know_of_the_stop_is_refused(asked_ns: int, now_ns:
     assert life.mode is Mode.STOPPED
 
 
+def test_without_a_stop_a_clear_is_never_too_soon() -> None:
+    life = ready()
+    life.fault("wheel")
+    life.clear(asked_ns=0, now_ns=0, linked=True)
+    assert life.mode is Mode.READY
+
+
 def test_a_clear_without_a_link_waits_for_it() -> None:
     life = ready()
     life.stop(now_ns=1)

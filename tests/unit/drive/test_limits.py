@@ -232,6 +232,41 @@ def test_jerk_lets_the_slope_grow_step_by_step() -> None:
     assert [t.linear for t in path] == pytest.approx([0.0005, 0.0015, 0.003])
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("goal", "path"),
+    [
+        # in steps of 0.05 m/s2 and 10 ms: slopes of 1, 2, 2, 1 and of 1, 2, 3, 2, 1 steps
+        (0.0030, [0.0005, 0.0015, 0.0025, 0.0030, 0.0030]),
+        (0.0045, [0.0005, 0.0015, 0.0030, 0.0040, 0.0045]),
+        # 5.97 such steps: after 1 and 2 the rest of 2.97 is 1.985 and 0.985, each one less
+        (0.002985, [0.0005, 0.0015, 0.0024925, 0.002985, 0.002985]),
+    ],
+)
+def test_jerk_lets_the_slope_fall_as_late_as_it_may(
+    goal: float, path: list[float], sign: float
+) -> None:
+    got = followed(limiter(JERKY), Twist(sign * goal, 0.0), 5)
+    assert [sign * twist.linear for twist in got] == pytest.approx(path)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_slope_falls_no_faster_than_jerk_unless_the_goal_would_be_passed(sign: float) -> None:
+    found = limiter(JERKY)
+    assert followed(found, Twist(sign, 0.0), 10)[-1].linear == pytest.approx(sign * 0.0275)
+    # From a slope of 10 steps to one of 9; then the goal is one step away.
+    got = followed(found, Twist(sign * 0.0325, 0.0), 2)
+    assert [sign * twist.linear for twist in got] == pytest.approx([0.032, 0.0325])
+
+
+def test_a_long_way_with_jerk_takes_the_time_worked_by_hand() -> None:
+    # Up to 1 m/s2 in 20 steps of 0.05 m/s2, which are 0.105 m/s; as much again to fall from it
+    # in 19, 0.095 m/s; the 0.3 m/s between take 30 steps of 10 ms.
+    path = followed(limiter(JERKY), Twist(0.5, 0.0), 69)
+    assert path[-2].linear < 0.5
+    assert path[-1].linear == 0.5
+
+
 def slopes(speeds: list[float]) -> list[float]:
     return [(after - before) / DT for before, after in pairwise(speeds)]
 
@@ -347,6 +382,10 @@ def test_coasting_at_rest_stays_at_rest() -> None:
     assert limiter().coast(0.0) == REST
 
 
+def test_coasting_ends_at_rest_without_a_negative_zero() -> None:
+    assert repr(moving(-0.5, -1.0).coast(1.0)) == repr(REST)
+
+
 def test_no_time_coasts_nowhere() -> None:
     assert moving(0.5, 1.0).coast(0.0) == Twist(0.5, 1.0)
 
@@ -404,11 +443,14 @@ def test_jerk_never_delays_coasting() -> None:
     assert moving(0.5, 0.0, JERKY).coast(DT).linear == pytest.approx(0.49)
 
 
-def test_after_coasting_jerk_begins_from_a_level_slope() -> None:
-    found = limiter(JERKY)
-    followed(found, Twist(1.0, 0.0), 20)
-    left = found.coast(DT).linear
-    assert found.follow(Twist(1.0, 0.0), DT).linear == pytest.approx(left + 0.0005)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
+    # 5 m/s3 and 20 rad/s3 x 10 ms x 10 ms
+    found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
+    followed(found, wish, 20)
+    left = found.coast(DT)
+    expected = approx(left.linear + sign * 0.0005, left.angular + sign * 0.002)
+    assert pair(found.follow(wish, DT)) == expected
 
 
 # cut and restore
@@ -420,11 +462,18 @@ def test_a_cut_is_rest_at_once() -> None:
     assert found.twist == REST
 
 
-def test_after_a_cut_jerk_begins_from_a_level_slope() -> None:
-    found = limiter(JERKY)
-    followed(found, Twist(1.0, 0.0), 20)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_after_a_cut_jerk_begins_from_a_level_slope(sign: float) -> None:
+    found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
+    followed(found, wish, 20)
     found.cut()
-    assert found.follow(Twist(1.0, 0.0), DT).linear == pytest.approx(0.0005)
+    assert pair(found.follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_new_limiter_begins_from_a_level_slope(sign: float) -> None:
+    wish = Twist(sign * 0.5, sign * 2.0)
+    assert pair(limiter(JERKY).follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
 
 
 @pytest.mark.parametrize("limits", [FREE, JERKY])

@@ -337,6 +337,14 @@ def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
     assert far_p.yawyaw > near_p.yawyaw
 
 
+def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
+    robot = odometry()
+    robot.fold(feedback(4.5, 7.5, 0.0))
+    covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
+    assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
+    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == covariance
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e6], ids=["driving", "gaps"])
 def test_the_covariance_stays_finite_for_years(gap: float) -> None:
     robot = odometry(

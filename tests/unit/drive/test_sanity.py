@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.drive.sanity import REPEATED, Sanity
+from acsard.drive.sanity import Sanity
 from acsard.mcu.session import Feedback
 from acsard.settings import FeedbackConfig
 from acsard.values import STILL, WHEELS, Instant, WheelSpeeds
@@ -40,6 +40,15 @@ def watched(
     return math.inf, ""
 
 
+def watched_after_driving(wheel: int, sent: float, seen: float, jitter: float = 0.0) -> str:
+    """The fault that comes within two seconds of this, after three of doing as told."""
+    sanity = Sanity(FeedbackConfig())
+    told = only(wheel, sent)
+    assert not any(sanity.watch(told, only(wheel, sent + step % 2 / 10), DT) for step in range(300))
+    found = (sanity.watch(told, only(wheel, seen + jitter * (step % 2)), DT) for step in range(200))
+    return next(filter(None, found), "")
+
+
 # impossible lines
 
 
@@ -56,6 +65,15 @@ def test_a_change_no_wheel_makes_is_impossible_and_names_the_wheel(wheel: int) -
     assert sanity.impossible(line(STILL)) == ""
     assert WHEELS[wheel] in sanity.impossible(line(only(wheel, 3.5)))
     assert sanity.impossible(line(only(wheel, 2.9))) == ""
+
+
+def test_the_most_a_wheel_can_do_is_possible() -> None:
+    # 100 rad/s2 x 10 ms and 2 rad/s of slack
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    assert sanity.impossible(line(STILL)) == ""
+    assert sanity.impossible(line(only(0, 3.0))) == ""
+    assert sanity.impossible(line(only(0, 0.0))) == ""
+    assert "front_right" in sanity.impossible(line(only(0, -3.01)))
 
 
 def test_a_real_step_is_believed_as_soon_as_it_could_have_happened() -> None:
@@ -75,11 +93,11 @@ def test_three_impossible_lines_in_a_row_are_doubtful_and_two_are_not() -> None:
     sanity = Sanity(FeedbackConfig())
     fast = line(only(0, 99.0))
     found = []
-    for _ in range(REPEATED - 1):
+    for _ in range(2):
         sanity.impossible(fast)
         found.append(sanity.doubtful)
     sanity.impossible(line(STILL))
-    for _ in range(REPEATED):
+    for _ in range(3):
         sanity.impossible(fast)
         found.append(sanity.doubtful)
     assert found == [False, False, False, False, True]
@@ -88,11 +106,30 @@ def test_three_impossible_lines_in_a_row_are_doubtful_and_two_are_not() -> None:
 def test_forgetting_starts_over() -> None:
     sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
     sanity.impossible(line(STILL))
-    for _ in range(REPEATED):
+    for _ in range(3):
         sanity.impossible(line(TEN))
     sanity.forget()
     assert not sanity.doubtful
     assert sanity.impossible(line(TEN)) == ""
+
+
+@pytest.mark.parametrize("forget", [False, True])
+def test_new_or_after_forgetting_it_takes_three_impossible_lines(forget: bool) -> None:
+    sanity = Sanity(FeedbackConfig())
+    if forget:
+        sanity.forget()
+    found = []
+    for _ in range(3):
+        sanity.impossible(line(only(0, 99.0)))
+        found.append(sanity.doubtful)
+    assert found == [False, False, True]
+
+
+def test_forgetting_drops_the_evidence_against_every_wheel() -> None:
+    sanity = Sanity(FeedbackConfig())
+    for _ in range(3):
+        assert not any(sanity.watch(TEN, STILL, DT) for _ in range(45))
+        sanity.forget()
 
 
 # contradictions
@@ -122,6 +159,49 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
     assert word in fault
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("sent", "seen", "word"),
+    [
+        # a tenth of 10 rad/s is not turning
+        (10.0, 0.9, "does not turn"),
+        (10.0, 1.05, ""),
+        # three tenths of 10 rad/s backwards are a reversal
+        (10.0, -3.1, "against its command"),
+        (10.0, -2.9, ""),
+        # one and a half times 10 rad/s and 2 rad/s more are a runaway
+        (10.0, 17.1, "faster than commanded"),
+        (10.0, 16.9, ""),
+        (0.0, 2.1, "faster than commanded"),
+        (0.0, 1.9, ""),
+    ],
+)
+def test_what_is_too_far_from_the_command_is_worked_by_hand(
+    sent: float, seen: float, word: str, sign: float
+) -> None:
+    # 0.04 rad/s of jitter, as nothing that changes is stuck
+    fault = watched_after_driving(1, sign * sent, sign * seen, jitter=0.04)
+    assert word in fault if word else fault == ""
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("seen", "stuck"), [(4.9, True), (5.1, False), (14.9, False), (15.1, True)]
+)
+def test_a_constant_speed_more_than_two_and_three_tenths_away_is_stuck(
+    seen: float, stuck: bool, sign: float
+) -> None:
+    # 10 rad/s -+ (2 + 0.3 x 10) rad/s
+    fault = watched_after_driving(2, sign * 10.0, sign * seen)
+    assert ("one and the same speed" in fault) is stuck
+
+
+def test_a_dead_wheel_is_found_half_a_second_after_a_healthy_one_would_have_turned() -> None:
+    # A healthy wheel passes 2 rad/s on its way to 10 in step 5: 10 (1 - (0.2 / 0.21)^5) = 2.16.
+    after, _ = watched(TEN, STILL)
+    assert after == pytest.approx(0.04 + 0.5, abs=0.011)
+
+
 def test_a_contradiction_that_does_not_last_is_none() -> None:
     sanity = Sanity(FeedbackConfig())
     for _ in range(20):
@@ -133,12 +213,43 @@ def test_a_robot_pushed_gently_by_hand_is_no_fault() -> None:
     assert watched(STILL, WheelSpeeds(1.9, 1.9, 1.9, 1.9))[1] == ""
 
 
+def test_a_robot_pushed_back_gently_after_it_drove_is_no_fault() -> None:
+    sanity = Sanity(FeedbackConfig())
+    for told, seen in ((10.0, 10.0), (0.0, -1.5)):
+        for step in range(300):
+            moved = only(0, seen + step % 2 / 10)
+            assert sanity.watch(only(0, told), moved, DT) == ""
+
+
 def test_a_wheel_slowed_by_half_under_load_is_no_fault() -> None:
     sanity = Sanity(FeedbackConfig())
     dice = random.Random(1)
     for _ in range(500):
         seen = WheelSpeeds(*(5.0 + dice.uniform(-0.2, 0.2) for _ in range(4)))
         assert sanity.watch(TEN, seen, DT) == ""
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_slow_wheel_that_brakes_as_it_was_said_to_is_no_fault(sign: float) -> None:
+    sanity, speed = Sanity(FeedbackConfig(response_time=2.0)), 0.0
+    for told in (sign * 20.0, 0.0):
+        for _ in range(1000):
+            speed += (told - speed) * (DT / (2.0 + DT))
+            assert sanity.watch(only(3, told), only(3, speed), DT) == ""
+
+
+def test_a_wheel_that_stops_sooner_than_it_was_said_to_is_no_fault() -> None:
+    sanity = Sanity(FeedbackConfig(response_time=2.0))
+    for told in (20.0, 0.0):
+        for step in range(1000):
+            seen = WheelSpeeds(*(told and told + step % 2 / 10 for _ in WHEELS))
+            assert sanity.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
+
+
+def test_evidence_must_last_longer_than_the_fault_time() -> None:
+    sanity = Sanity(FeedbackConfig(fault_time=0.5))
+    found = [bool(sanity.watch(TEN, STILL, 0.125)) for _ in range(5)]
+    assert found == [False, False, False, False, True]
 
 
 def test_fault_time_zero_switches_it_off() -> None:

@@ -152,6 +152,12 @@ def test_a_line_is_refused_whole_and_for_its_reason(codec: Codec, line: bytes, r
     assert caught.value.reason == reason
 
 
+def test_a_refusal_tells_its_reason_and_the_beginning_of_the_line(codec: Codec) -> None:
+    with pytest.raises(FrameError) as caught:
+        codec.decode(b"x" * 70)
+    assert str(caught.value) == f"malformed: {b'x' * 60!r}"
+
+
 @pytest.mark.parametrize("order", ["".join(order) for order in itertools.permutations("abcd")])
 def test_the_wheels_may_come_in_any_order(codec: Codec, order: str) -> None:
     token = {chr(token[0]): token for token in SEED_LINE.split(b",")}

@@ -1,0 +1,32 @@
+"""Mutants no test can notice: how they are printed (without the line), and why."""
+
+# ruff: noqa: E501 - as they are printed
+
+from __future__ import annotations
+
+EQUIVALENT: dict[str, str] = {
+    "acsard/mcu/frames.py Codec.decode: 'index, sign = self._by_letter[letter[0]]' -> 'index, sign = self._by_letter[letter[-1]]'": "the first of one byte is its last",
+    "acsard/drive/sanity.py Sanity._objection: 'if abs(now - then) > most:' -> 'if abs(then - now) > most:'": "the size of a difference",
+    "acsard/drive/sanity.py _signs: 'ant and speed != 0.0 and (abs(speed - expected) > SLACK + 0.3 * most))' -> 'ant and speed != 0.0 and (abs(expected - speed) > SLACK + 0.3 * most))'": "the size of a difference",
+    "acsard/drive/limits.py _approach: 'most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))' -> 'most = min(most, abs(slope) + step, _flattenable(abs(speed - target), step, dt))'": "the size of a difference",
+    "acsard/drive/sanity.py _signs: ' moving and speed * expected < 0 and (abs(speed) > 0.3 * siz' -> ' moving and speed * expected <= 0 and (abs(speed) > 0.3 * siz'": "neither is 0: `moving` has |expected| > 2, the term after it |speed| > 0.6",
+    "acsard/drive/sanity.py _signs: 'moving and speed * expected < 0 and (abs(speed) > 0.3 * size)' -> 'moving and speed * expected < 1 and (abs(speed) > 0.3 * size)'": "|expected| > 2 and |speed| > 0.6: their product is not between 0 and 1",
+    "acsard/guard.py Guard._read: 'token = line[start:start + 7]' -> 'token = line[start:start + 8]'": "the digits are taken from columns 2 to 6 of the token",
+    "acsard/guard.py Guard._read: 'if len(line) != self._length or line[31:] != self._stop[31:]:' -> 'if line[31:] != self._stop[31:]:'": "where the ends from column 31 on are equal, so are the lengths",
+    "acsard/guard.py Guard.check: 'if self.trip or wheels is None:' -> 'if self.trip:'": "without wheels there is a trip; the rest is for the type checker",
+    "acsard/guard.py Guard._read: 'found.append(int(digits) if token[1] == 112 else -int(digits))' -> 'found.append(int(digits) if token[1] != 112 else -int(digits))'": "all signs turned: the guard asks only for sizes and for changes of sign",
+    "acsard/drive/limits.py Limiter._within_speed: 'if abs(wished.angular) * scale > self._angular.speed:' -> 'if abs(wished.angular) * scale >= self._angular.speed:'": "at the limit itself both branches give the same scale",
+    "acsard/drive/arbiter.py _Commander.__init__: 'self.came_ns = 0' -> 'self.came_ns = 1'": "set by the first command, before it is read",
+    "acsard/drive/arbiter.py _Commander.__init__: 'self.came_ns = 0' -> 'self.came_ns = -1'": "set by the first command, before it is read",
+    "acsard/drive/odometry.py Odometry.fold: 'if dt > 0.0:' -> 'if dt > -1.0:'": "no dt is negative, and a step of none adds nothing",
+    "acsard/robot.py Robot.__init__: 'self._before = (self._limiter.state, 0)' -> 'self._before = (self._limiter.state, 1)'": "no robot starts with a link, and without one each step sets it",
+    "acsard/robot.py Robot.__init__: 'self._before = (self._limiter.state, 0)' -> 'self._before = (self._limiter.state, -1)'": "no robot starts with a link, and without one each step sets it",
+    "acsard/robot.py Robot._drive: \"if self.session.link != 'up' or since > UNHEARD_S:\" -> 'if since > UNHEARD_S:'": "without a link `_fold` has cut the limiter, and rest coasts to rest",
+    "acsard/drive/sanity.py _Wheel.__init__: 'self.seen = 0.0' -> 'self.seen = -1.0'": "one line more of evidence, for a wheel first seen at just this speed",
+    "acsard/mcu/frames.py Codec.decode: \"wheel[index] = speed * sign if direction == b'p' else -speed * sign\" -> \"wheel[index] = speed / sign if direction == b'p' else -speed * sign\"": "the sign is 1 or -1",
+    "acsard/drive/limits.py _approach: 'most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration' -> 'most = axis.acceleration if abs(target) >= abs(speed) else axis.deceleration'": "as fast as its target it is there: the change is none",
+    "acsard/drive/sanity.py Sanity.forget: 'self._last, self._since, self._impossible = (None, 0.0, 0)' -> 'self._last, self._since, self._impossible = (None, 1.0, 0)'": "counts only against a last line, and there is none",
+    "acsard/guard.py Guard._commanded: 'return abs(outputs.now.mono_ns - arrived) <= timeout' -> 'return abs(arrived - outputs.now.mono_ns) <= timeout'": "the size of a difference",
+    "acsard/robot.py Robot._line: 'return codec.stop if self._speeds == STILL else codec.encode(self._speeds)' -> 'return codec.encode(self._speeds)'": "`codec.stop` is that line, kept",
+    "acsard/mcu/frames.py Codec.decode: \"direction == b'p' else -speed * sign\" -> \"direction == b'p' else -speed / sign\"": "the sign is 1 or -1",
+}

@@ -1,0 +1,174 @@
+"""The small faults a module may have: one changed, swapped or dropped piece of its syntax each.
+
+Not mutated: texts (words for people), annotations, and `zip(strict=...)` and `frozen=...` (checks
+of what is always so).
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from acsard.drive.modes import Mode, Trigger
+
+COMPARE: dict[type, tuple[type, ...]] = {
+    ast.Lt: (ast.LtE, ast.GtE),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.LtE),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+}
+ARITHMETIC: dict[type, type] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+    ast.Pow: ast.Mult,
+}
+NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
+MEMBERS = {name: list(Mode.__members__) for name in ("Mode", "_M")}
+MEMBERS |= {name: list(Trigger.__members__) for name in ("Trigger", "_T")}
+
+
+class Mutant(NamedTuple):
+    """One fault: the module's text with it, where it is and how it reads."""
+
+    path: str
+    line: int
+    key: str
+    text: str
+
+
+def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
+    """The faults this node may have: what would stand in its place."""
+
+    def made(kind: type, **changed: Any) -> Any:
+        parts = {name: getattr(node, name) for name in node._fields} | changed
+        return kind(**parts)
+
+    match node:
+        case ast.Compare(ops=[op]):
+            yield from (made(ast.Compare, ops=[other()]) for other in COMPARE.get(type(op), ()))
+        case ast.BinOp(op=op) | ast.AugAssign(op=op):
+            if type(op) in ARITHMETIC:
+                yield made(type(node), op=ARITHMETIC[type(op)]())
+            if isinstance(node, ast.BinOp) and not isinstance(op, ast.Add | ast.Mult):
+                yield made(ast.BinOp, left=node.right, right=node.left)
+        case ast.BoolOp(op=op, values=values):
+            yield made(ast.BoolOp, op=ast.Or() if isinstance(op, ast.And) else ast.And())
+            for value in values:
+                rest = [other for other in values if other is not value]
+                yield rest[0] if len(rest) == 1 else made(ast.BoolOp, values=rest)
+        case ast.UnaryOp(op=ast.Not() | ast.USub(), operand=operand):
+            yield operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield from (ast.Constant(value + 1), ast.Constant(value - 1))
+        case ast.Constant(value=float(value)):
+            yield from (ast.Constant(value * 1.25 or 1.0), ast.Constant(value * 0.8 or -1.0))
+        case ast.Constant(value=bytes(value)) if value:
+            yield ast.Constant(value[1:])
+        case ast.IfExp(body=body, orelse=orelse):
+            yield from (body, orelse)
+        case ast.Attribute(value=ast.Name(id=name), attr=attr) if attr in MEMBERS.get(name, ()):
+            following = (MEMBERS[name] * 2)[MEMBERS[name].index(attr) + 1]
+            yield made(ast.Attribute, attr=following)
+        case ast.Call(func=func, args=args):
+            match func:
+                case ast.Name(id=name) if name in NAMES:
+                    yield made(ast.Call, func=ast.Name(NAMES[name]))
+                case ast.Name(id="abs"):
+                    yield args[0]
+                case ast.Attribute(attr=name) if name in NAMES:
+                    yield made(ast.Call, func=ast.Attribute(func.value, NAMES[name]))
+            if len(args) > 1 and ast.unparse(func) not in ("min", "max", "isinstance"):
+                yield made(ast.Call, args=[args[1], args[0], *args[2:]])
+        case ast.Return(value=value) if value and not isinstance(value, ast.Constant):
+            yield ast.Return(ast.Constant(None))
+    if field in ("test", "ifs") and not isinstance(node, ast.Compare | ast.BoolOp | ast.UnaryOp):
+        yield ast.UnaryOp(ast.Not(), cast(ast.expr, node))
+    match node:
+        case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise() | ast.Delete():
+            yield ast.Pass()
+        case ast.If(orelse=[]) | ast.Return(value=ast.Constant() | None):
+            yield ast.Pass()
+        case ast.Assign(targets=targets) if not isinstance(parent, ast.Module | ast.ClassDef):
+            # Without its assignment a local name is an error for nothing.
+            if not any(
+                isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+                for target in targets
+                for n in ast.walk(target)
+            ):
+                yield ast.Pass()
+
+
+def places(node: ast.AST, scope: str = "") -> Iterator[tuple[ast.AST, str, ast.AST, str]]:
+    """All that may be mutated below a node: its parent, its field there, itself, its scope."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        scope += f".{node.name}" if scope else node.name
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list", "bases"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            match child:
+                case ast.JoinedStr() | ast.keyword(arg="strict" | "frozen"):
+                    continue
+                case ast.AST():
+                    yield node, field, child, scope
+                    yield from places(child, scope)
+
+
+def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
+    """Let the parent hold `new` where it held `old`."""
+    value = getattr(parent, field)
+    if isinstance(value, list):
+        value[next(i for i, child in enumerate(value) if child is old)] = new
+    else:
+        setattr(parent, field, new)
+
+
+def mutants(root: Path, path: str) -> Iterator[Mutant]:
+    """All mutants of one module."""
+    tree = ast.parse((root / path).read_text(encoding="utf-8"))
+    original = ast.unparse(tree)
+    for parent, field, node, scope in list(places(tree)):
+        for variant in variants(node, parent, field):
+            new = deepcopy(variant)
+            put(parent, field, node, new)
+            text = ast.unparse(tree)
+            put(parent, field, new, node)
+            if text != original:
+                line: int = getattr(node, "lineno", getattr(parent, "lineno", 0))
+                yield Mutant(path, line, f"{path} {scope}: {change(original, text)}", text)
+
+
+def change(before: str, after: str) -> str:
+    """What differs, with what stands around it, in one line."""
+    old, new = before.splitlines(), after.splitlines()
+    while old and new and old[0] == new[0]:
+        del old[0], new[0]
+    while old and new and old[-1] == new[-1]:
+        del old[-1], new[-1]
+    said, says = (" ".join(line.strip() for line in lines) for lines in (old, new))
+    start = common(said, says)
+    end = common(said[start:][::-1], says[start:][::-1])
+    left = max(0, start - 30) if start > 60 else 0
+    return " -> ".join(
+        repr(text[left : len(text) - end + 30 if end > 60 else None]) for text in (said, says)
+    )
+
+
+def common(one: str, other: str) -> int:
+    """How many characters both begin with."""
+    pairs = enumerate(zip(one, other, strict=False))
+    return next((i for i, (a, b) in pairs if a != b), min(len(one), len(other)))

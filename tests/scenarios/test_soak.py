@@ -1,0 +1,437 @@
+"""What must not move does not, ten thousand times over, and for a day with a fault every minute.
+
+Each test prints its figure; the short versions run by default, the long ones with
+
+    pytest -m soak -s tests/scenarios/test_soak.py
+"""
+
+from __future__ import annotations
+
+import gc
+import random
+import sys
+import time
+import zlib
+from collections import Counter, deque
+
+import msgspec
+import pytest
+
+from acsard.settings import CommandsConfig, Config, ControlConfig, Source
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import NS_PER_S, Outputs
+from tests.scenarios.world import World
+
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+DAY_NS = 86_400 * NS_PER_S
+
+
+def long(count: int, seconds: int) -> object:
+    """A long run that may take so many seconds of real time."""
+    return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(seconds)])
+
+
+def quiet_bus(world: World) -> World:
+    """Nobody listens: what is published has its own tests."""
+    world.bus.wanted = set()
+    return world
+
+
+def wheels(line: bytes) -> tuple[float, ...]:
+    """What a line we sent says, rad/s."""
+    return tuple(
+        float(line[at + 2 : at + 7]) * (1 if line[at + 1 : at + 2] == b"p" else -1)
+        for at in (0, 8, 16, 24)
+    )
+
+
+def speed(line: bytes) -> float:
+    """The fastest wheel of a line, rad/s, without its sign."""
+    return max(map(abs, wheels(line)))
+
+
+# a. silence
+
+
+def refused(world: World, dice: random.Random) -> None:
+    """Something that must not count as a command."""
+    match dice.randrange(4):
+        case 0:
+            world.put("cmd/it", b'{"linear": {"x": ')
+        case 1:
+            nan = {"linear": {"x": float("nan")}, "angular": {}}
+            world.put("cmd/it", msgspec.msgpack.encode(nan))
+        case 2:
+            world.send(0.5, source="stranger")
+        case 3:
+            world.put("cmd/it", b'{"linear": {"x": 0.5}, "angular": {}}', put=False)
+
+
+def silence(world: World, dice: random.Random, timeout: float) -> float:
+    """Drive, fall silent; how long after the last command the wheels first slow down, s."""
+    linear = dice.choice((-1, 1)) * dice.uniform(0.1, 1.0)
+    angular = dice.uniform(-1.5, 1.5)
+    pause = min(0.05, timeout * 0.6)
+    world.send(0.0, source="it")
+    world.run(2 / world.config.rate_hz)
+    for _ in range(dice.randint(4, 16)):
+        world.send(linear, angular, "it")
+        world.run(pause * dice.uniform(0.5, 1.0))
+    world.run(dice.random() / world.config.rate_hz)
+    world.send(linear, angular, "it")
+    last_ns = world.now_ns
+    world.port.sent.clear()
+    end_ns = last_ns + int((timeout + 3 / world.config.rate_hz) * NS_PER_S)
+    while world.now_ns < end_ns:
+        if dice.random() < 0.3:
+            refused(world, dice)
+        world.run(min(0.04, (end_ns - world.now_ns) / NS_PER_S + 1e-9))
+    before = 0.0
+    for at_ns, line in world.port.sent:
+        if speed(line) < before:
+            took = (at_ns - last_ns) / NS_PER_S
+            break
+        before = speed(line)
+    else:
+        return float("inf")
+    while world.port.sent[-1][1] != ZERO:
+        world.run(0.1)
+    return took
+
+
+@pytest.mark.parametrize("count", [200, long(10_000, 1200)])
+def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int) -> None:
+    dice, kept, latest = random.Random(1), 0, 0.0
+    for trial in range(count):
+        if trial % 25 == 0:
+            rate = dice.choice((10.0, 20.0, 50.0, 100.0, 100.0, 200.0))
+            timeout = round(dice.uniform(max(0.02, 2 / rate), 0.6), 3)
+            source = Source("it", dice.randrange(100), timeout)
+            config = Config(
+                control=ControlConfig(rate=rate),
+                commands=CommandsConfig(sources=(Source("other", 50), source)),
+            )
+            world = quiet_bus(World(config))
+            world.run(1.0)
+        took = silence(world, dice, timeout)
+        late = (took - timeout) * rate
+        kept += 0.0 <= late <= 1.0 + 1e-6
+        latest = max(latest, late)
+    print(
+        f"\nsilence: {kept} of {count} ramps within timeout + 1 tick; the latest {latest:.3f} tick"
+    )
+    assert kept == count
+
+
+# b. neutral first
+
+STARTS_OVER = (
+    "restart", "replug", "new board", "reset", "mute", "stop, clear", "fault, clear", "activate",
+)  # fmt: skip
+
+
+def start_over(world: World, kind: str, dice: random.Random) -> World:
+    """Let it happen while the commander goes on sending; the world that goes on after it."""
+    fast = dice.uniform(-0.9, 0.9)
+    match kind:
+        case "restart":
+            again = quiet_bus(World(world.config, plugged=False))
+            again.now_ns = again.next_tick_ns = world.now_ns + dice.randrange(3 * NS_PER_S)
+            again.mcu = world.mcu
+            again.port.plug(world.mcu)
+            return again
+        case "replug" | "new board":
+            world.port.unplug()
+            if kind == "new board":
+                world.mcu = FakeMcu(world.config, world.now_ns)
+            world.hold(fast, seconds=dice.uniform(0.0, 2.0))
+            world.mcu.advance(world.now_ns)
+            world.port.plug(world.mcu)
+        case "reset":
+            world.mcu.reset(world.now_ns)
+            world.hold(fast, seconds=2.1)
+        case "mute":
+            with world.mcu.mute():
+                world.hold(fast, seconds=dice.uniform(1.2, 3.0))
+        case "stop, clear":
+            world.put("stop", b"")
+            world.hold(fast, seconds=dice.uniform(1.0, 2.0))
+            assert world.state.mode == "stopped"
+            world.call("clear")
+        case "fault, clear":
+            with world.mcu.bias(dice.randrange(4), dice.choice((-1.0, 3.0, 9.0))):
+                world.hold(0.5, seconds=2.0)
+                assert world.state.mode == "fault"
+            world.hold(fast, seconds=0.5)
+            world.call("clear")
+        case "activate":
+            world.call("deactivate")
+            world.hold(fast, seconds=dice.uniform(1.5, 2.0))
+            world.call("activate")
+    return world
+
+
+@pytest.mark.parametrize("count", [48, long(1_000, 1800)])
+def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
+    dice, kept, seen = random.Random(2), 0, Counter[str]()
+    world = quiet_bus(World())
+    world.run(0.3)
+    for trial in range(count):
+        kind = STARTS_OVER[trial % len(STARTS_OVER)]
+        source = dice.choice(("app", "nav", "teleop"))
+        # Fast enough for every kind of lying encoder to be found out.
+        linear = dice.choice((-1, 1)) * dice.uniform(0.4, 0.9)
+        world.drive(linear, seconds=dice.uniform(0.5, 1.2))
+        assert world.state.mode == "driving"
+        world = start_over(world, kind, dice)
+        world.port.sent.clear()
+        hz = dice.choice((5.0, 10.0, 20.0, 50.0))
+        world.hold(linear, dice.uniform(-1, 1), 1.5, source, hz)
+        lines = [line for _, line in world.port.sent]
+        still = len(lines) > 100 and lines[0] == ZERO and set(lines) == {ZERO}
+        told = world.state.mode == "ready" and f"neutral first: {source}" in world.state.reason
+        kept += still and told
+        seen[kind] += still and told
+        world.run(0.3)
+        world.drive(linear, seconds=0.2, source=source)
+        assert world.state.mode == "driving"  # it is not simply dead
+        world.send(0.0, source=source)
+        world.run(1.5)
+    print(f"\nneutral first: {kept} of {count}; {dict(seen)}")
+    assert kept == count
+
+
+# c. blackholes
+
+NORMAL_NS = 3_000_000
+"""The normal delay, and its drift over the longest hole: what a relative age cannot see."""
+
+
+def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int, int]:
+    """A network that holds everything back and then lets go: what was stale, obeyed, accepted.
+
+    What is sent while it would be stale on arrival says backward, everything else forward.
+    """
+    timeout_ns, pause_ns = NS_PER_S // 4, int(NS_PER_S / dice.choice((20, 30, 50)))
+    world = quiet_bus(World())
+    world.run(0.3)
+    clock_ns = dice.randrange(2 * DAY_NS)
+    queue: deque[int] = deque()
+    start_ns = world.now_ns
+    hole_ns = start_ns + dice.randrange(NS_PER_S // 2, NS_PER_S)
+    end_ns = hole_ns + int(seconds * NS_PER_S)
+    # The drain lets through so many lines for each that is sent.
+    pace = dice.uniform(1.2, 6.0)
+    next_ns, credit, stale, accepted, drained_ns = start_ns, 0.0, 0, 0, 0
+    counters = world.loop.robot.counters
+    first = True
+    while not drained_ns or world.now_ns < drained_ns + NS_PER_S:
+        queue.append(next_ns)
+        next_ns += pause_ns
+        if not hole_ns <= world.now_ns < end_ns:
+            credit = min(credit + (pace if slow else 1e9), len(queue))
+            while queue and credit >= 1.0:
+                credit -= 1.0
+                sent_ns = queue.popleft()
+                old = world.now_ns - sent_ns > timeout_ns + NORMAL_NS
+                obeyed = counters["commands"]
+                world.send(0.0 if first else -0.5 if old else 0.5, stamp_ns=sent_ns + clock_ns)
+                first = False
+                if old and (slow or dice.random() < 0.5):  # one by one, or all in one step
+                    world.loop.wake(world.instant, tick=False)
+                    accepted += counters["commands"] - obeyed
+                stale += old
+            if world.now_ns >= end_ns and not queue and not drained_ns:
+                drained_ns = world.now_ns
+        world.run((max(next_ns, world.now_ns) - world.now_ns) / NS_PER_S + 1e-9)
+    backward = sum(min(wheels(line)) < 0 for _, line in world.port.sent)
+    assert world.state.mode == "driving"  # by what is fresh again
+    return stale, backward, accepted
+
+
+@pytest.mark.parametrize("count", [10, long(200, 1800)])
+def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
+    dice, stale, backward, accepted = random.Random(3), 0, 0, 0
+    for trial in range(count):
+        held, moved, counted = blackhole(dice, trial % 2 == 1, dice.uniform(0.3, 15.0))
+        stale, backward, accepted = stale + held, backward + moved, accepted + counted
+    print(
+        f"\nblackholes: {count}, {stale} stale commands held back, {accepted} accepted, "
+        f"{backward} lines moved by them"
+    )
+    assert stale > 10 * count
+    assert (accepted, backward) == (0, 0)
+
+
+# d. a day
+
+MODES = {"inactive", "waiting", "ready", "driving", "stopped", "fault"}
+TROUBLES = (
+    "mute", "reset", "noise", "partial_line", "unplug", "block", "stall", "stuck", "bias",
+    "bad commands", "clock", "stop",
+)  # fmt: skip
+
+
+def trouble(world: World, kind: str, dice: random.Random) -> str:
+    """One fault, from begin to end; a word the reason must have held while it lasted, or ""."""
+    seconds, wheel, linear = dice.uniform(0.5, 4.0), dice.randrange(4), 0.5
+    if kind == "mute":
+        with world.mcu.mute():
+            world.hold(linear, seconds=seconds)
+            return _word(world, "fallen silent")
+    if kind in ("noise", "partial_line"):
+        with getattr(world.mcu, kind)():
+            world.hold(linear, seconds=seconds)
+            return _word(world, "fallen silent")
+    if kind == "reset":
+        world.mcu.reset(world.now_ns)
+        world.hold(linear, seconds=1.0)
+        return _word(world, "fallen silent")
+    if kind == "unplug":
+        world.port.unplug()
+        world.hold(linear, seconds=seconds)
+        found = _word(world, "reopened")
+        world.mcu = FakeMcu(world.config, world.now_ns)
+        world.port.plug(world.mcu)
+        return found
+    if kind == "block":
+        world.port.blocked = True
+        world.hold(linear, seconds=seconds)
+        world.port.blocked = False
+        return _word(world, "fallen silent")
+    if kind == "stall":
+        world.send(linear)
+        world.stall(seconds / 4)
+        return ""
+    if kind in ("stuck", "bias"):
+        gain = dice.choice((-1.0, 3.0, 9.0))
+        with world.mcu.stuck_encoder(wheel) if kind == "stuck" else world.mcu.bias(wheel, gain):
+            world.hold(linear, seconds=2.5)
+            return _word(world, "wheel" if kind == "stuck" or gain < 9 else "rad/s is over")
+    if kind == "bad commands":
+        world.put("cmd/app", b"{")
+        world.put("cmd/*", b"{}")
+        world.put("wheel_cmd/app", b"\x80")
+        world.send(1e300, -1e300, source="stranger")
+        world.run(seconds)
+        return _word(world, "no commands")
+    if kind == "clock":
+        world.wall_offset_ns += dice.choice((-1, 1)) * dice.randrange(DAY_NS)
+        world.hold(linear, seconds=seconds)
+        return _word(world, "commanded by app")
+    world.put("stop", b"")
+    world.hold(linear, seconds=seconds)
+    return _word(world, "stopped by request")
+
+
+def _word(world: World, word: str) -> str:
+    state = world.state
+    return "" if word in state.reason else f"{word!r} is not in {state.mode}: {state.reason!r}"
+
+
+def recover(world: World) -> None:
+    """Whatever it was: clear, a zero, and the robot drives; then it is ready."""
+    world.run(3.0)  # a board that was reset boots for 2 s
+    if world.state.mode in ("stopped", "fault"):
+        assert world.call("clear").success
+    world.drive(0.3, seconds=0.5)
+    assert world.state.mode == "driving", world.state.reason
+    world.send(0.0)
+    world.run(1.0)
+    assert world.state.mode == "ready", world.state.reason
+
+
+def empty(world: World) -> int:
+    """Drop what only the test keeps; the blocks of memory that are left in use."""
+    for kept in (world.events, world.bus.replies, world.bus.finished, world.port.sent):
+        kept.clear()
+    world.mcu.heard.clear()
+    gc.collect()
+    return sys.getallocatedblocks()
+
+
+@pytest.mark.parametrize("minutes", [10, long(24 * 60, 3600)])
+def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memory(
+    minutes: int,
+) -> None:
+    dice, world, unexplained = random.Random(4), quiet_bus(World()), list[str]()
+    kinds, modes = Counter[str](), Counter[str]()
+    settled, faults = min(60, minutes // 2), minutes if minutes > 60 else len(TROUBLES)
+    baseline = last = 0
+    began = time.perf_counter()
+
+    def watch(outputs: Outputs) -> None:
+        modes[outputs.mode] += 1
+        if outputs.mode not in MODES or len(outputs.reason) < 6:
+            unexplained.append(f"{outputs.mode}: {outputs.reason!r}")
+        if (outputs.mode == "driving") != outputs.reason.startswith("driving"):
+            unexplained.append(f"{outputs.mode} says {outputs.reason!r}")
+
+    world.watch = watch
+    world.run(0.3)
+    for minute in range(faults):
+        start_ns = world.now_ns
+        world.drive(dice.uniform(0.5, 0.9), dice.uniform(-0.5, 0.5), dice.uniform(1.5, 20.0))
+        kind = TROUBLES[minute % len(TROUBLES)]
+        kinds[kind] += 1
+        wrong = trouble(world, kind, dice)
+        if wrong:
+            unexplained.append(f"minute {minute}, {kind}: {wrong}")
+        recover(world)
+        world.run(60.0 * minutes / faults - (world.now_ns - start_ns) / NS_PER_S)
+        last = empty(world)
+        if minute + 1 == settled:
+            baseline = last
+    drift = last / baseline - 1
+    print(
+        f"\na day: {minutes} min with {kinds.total()} faults in {time.perf_counter() - began:.0f} s"
+        f", memory drift {drift:+.3%} ({baseline} -> {last} blocks), "
+        f"{len(unexplained)} unexplained states; steps by mode {dict(modes)}"
+    )
+    assert not unexplained
+    assert world.state.mode == "ready"
+    assert abs(drift) < 0.01
+
+
+# e. the wall clock
+
+
+def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
+    """Drive about while the wall clock jumps `count` times, or does not."""
+    dice, clock = random.Random(5), random.Random(6)
+    world, ticks, trace = quiet_bus(World()), 0, [0, 0]
+
+    def watch(outputs: Outputs) -> None:
+        nonlocal ticks
+        ticks += outputs.tick
+        for sample in outputs.samples:
+            told = (sample.at.mono_ns, msgspec.to_builtins(sample.pose), sample.positions)
+            trace[0] = zlib.crc32(repr(told).encode(), trace[0])
+        if outputs.line is not None:
+            trace[1] = zlib.crc32(b"%d %s" % (outputs.now.mono_ns, outputs.line), trace[1])
+
+    world.watch = watch
+    world.run(0.3)
+    world.send(0.0, stamp_ns=world.now_ns)
+    for _ in range(count):
+        linear, angular = dice.uniform(-1, 1), dice.uniform(-3, 3)
+        for _ in range(dice.randint(1, 12)):
+            world.send(linear, angular, stamp_ns=world.now_ns)
+            world.run(dice.uniform(0.01, 0.1))
+        step_ns = clock.choice((-DAY_NS, DAY_NS, clock.randrange(-DAY_NS, DAY_NS)))
+        world.wall_offset_ns += step_ns if jumps else 0
+    world.run(1.0)
+    missed = world.loop.robot.counters["missed_periods"]
+    return ticks, missed, trace, world.state.counters
+
+
+@pytest.mark.parametrize("count", [30, long(5_000, 1800)])
+def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count: int) -> None:
+    undisturbed, disturbed = walk(count, jumps=False), walk(count, jumps=True)
+    ticks, missed = disturbed[:2]
+    print(
+        f"\nwall clock: {count} jumps of up to a day, {undisturbed[0] - ticks + missed} of {ticks} "
+        f"ticks lost, odometry {'identical' if disturbed[2] == undisturbed[2] else 'DIFFERENT'}"
+    )
+    assert missed == 0
+    assert disturbed == undisturbed

@@ -1,0 +1,542 @@
+"""Faults of the processes, the kernel and the serial line (SAFETY section 2), on the real daemon.
+
+The faults of the bus are in `test_faults_bus.py`. Every promise has a short version here; the full
+count is `pytest -m soak -s tests/system/test_faults.py`, which prints its figures.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import os
+import pty
+import random
+import signal
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.harness import (
+    PLAIN,
+    ZERO,
+    ZERO_LINE,
+    Bus,
+    Daemon,
+    FarPeer,
+    Heard,
+    Peer,
+    Periods,
+    Program,
+    alive_at,
+    environment,
+    free_endpoint,
+    seconds,
+    twist,
+    until,
+    wheels,
+)
+from tests.system.strangers import BUSY, COMMANDER, words
+
+TIMEOUT_S = 0.25
+TICK_S = 0.01
+WIRE_S = 33 * 10 / 115200
+"""A line's time on the wire at the default baud rate, 2.86 ms."""
+
+SLACK_S = 0.1
+"""What a noisy two-core machine may add to a bound before a test calls it broken."""
+
+ZERO_TEXT = ZERO_LINE.strip()
+
+
+def commander(daemon: Daemon, speed: float, source: str = "app", zeros: int = 1) -> Program:
+    """A process that sends stamped commands at 20 Hz until it is ended."""
+    return Program(words(COMMANDER, daemon.endpoint, source, speed, zeros), daemon.config.parent)
+
+
+def last_put(program: Program) -> float:
+    """When a commander that has ended sent its last command."""
+    # Killed in the middle of a line, it has said "put" and not yet when.
+    said = [line.split() for line in program.out[-2:]]
+    return max(float(words[1]) for words in said if len(words) == 2)
+
+
+def text(speed: float) -> bytes:
+    """How a line begins that drives straight at so many m/s."""
+    return f"ap{speed / 0.05:05.2f},".encode()
+
+
+def gaps(lines: list[Heard]) -> list[float]:
+    return [after.at - before.at for before, after in itertools.pairwise(lines)]
+
+
+# a commander dies
+
+
+def killed_commanders(tmp_path: Path, count: int) -> list[float]:
+    """Seconds from the last command of a commander that is killed to the first slower line."""
+    rng, found = random.Random(1), []
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon:
+        for _ in range(count):
+            with commander(daemon, 0.1) as driver:
+                peer.awaits(text(0.1), after=time.monotonic())
+                time.sleep(rng.uniform(0.0, 0.1))  # killed at any moment between two commands
+                driver.signal(signal.SIGKILL)
+                driver.ended(5.0)
+            sent = last_put(driver)
+            until(
+                lambda: peer.lines[-1].line == ZERO_TEXT,
+                5.0,
+                "at rest",
+            )
+            lines = peer.lines
+            steady = max(n for n, h in enumerate(lines) if h.line.startswith(text(0.1)))
+            found.append(lines[steady + 1].at - sent)
+    exact = sum(took <= TIMEOUT_S + TICK_S for took in found)
+    print(
+        f"SIGKILL of a commander, last put -> ramp on the wire: {exact} of {count} within 260 ms; "
+        f"min {min(found) * 1e3:.1f} median {statistics.median(found) * 1e3:.1f} "
+        f"max {max(found) * 1e3:.1f} ms"
+    )
+    return found
+
+
+def test_when_a_commander_is_killed_the_ramp_starts_within_its_timeout_and_a_tick(
+    tmp_path: Path,
+) -> None:
+    found = killed_commanders(tmp_path, 3)
+    assert max(found) <= TIMEOUT_S + TICK_S + SLACK_S
+    assert statistics.median(found) <= TIMEOUT_S + TICK_S + 0.005
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
+def test_when_200_commanders_are_killed_200_ramps_start_in_time(tmp_path: Path) -> None:
+    found = killed_commanders(tmp_path, 200)
+    assert max(found) <= TIMEOUT_S + TICK_S + SLACK_S
+    assert statistics.median(found) <= TIMEOUT_S + TICK_S + 0.005
+
+
+TWO = [
+    {"name": "first", "priority": 50, "timeout": 0.25},
+    {"name": "second", "priority": 50, "timeout": 0.25},
+    {"name": "third", "priority": 10, "timeout": 0.25},
+]
+
+
+@contextmanager
+def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
+    """A daemon with two sources of one priority and one below them."""
+    rows = "".join(
+        f'[[commands.sources]]\nname = "{row["name"]}"\npriority = {row["priority"]}\n'
+        f"timeout = {row['timeout']}\n"
+        for row in TWO
+    )
+    config, endpoint = where / "sources.toml", free_endpoint()
+    config.write_text(
+        f'[mcu]\nport = "{peer.path}"\n[bus]\nlisten = ["{endpoint}"]\n{rows}',
+    )
+    with Daemon(where, words=["--config", str(config)], endpoint=endpoint) as daemon:
+        yield daemon
+
+
+@pytest.mark.parametrize("successor", ["second", "third"])
+def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command(
+    tmp_path: Path, successor: str
+) -> None:
+    with (
+        FarPeer(tmp_path) as peer,
+        three_sources(tmp_path, peer) as daemon,
+        Bus(daemon.endpoint) as bus,
+        commander(daemon, 0.3, "first") as first,
+    ):
+        peer.awaits(text(0.3))
+        with commander(daemon, 0.1, successor) as other:
+            until(lambda: len(other.out) > 5, 5.0, "the other one commands")
+            waits = {one["name"]: one["waits_for"] for one in bus.state()["sources"]}
+            assert "first" in waits[successor]
+            assert peer.lines[-1].line.startswith(text(0.3))
+            first.signal(signal.SIGKILL)
+            first.ended(5.0)
+            sent = last_put(first)
+            reached = peer.awaits(text(0.1), after=sent)
+            later = peer.since(sent, reached.at)
+            slower = next(h for h in later if not h.line.startswith(text(0.3)))
+            ramp = [wheels(heard.line)[0] for heard in later]
+            assert bus.state()["source"] == successor
+    print(f"{successor} takes over {slower.at - sent:.3f} s after the last command")
+    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S
+    assert ramp == sorted(ramp, reverse=True)
+    assert ramp[-1] == 2.0, "it never fell below what the successor asks for"
+
+
+# the cable
+
+
+def kinds_of(pid: int) -> tuple[int, int]:
+    """File descriptors and threads of a process."""
+    return len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task"))
+
+
+@contextmanager
+def taken(name: str) -> Iterator[None]:
+    """Hold the pty of this name, so that whoever asks for one now gets another."""
+    kept: list[tuple[int, int]] = []
+
+    def hold() -> bool:
+        # Free once the daemon has closed its end, too; others may be free before it.
+        some = [pty.openpty() for _ in range(8)]
+        for ends in some:
+            if os.ttyname(ends[1]) == name:
+                kept.append(ends)
+            else:
+                for end in ends:
+                    os.close(end)
+        return bool(kept)
+
+    until(hold, 5.0, f"{name} is free")
+    try:
+        yield
+    finally:
+        for end in kept[0]:
+            os.close(end)
+
+
+def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], list[float]]:
+    """Seconds until an unplug is seen in state, and from replug to the first zero line."""
+    noticed, zeros = [], []
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+    ):
+        bus.linked()
+        before = (0, 0)
+        for cycle in range(cycles + 1):
+            name = os.readlink(peer.path)
+            pulled = peer.unplug()
+            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
+            with taken(name):
+                peer.plug()
+            plugged = time.monotonic()
+            assert os.readlink(peer.path) != name
+            first = until(lambda: peer.lines[1:2], 5.0, "the first line")[0]
+            states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
+            assert first.line == ZERO_LINE
+            if cycle == 0:
+                # The first loss may start a thread that stays.
+                before = kinds_of(daemon.pid)
+                continue
+            noticed.append(down.at - pulled)
+            zeros.append(first.at - plugged)
+        until(
+            lambda: kinds_of(daemon.pid) <= before,
+            3.0,
+            f"descriptors and threads were {before}, are {kinds_of(daemon.pid)}",
+        )
+        after = kinds_of(daemon.pid)
+    print(
+        f"{cycles} unplugs: seen in state after median {statistics.median(noticed) * 1e3:.1f} "
+        f"max {max(noticed) * 1e3:.1f} ms; replug under a new name -> first zero line median "
+        f"{statistics.median(zeros):.3f} max {max(zeros):.3f} s; file descriptors and threads "
+        f"{before} -> {after}"
+    )
+    assert after[0] <= before[0]
+    assert after[1] <= before[1]
+    return noticed, zeros
+
+
+def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without_leaks(
+    tmp_path: Path, peer: Peer
+) -> None:
+    noticed, zeros = replugged(tmp_path, peer, 5)
+    assert statistics.median(noticed) <= 0.02
+    assert max(noticed) <= 0.02 + SLACK_S
+    assert max(zeros) <= 0.5 + SLACK_S
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
+def test_200_replugs_are_found_in_time_and_leak_nothing(tmp_path: Path, peer: Peer) -> None:
+    noticed, zeros = replugged(tmp_path, peer, 200)
+    assert statistics.median(noticed) <= 0.02
+    assert max(noticed) <= 0.02 + SLACK_S
+    assert max(zeros) <= 0.5 + SLACK_S
+
+
+# nobody reads
+
+
+def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_lines(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.commanding(0.5),
+    ):
+        until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")
+        with peer.deaf():
+            begun, known = time.monotonic(), len(peer.lines)
+            until(lambda: time.monotonic() > begun + 1.0, 5.0, "a second")
+            heard = time.monotonic()
+        until(lambda: len(peer.lines) > known, 5.0, "it reads again")
+        found = [one.line for one in peer.lines[known:] if one.at < heard + 0.005]
+        drive = [line for line in found if line != ZERO_LINE]
+        first_zero = found.index(ZERO_LINE)
+        print(
+            f"deaf for 1 s: {len(found)} lines waited, {len(drive)} of them drive lines "
+            f"(quiet is 10 periods), all {len(found) - first_zero} behind them zeros"
+        )
+        assert set(found[first_zero:]) == {ZERO_LINE}
+        assert len(drive) <= 10 + 2
+        # 10 Hz of zeros.
+        assert len(found) - first_zero <= 10 + 2
+
+
+def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> None:
+    # Feedback goes on, so only the kernel's refusal says that nothing goes out.
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.commanding(0.5) as driver,
+    ):
+        until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")
+        before = bus.state()
+        with peer.deaf():
+            taken, known, begun = peer.stuff(), len(peer.lines), time.monotonic()
+            driver.wish = twist(0.2)
+            while (now := time.monotonic()) < begun + 0.8:
+                # Its own 100 Hz; unheard, it stops as the contract says.
+                peer.say(PLAIN((10.0 if now < begun + 0.3 else 0.0,) * 4))
+                time.sleep(TICK_S)
+            full = bus.state()
+            heard = time.monotonic()
+        until(lambda: len(peer.lines) > known + taken // 2 + 1, 5.0, "it reads again")
+        waited = [
+            one.line for one in peer.lines[known:] if one.line.strip() and one.at < heard + 0.005
+        ]
+        periods = Periods.between(before, full)
+        print(
+            f"full for {heard - begun:.2f} s: the kernel held {taken} bytes of noise, "
+            f"{len(waited)} lines of ours in the first 5 ms, {periods.superseded} superseded, "
+            f"link {full['link']}"
+        )
+        assert full["link"] == "up"
+        assert periods.superseded >= 60
+        assert periods.accounted == pytest.approx(periods.elapsed, abs=2)
+        # Those sent between the last read and the stuffing, a torn one and the newest.
+        assert len(waited) <= 6
+        # Long unheard, the MCU has stopped: we start over from zero.
+        until(lambda: peer.lines[-1].line.startswith(text(0.2)), 5.0, "the newest command")
+
+
+# no processor time
+
+
+def busy(where: Path) -> ExitStack:
+    """Two processes per core that use all they get."""
+    stack = ExitStack()
+    for _ in range(2 * (os.cpu_count() or 1)):
+        stack.enter_context(Program(words(BUSY), where))
+    return stack
+
+
+def starved(tmp_path: Path, length: float) -> None:
+    with (
+        FarPeer(tmp_path) as peer,
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        commander(daemon, 0.3) as driver,
+        bus.follow("cmd_vel_out") as steps,
+        bus.follow("state") as states,
+    ):
+        peer.awaits(text(0.3))
+        with busy(tmp_path):
+            # Published after a step, so that stamp and counters belong together.
+            begun, ended = time.monotonic(), time.monotonic() + length
+            before = states.find(lambda _: True, 5.0, "a state", after=begun).value
+            after = states.find(lambda _: True, length + 5, "a later one", after=ended).value
+            ended = time.monotonic()
+            driver.signal(signal.SIGKILL)
+            driver.ended(5.0)
+            sent = last_put(driver)
+            peer.awaits(ZERO_TEXT, after=sent)
+        lines = peer.since(begun, ended)
+        slower = next(h for h in peer.since(sent) if not h.line.startswith(text(0.3)))
+    stamps = [seconds(step.value["header"]["stamp"]) for step in steps.seen]
+    apart = min(b - a for a, b in itertools.pairwise(stamps))
+    periods, between = Periods.between(before, after), gaps(lines)
+    close = sum(gap < WIRE_S for gap in between)
+    print(
+        f"starved for {length:g} s: {periods.sent} sent, {periods.superseded} superseded, "
+        f"{periods.missed} missed of {periods.elapsed:.0f} periods, "
+        f"{periods.elapsed - periods.accounted:+.1f} unaccounted; steps at least "
+        f"{apart * 1e3:.2f} ms apart; {len(lines)} lines at the other end of the pty, at most "
+        f"{max(between) * 1e3:.1f} ms apart, {close} closer than a line's time; ramp "
+        f"{slower.at - sent:.3f} s after the last command"
+    )
+    assert periods.accounted == pytest.approx(periods.elapsed, abs=2)
+    # Counted, not timed: the kernel's thread that carries bytes through a pty starves as well,
+    # and then hands over several lines at once.
+    assert len(lines) <= 100 * (ended - begun) + 5
+    assert {h.line for h in lines} <= {text(0.3) + b"bp06.00,cp06.00,dp06.00"}
+    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S
+
+
+def test_starved_of_both_cores_every_missed_period_is_counted_and_none_made_up_in_a_burst(
+    tmp_path: Path,
+) -> None:
+    starved(tmp_path, 1.0)
+
+
+@pytest.mark.soak
+def test_starved_of_both_cores_for_60_s(tmp_path: Path) -> None:
+    starved(tmp_path, 60.0)
+
+
+@contextmanager
+def stalled(daemon: Daemon) -> Iterator[None]:
+    """The whole daemon stands still while entered."""
+    daemon.signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        daemon.signal(signal.SIGCONT)
+
+
+def no_burst(lines: list[Heard]) -> float:
+    """The smallest gap; fails when lines came faster than their periods.
+
+    Counted over a tenth of a second: the kernel's thread that carries bytes through a pty may be
+    late itself and hand over two or three lines at once.
+    """
+    for first in lines:
+        assert sum(first.at <= heard.at < first.at + 0.1 for heard in lines) <= 10 + 4
+    return min(gaps(lines))
+
+
+def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_has_gone(
+    tmp_path: Path,
+) -> None:
+    with (
+        FarPeer(tmp_path) as peer,
+        Daemon(tmp_path, peer.path) as daemon,
+        commander(daemon, 0.3) as driver,
+    ):
+        peer.awaits(text(0.3))
+        with stalled(daemon):
+            begun, count = time.monotonic(), len(driver.out)
+            until(lambda: len(driver.out) >= count + 3, 5.0, "commands pile up")
+            driver.signal(signal.SIGKILL)
+            driver.ended(5.0)
+            until(lambda: time.monotonic() > begun + 0.5, 5.0, "half a second")
+            woken = time.monotonic()
+        until(lambda: len(peer.since(woken)) > 40, 5.0, "40 lines")
+        print(f"stall: smallest gap after it {no_burst(peer.since(woken)) * 1e3:.2f} ms")
+        assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
+
+
+def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_by_the_ramp(
+    tmp_path: Path,
+) -> None:
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, commander(daemon, 0.3):
+        peer.awaits(text(0.3))
+        with stalled(daemon):
+            begun = time.monotonic()
+            until(lambda: time.monotonic() > begun + 0.5, 5.0, "half a second")
+            woken = time.monotonic()
+        peer.awaits(text(0.3), after=woken)
+        after = peer.since(woken)
+        assert no_burst(after) >= 0.0
+        assert after[0].line == ZERO_TEXT
+        ramp = [wheels(heard.line)[0] for heard in after]
+        assert max(b - a for a, b in itertools.pairwise(ramp)) <= 20 * 0.05 + 0.01
+        assert ramp == sorted(ramp)
+
+
+def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first(
+    tmp_path: Path,
+) -> None:
+    # Shorter than the 2 s after which clients give the daemon up and connect anew.
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, commander(daemon, 0.3):
+        peer.awaits(text(0.3))
+        with stalled(daemon):
+            begun = time.monotonic()
+            until(lambda: time.monotonic() > begun + 1.2, 5.0, "seconds")
+            woken = time.monotonic()
+        with Bus(daemon.endpoint) as bus:
+            until(lambda: "neutral first" in bus.state()["reason"], 5.0, "what it waits for")
+            until(lambda: len(peer.since(woken)) > 40, 5.0, "40 lines")
+            assert no_burst(peer.since(woken)) >= 0.0
+            assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
+            bus.put("cmd/app", ZERO)
+            peer.awaits(text(0.3), after=woken)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_after_50_stalls_of_any_length_the_first_line_is_zero_and_none_comes_in_a_burst(
+    tmp_path: Path,
+) -> None:
+    rng, least, resumed = random.Random(2), 1.0, 0
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon:
+        for _ in range(50):
+            with commander(daemon, 0.2):
+                peer.awaits(text(0.2), after=time.monotonic())
+                with stalled(daemon):
+                    begun, length = time.monotonic(), rng.uniform(0.3, 3.0)
+                    until(lambda: time.monotonic() > begun + length, 9.0, "a stall")  # noqa: B023
+                    woken = time.monotonic()
+                until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")  # noqa: B023
+                lines = peer.since(woken)
+                resumed += lines[0].line != ZERO_TEXT
+                least = min(least, no_burst(lines))
+            until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "at rest")
+    print(f"50 stalls of 0.3 to 3 s: {resumed} resumed a speed, smallest gap {least * 1e3:.2f} ms")
+    assert resumed == 0
+
+
+# output that blocks
+
+
+@contextmanager
+def full_pipe() -> Iterator[int]:
+    """A pipe that is full and that nobody reads: every write to it waits for ever."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    os.set_blocking(writer, False)
+    try:
+        while True:
+            os.write(writer, b".")
+    except BlockingIOError:
+        os.set_blocking(writer, True)
+    try:
+        yield writer
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+@pytest.mark.parametrize("which", ["stdout", "stderr"])
+def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
+    tmp_path: Path, peer: Peer, which: str
+) -> None:
+    with ExitStack() as stack:
+        how: dict[str, Any] = {which: stack.enter_context(full_pipe())}
+        # As a user starts it, with buffered streams.
+        how["env"] = {k: v for k, v in environment().items() if k != "PYTHONUNBUFFERED"}
+        daemon = stack.enter_context(Daemon(tmp_path, peer.path, ready=False, **how))
+        with alive_at(daemon.endpoint, daemon) as alive:
+            until(alive.try_recv, 5.0, "the alive token")
+        until(lambda: ZERO_LINE in peer.session.said(), 5.0, "the first line on the wire")
+        with Bus(daemon.endpoint) as bus:
+            with bus.commanding(0.5):
+                until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")
+            daemon.signal(signal.SIGTERM)
+            assert daemon.ended(5.0) == 0
+        assert peer.last_line() == ZERO_LINE

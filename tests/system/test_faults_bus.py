@@ -1,0 +1,530 @@
+"""Faults of the bus (SAFETY section 2) on the real daemon: partition, flood, stalls, a dead router.
+
+Every promise has a short version here; the full count is
+`pytest -m soak -s tests/system/test_faults_bus.py`, which prints its figures.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import signal
+import socket
+import statistics
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import pytest
+import zenoh
+
+from acsard.client import Client, connect
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    FarPeer,
+    Heard,
+    Periods,
+    Program,
+    Tables,
+    client_config,
+    free_endpoint,
+    resident_kb,
+    seconds,
+    until,
+    wheels,
+)
+from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, words
+
+TIMEOUT_S = 0.25
+TICK_S = 0.01
+SLACK_S = 0.1
+"""What a noisy two-core machine may add to a bound before a test calls it broken. A backlog's ages
+run through all values from seconds down to zero: one that is obeyed too early cannot hide in it."""
+
+PROMPT: dict[str, object] = {
+    "linear_acceleration": 100.0,
+    "linear_deceleration": 100.0,
+    "linear_stop_deceleration": 100.0,
+}
+"""Limits so wide that a command's speed is on the wire in one step: lines say whose they are."""
+
+PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
+"""And what wheels that obey so promptly report is possible."""
+
+
+def gaps(lines: list[Heard]) -> list[float]:
+    return [after.at - before.at for before, after in itertools.pairwise(lines)]
+
+
+def port_of(endpoint: str) -> int:
+    return int(endpoint.rpartition(":")[2])
+
+
+# a partition that heals
+
+Way = Literal["hole", "fast", "slow"]
+
+
+class Proxy:
+    """Between a client and the daemon: a hole swallows what both say, and gives it back later."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._target = port_of(endpoint)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._way: Way = "fast"
+        self._changed = threading.Condition()
+        self._sockets: list[socket.socket] = []
+        self._open = True
+        self.pace = 1 << 16
+        """Bytes per 10 ms while draining slowly."""
+        self.held = 0
+        """Bytes from the client that wait."""
+
+    def __enter__(self) -> Proxy:
+        threading.Thread(target=self._accept, daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open = False
+        self.turn("fast")
+        for one in [self._listener, *self._sockets]:
+            try:
+                one.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass  # closed by the other side
+            one.close()
+
+    def turn(self, way: Way) -> None:
+        """From now on let nothing through, or all at once, or all at `pace`."""
+        with self._changed:
+            self._way = way
+            self._changed.notify_all()
+
+    def _accept(self) -> None:
+        while self._open:
+            try:
+                client, _ = self._listener.accept()
+                daemon = socket.create_connection(("127.0.0.1", self._target))
+            except OSError:
+                return
+            for one in (client, daemon):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._sockets += [client, daemon]
+            for source, sink, counted in ((client, daemon, True), (daemon, client, False)):
+                buffer = bytearray()
+                ended = threading.Event()
+                for work in (self._take, self._give):
+                    threading.Thread(
+                        target=work, args=(source, sink, buffer, ended, counted), daemon=True
+                    ).start()
+
+    def _take(
+        self,
+        source: socket.socket,
+        sink: socket.socket,
+        buffer: bytearray,
+        ended: threading.Event,
+        counted: bool,
+    ) -> None:
+        while True:
+            try:
+                data = source.recv(65536)
+            except OSError:
+                data = b""
+            with self._changed:
+                buffer += data
+                if counted:
+                    self.held += len(data)
+                if not data:
+                    ended.set()
+                self._changed.notify_all()
+            if not data:
+                return
+
+    def _give(
+        self,
+        source: socket.socket,
+        sink: socket.socket,
+        buffer: bytearray,
+        ended: threading.Event,
+        counted: bool,
+    ) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._way != "hole" and (buffer or ended.is_set()), timeout=None
+                )
+                most = self.pace if counted and self._way == "slow" else len(buffer)
+                data = bytes(buffer[:most])
+                del buffer[:most]
+                if counted:
+                    self.held -= len(data)
+            try:
+                sink.sendall(data)
+                if not data:
+                    sink.shutdown(socket.SHUT_WR)
+            except OSError:
+                return
+            if not data:
+                return
+            if self._way == "slow" and counted:
+                time.sleep(0.01)
+
+
+class Numbered:
+    """A stamped commander at 50 Hz whose every command has a speed of its own."""
+
+    COUNT = 400
+    """Speeds before they repeat: 8 s, longer than any hole and its drain."""
+
+    def __init__(self, client: Client) -> None:
+        self.sent: list[list[float]] = [[] for _ in range(self.COUNT)]
+        self._client = client
+        self._leave = threading.Event()
+        self._thread = threading.Thread(target=self._send)
+
+    def __enter__(self) -> Numbered:
+        self._client.send(0.0)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._leave.set()
+        self._thread.join()
+
+    def _send(self) -> None:
+        for number in itertools.cycle(range(self.COUNT)):
+            self._client.send(0.1 + 0.0005 * number)
+            self.sent[number].append(time.monotonic())
+            if self._leave.wait(0.02):
+                return
+
+    def age(self, heard: Heard) -> float | None:
+        """How old the command of this line was when it appeared; None for one of no command."""
+        number = round(wheels(heard.line)[0] * 100) - 200
+        if not 0 <= number < self.COUNT:
+            return None
+        before = [at for at in self.sent[number] if at <= heard.at + 0.05]
+        return heard.at - before[-1] if before else None
+
+
+class Hole(NamedTuple):
+    """What came of one partition."""
+
+    way: Way
+    length: float
+    held: int
+    refused: int
+    obeyed: int
+    stale: int
+    oldest: float
+    resumed: float
+
+
+def appeared(lines: list[Heard]) -> list[Heard]:
+    """The first line of each new command."""
+    return [b for a, b in itertools.pairwise(lines) if b.line != a.line]
+
+
+def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
+    """Partitions of so many seconds one after the other, each drained one way."""
+    where.mkdir(exist_ok=True)
+    found: list[Hole] = []
+    with (
+        FarPeer(where) as peer,
+        Daemon(where, peer.path, {"limits": PROMPT, "feedback": PROMPT_FEEDBACK}) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Proxy(daemon.endpoint) as proxy,
+        connect(proxy.endpoint) as client,
+        Numbered(client) as numbered,
+    ):
+
+        def driving(after: float) -> Heard | None:
+            lines = appeared(peer.since(after))
+            return next((h for h in lines if (numbered.age(h) or 9.0) < 0.1), None)
+
+        for way, length in ways:
+            start = time.monotonic()
+            until(lambda: driving(start), 15.0, "it drives")  # noqa: B023
+            refused = bus.count("command_stale")
+            proxy.turn("hole")
+            begun = time.monotonic()
+            until(lambda: time.monotonic() > begun + length, length + 5, "a hole")  # noqa: B023
+            held = proxy.held
+            # Twice as fast as it came: the drain takes as long as the hole did.
+            proxy.pace = max(1, round(2 * held / length * 0.01))
+            healed = time.monotonic()
+            proxy.turn("slow" if way == "slow" else "fast")
+            again = until(lambda: driving(healed), 20.0, "it drives again")  # noqa: B023
+            until(lambda: proxy.held < 2000, 20.0, "all is through")
+            proxy.turn("fast")
+            lines = appeared(peer.since(begun + TIMEOUT_S))
+            ages = [age for heard in lines if (age := numbered.age(heard)) is not None]
+            found.append(
+                Hole(
+                    way,
+                    length,
+                    held,
+                    bus.count("command_stale") - refused,
+                    len(ages),
+                    sum(age > TIMEOUT_S + TICK_S + SLACK_S for age in ages),
+                    max(ages),
+                    again.at - healed,
+                )
+            )
+    return found
+
+
+def told(found: list[Hole]) -> None:
+    for way in ("fast", "slow"):
+        these = [hole for hole in found if hole.way == way]
+        print(
+            f"{len(these)} holes of {min(h.length for h in these):.1f} to "
+            f"{max(h.length for h in these):.1f} s drained {way}: "
+            f"{sum(h.held for h in these)} bytes held, {sum(h.refused for h in these)} commands "
+            f"refused as stale, {sum(h.obeyed for h in these)} obeyed, "
+            f"{sum(h.stale for h in these)} of them stale, oldest when it appeared "
+            f"{max(h.oldest for h in these) * 1e3:.0f} ms; driving again median "
+            f"{statistics.median(h.resumed for h in these):.2f} max "
+            f"{max(h.resumed for h in these):.2f} s after the heal"
+        )
+
+
+def test_after_a_partition_heals_fast_or_slowly_no_stale_command_is_obeyed(
+    tmp_path: Path,
+) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        both = pool.map(
+            lambda way: holes(tmp_path / way, [(way, 1.0)]), tuple[Way, Way](("fast", "slow"))
+        )
+        found = list(itertools.chain.from_iterable(both))
+    told(found)
+    assert [hole.stale for hole in found] == [0, 0]
+    assert all(hole.held > 4000 for hole in found), "a backlog came back"
+    assert all(hole.refused > 0 for hole in found), "and was refused"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+def test_over_200_partitions_no_stale_command_is_obeyed(tmp_path: Path) -> None:
+    rng = random.Random(3)
+    plans: list[list[tuple[Way, float]]] = [
+        [(("fast", "slow")[n % 2], rng.uniform(1.0, 3.0)) for n in range(67)] for _ in range(3)
+    ]
+    with ThreadPoolExecutor(3) as pool:
+        lots = pool.map(holes, [tmp_path / str(n) for n in range(3)], plans)
+        found = list(itertools.chain.from_iterable(lots))
+    told(found)
+    assert len(found) >= 200
+    assert sum(hole.stale for hole in found) == 0
+
+
+# a flood
+
+
+SLOPE = 0.5
+BASE = 0.25
+
+
+def flooded(where: Path, length: float) -> list[float]:
+    """Ages in s of the commands obeyed in a flood, by the speeds applied and the steps' stamps.
+
+    Not by the lines at the other end of the pty: the kernel's thread that carries them starves on
+    a machine that a flood keeps busy, up to making the link stale; the robot then stands, and
+    steps that stand or rise from there obey no command's speed yet.
+    """
+    limits = PROMPT | {"linear_speed": 10.0, "wheel_speed": 99.0}
+    feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.9}
+    with (
+        FarPeer(where) as peer,
+        Daemon(where, peer.path, {"limits": limits, "feedback": feedback}) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("cmd_vel_out") as applied,
+        bus.follow("state") as states,
+    ):
+        bus.linked()
+        before, memory = bus.state(), resident_kb(daemon.pid)
+        with Program(words(CODED_FLOOD, daemon.endpoint, BASE, SLOPE, length), where) as flood:
+            begun = float(flood.says("flooding").split()[1])
+            count = int(flood.says("flooded").split()[1])
+            assert flood.ended(5.0) == 0
+        after, grown = bus.state(), resident_kb(daemon.pid) - memory
+        start = begun + time.time() - time.monotonic()
+        steps = [
+            (seconds(step.value["header"]["stamp"]) - start, step.value["twist"]["linear"]["x"])
+            for step in applied.seen
+        ]
+    stale = sum(seen.value["link"] == "stale" and seen.at > begun for seen in states.seen)
+    stood = 0.0
+    ages = []
+    for at, speed in steps:
+        if speed < BASE:
+            stood = at
+        elif at < length and at > stood + 0.1:
+            ages.append(at - (speed - BASE) / SLOPE)
+    ordered, periods = sorted(ages), Periods.between(before, after)
+    taken = after["counters"]["commands"] - before["counters"].get("commands", 0)
+    print(
+        f"flood of {count / length:.0f}/s for {length:g} s, {taken} commands taken: age of the "
+        f"one obeyed p50 {statistics.median(ages) * 1e3:.1f} "
+        f"p99 {ordered[int(0.99 * len(ages))] * 1e3:.1f} max {ordered[-1] * 1e3:.1f} ms "
+        f"(n={len(ages)}, {sum(age > 0.02 for age in ages)} over 20 ms); "
+        f"{periods.missed} of {periods.elapsed:.0f} periods missed, memory {grown:+d} kB, "
+        f"{stale} states with a stale link"
+    )
+    assert count > 10_000 * length
+    assert periods.missed <= 0.03 * periods.elapsed + 1
+    assert grown < 10_000
+    assert after["mode"] != "fault"
+    return ages
+
+
+def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
+    ages = flooded(tmp_path, 1.5)
+    assert len(ages) > 100
+    assert statistics.median(ages) <= 0.02
+    assert max(ages) <= 0.02 + SLACK_S
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
+    ages = []
+    for number in range(7):
+        where = tmp_path / str(number)
+        where.mkdir()
+        ages += flooded(where, 9.0)
+    late = sum(age > 0.02 for age in ages)
+    print(f"{len(ages)} steps in floods: {late} with a command older than 20 ms, "
+          f"max {max(ages) * 1e3:.1f} ms")  # fmt: skip
+    assert late <= 0.01 * len(ages)
+    assert max(ages) <= 0.02 + SLACK_S
+
+
+# subscribers that stand still
+
+
+def unsent(port: int) -> list[int]:
+    """Bytes the kernel holds for each client of a local port."""
+    rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    mine = [row for row in rows if int(row[1].partition(":")[2], 16) == port and row[3] == "01"]
+    return [int(row[4].partition(":")[0], 16) for row in mine]
+
+
+def filled(daemon: Daemon, filler: Bus) -> int:
+    """The bytes held for stopped clients when there is no room for more, else 0.
+
+    What the daemon says by itself would take a minute to fill it, so another client helps.
+    """
+    before = sorted(unsent(port_of(daemon.endpoint)))[-4:]
+    for _ in range(40):
+        filler.session.put("acsard/acsar/filler", b"." * 50_000)
+    time.sleep(0.3)
+    now = sorted(unsent(port_of(daemon.endpoint)))[-4:]
+    return sum(now) if now == before and min(now) > 0 else 0
+
+
+def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[float]]:
+    """Longest gaps between lines, a round each: without, and with, four stopped subscribers."""
+    without, stopped = [], []
+    with FarPeer(where) as peer, Daemon(where, peer.path) as daemon, ExitStack() as stack:
+        peer.awaits(b"ap00.00")
+
+        def longest() -> float:
+            begun = time.monotonic()
+            until(lambda: time.monotonic() > begun + length, length + 5, "a while")
+            return max(gaps(peer.since(begun)))
+
+        endpoint = f"{daemon.endpoint}#so_rcvbuf=4096"
+        four = [stack.enter_context(Program(words(HOARDER, endpoint), where)) for _ in range(4)]
+        for one in four:
+            one.says("listening")
+        filler = stack.enter_context(Bus(daemon.endpoint))
+        for _ in range(rounds):
+            without.append(longest())
+            for one in four:
+                one.signal(signal.SIGSTOP)
+            begun = time.monotonic()
+            held = until(lambda: filled(daemon, filler), 60.0, "the kernel takes no more for them")
+            took = time.monotonic() - begun
+            stopped.append(longest())
+            with Bus(daemon.endpoint) as healthy, healthy.follow("odom") as odom:
+                odom.find(lambda _: True, 2.0, "odometry for one that listens")
+            for one in four:
+                one.signal(signal.SIGCONT)
+    print(
+        f"4 stopped subscribers, {held} bytes unsent after {took:.1f} s; longest gap "
+        f"between lines in {rounds} x {length:g} s: without median "
+        f"{statistics.median(without) * 1e3:.2f} max {max(without) * 1e3:.2f}, "
+        f"with median {statistics.median(stopped) * 1e3:.2f} max {max(stopped) * 1e3:.2f} ms"
+    )
+    return without, stopped
+
+
+def test_four_stopped_subscribers_hold_up_no_line(tmp_path: Path) -> None:
+    without, stopped = hoarded(tmp_path, 1, 1.0)
+    assert max(stopped) <= max(without) + 0.005 + SLACK_S
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_four_stopped_subscribers_hold_up_no_line_in_20_rounds(tmp_path: Path) -> None:
+    without, stopped = hoarded(tmp_path, 20, 2.0)
+    assert statistics.median(stopped) <= statistics.median(without) + 0.005
+    assert max(stopped) <= max(without) + 0.005 + SLACK_S
+
+
+# a router dies
+
+
+def rerouted(where: Path, cycles: int) -> list[float]:
+    """Seconds from a router's return to odometry at a client behind it."""
+    routed, found, worst = free_endpoint(), [], 0.0
+    with ExitStack() as stack:
+        peer = stack.enter_context(FarPeer(where))
+        router = stack.enter_context(Program(words(ROUTER, routed), where))
+        router.says("routing")
+        config: Tables = {"bus": {"connect": [routed]}}
+        daemon = stack.enter_context(Daemon(where, peer.path, config))
+        stack.enter_context(Program(words(COMMANDER, daemon.endpoint, "app", 0.2, 1), where))
+        with Bus(routed) as remote, remote.follow("odom") as odom:
+            odom.find(lambda _: True, 5.0, "odometry behind the router")
+        steady = peer.awaits(b"ap04.00").at
+        for _ in range(cycles):
+            router.signal(signal.SIGKILL)
+            router.ended(5.0)
+            router = stack.enter_context(Program(words(ROUTER, routed), where))
+            back = float(router.says("routing").split()[1])
+            with zenoh.open(client_config(routed)) as session:
+                samples = session.declare_subscriber(
+                    "acsard/acsar/odom", zenoh.handlers.FifoChannel(100)
+                )
+                until(samples.try_recv, 10.0, "odometry behind the new router")
+                found.append(time.monotonic() - back)
+        lines = peer.since(steady)
+        worst = max(gaps(lines))
+        assert {heard.line[:7] for heard in lines} == {b"ap04.00"}, "it drove on all the time"
+    print(
+        f"router killed {cycles} times: back -> odometry behind it median "
+        f"{statistics.median(found):.2f} max {max(found):.2f} s; longest gap between lines of the "
+        f"local drive {worst * 1e3:.1f} ms"
+    )
+    assert worst <= 0.06
+    return found
+
+
+def test_a_router_that_dies_and_returns_does_not_touch_local_driving(tmp_path: Path) -> None:
+    assert max(rerouted(tmp_path, 1)) <= 2.0
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_a_router_dies_and_returns_50_times(tmp_path: Path) -> None:
+    found = rerouted(tmp_path, 50)
+    assert statistics.median(found) <= 0.5
+    assert max(found) <= 2.0
