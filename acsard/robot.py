@@ -131,7 +131,7 @@ class Robot:
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
-            self._arbiter.require_neutral()
+            self._arbiter.require_neutral(inputs.now.mono_ns)
         if link != before:
             events.append(_link_event(link))
         if link != "up":
@@ -141,7 +141,7 @@ class Robot:
             self._before = (self._limiter.state, inputs.now.mono_ns)
             self._life.link(up=False)
             if link == "down" and before != "down":
-                self._arbiter.require_neutral()
+                self._arbiter.require_neutral(inputs.now.mono_ns)
         else:
             self._life.link(up=True)
         return tuple([sample for line in feedback if (sample := self._believe(line, events))])
@@ -191,18 +191,18 @@ class Robot:
 
     def _obey(self, request: Request, now_ns: int) -> str:
         life, linked = self._life, self.session.link == "up"
+        asked_ns = now_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
             case "stop":
                 return life.stop(now_ns)
             case "clear":
-                asked_ns = now_ns if request.asked_ns is None else request.asked_ns
                 message = life.clear(asked_ns, now_ns, linked)
                 self._sanity.forget()
-                self._arbiter.require_neutral()
+                self._arbiter.require_neutral(asked_ns)
                 return message
             case "activate":
                 if life.activate(linked):
-                    self._arbiter.require_neutral()
+                    self._arbiter.require_neutral(asked_ns)
                 return "active"
             case "deactivate":
                 return life.deactivate()
@@ -216,7 +216,7 @@ class Robot:
 
     def _fault(self, why: str, events: list[Event]) -> None:
         if self._life.fault(why):
-            self._arbiter.require_neutral()
+            self._arbiter.require_neutral(self._limited_ns)
             events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
     # commands

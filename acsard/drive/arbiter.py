@@ -117,10 +117,16 @@ class Arbiter:
         self._commanders = {s.name: _Commander(s) for s in commands.sources}
         self._ranking = sorted(self._commanders.values(), key=lambda c: -c.settings.priority)
         self._holder: _Commander | None = None
+        self._since_ns = 0
         self._freshness = Freshness()
 
-    def require_neutral(self) -> None:
-        """Forget all commands; each source must be neutral once before it drives again."""
+    def require_neutral(self, since_ns: int = 0) -> None:
+        """Forget all commands; each source must be neutral once before it drives again.
+
+        Only what arrived after `since_ns` counts as neutral or as heard: a zero that was under
+        way before the stop was cleared says nothing about now.
+        """
+        self._since_ns = since_ns
         for commander in self._ranking:
             commander.arrived_ns = commander.heard_ns = None
             commander.armed = not self._neutral_first
@@ -140,7 +146,7 @@ class Arbiter:
             )
             if late > commander.timeout_ns:
                 return "stale"
-        if not commander.armed:
+        if not commander.armed and command.arrived_ns >= self._since_ns:
             heard, now_ns = commander.heard_ns, command.arrived_ns
             paused = heard is not None and now_ns - heard > commander.timeout_ns
             commander.armed = paused or twist == REST

@@ -46,6 +46,8 @@ class LineGate:
         self._baud_rate = baud_rate
         self._free_ns = 0
         self._torn = True
+        self.first = True
+        """No whole line has gone yet: the next one must be zeros, whatever is wished by then."""
 
     def may_send(self, now_ns: int, kernel_bytes: int) -> bool:
         """True when the kernel holds nothing and the previous line has left the wire."""
@@ -60,4 +62,6 @@ class LineGate:
         """Record that the kernel took `taken` of `offered` bytes; the rest is dropped."""
         if taken:
             self._torn = taken < offered
+        if taken == offered:
+            self.first = False
         self._free_ns = now_ns + wire_ns(taken, self._baud_rate)

@@ -82,7 +82,8 @@ class SerialPort:
             return "down"
         if not self._gate.may_send(now.mono_ns, self._kernel_bytes()):
             return "superseded"
-        data = self._gate.prefix + line
+        instead = self._gate.first and line != self._stop
+        data = self._gate.prefix + (self._stop if instead else line)
         try:
             taken = os.write(self._fd, data)
         except BlockingIOError:
@@ -92,7 +93,7 @@ class SerialPort:
             return "down"
         # From the moment it went, not from the start of the step that made it.
         self._gate.note_sent(clock.now().mono_ns, len(data), taken)
-        return "sent" if taken == len(data) else "superseded"
+        return "sent" if taken == len(data) and not instead else "superseded"
 
     def _kernel_bytes(self) -> int:
         """Bytes the driver has not sent yet; 0 where it cannot say (a pty)."""

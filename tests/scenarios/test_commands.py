@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from acsard.messages.queries import Query
 from acsard.settings import CommandsConfig, Config, Source
 from tests.scenarios.world import World
 
@@ -232,6 +233,17 @@ def test_state_is_published_ten_times_a_second_and_at_once_on_change(world: Worl
     world.put("stop", b"")
     world.run(0.012)
     assert len(published) - before >= 1
+
+
+def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) -> None:
+    world.call("stop")
+    world.send(0.0)
+    world.now_ns += 300_000_000
+    world.bus.queries.append(Query(99, "srv/clear", "srv/clear", "", b"", "", world.now_ns))
+    world.send(0.5)
+    world.run(0.2)
+    assert world.state.mode == "ready"
+    assert "neutral first" in world.state.reason
 
 
 def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:

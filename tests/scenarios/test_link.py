@@ -202,6 +202,21 @@ def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> Non
     assert first == ZERO
 
 
+def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_blocked() -> None:
+    world = World(plugged=False)
+    world.run(0.1)
+    world.port.blocked = True
+    with world.mcu.unprompted(0.02):
+        world.port.plug(world.mcu)
+        world.run(0.3)
+        world.drive(0.5, seconds=0.2)
+        assert world.state.link == "up"
+        world.port.blocked = False
+        world.hold(0.5, seconds=0.2)
+    assert world.lines()[0] == ZERO
+    assert moving(world.lines())
+
+
 def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:
     world = World(Config(mcu=McuConfig(baud_rate=9600), control=ControlConfig(rate="auto")))
     assert world.config.rate_hz == 23

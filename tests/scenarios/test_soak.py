@@ -350,7 +350,7 @@ def empty(world: World) -> int:
     return sys.getallocatedblocks()
 
 
-@pytest.mark.parametrize("minutes", [10, long(24 * 60, 3600)])
+@pytest.mark.parametrize("minutes", [5, long(24 * 60, 3600)])
 def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memory(
     minutes: int,
 ) -> None:

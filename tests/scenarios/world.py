@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from acsard.mcu.frames import Codec
 from acsard.mcu.wire import LineGate
 from acsard.messages.incoming import Arrival
 from acsard.messages.queries import Query, Reply
@@ -27,7 +28,8 @@ START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 class VirtualPort:
     """A serial port to the fake MCU that can be unplugged and blocked."""
 
-    def __init__(self, baud_rate: int) -> None:
+    def __init__(self, baud_rate: int, stop: bytes) -> None:
+        self._stop = stop
         self.is_open = False
         self.opened = 0
         self.blocked = False
@@ -60,11 +62,13 @@ class VirtualPort:
             return "down"
         if self.blocked or not self._gate.may_send(now.mono_ns, 0):
             return "superseded"
+        instead = self._gate.first and line != self._stop
+        line = self._stop if instead else line
         data = self._gate.prefix + line
         self.mcu.receive(now.mono_ns, data)
         self._gate.note_sent(now.mono_ns, len(data), len(data))
         self.sent.append((now.mono_ns, line))
-        return "sent"
+        return "superseded" if instead else "sent"
 
 
 class MemoryBus:
@@ -104,7 +108,10 @@ class World:
         self.period_ns = int(NS_PER_S / self.config.rate_hz)
         self.next_tick_ns = self.now_ns
         self.mcu = FakeMcu(self.config, self.now_ns)
-        self.port = VirtualPort(self.config.mcu.baud_rate)
+        self.port = VirtualPort(
+            self.config.mcu.baud_rate,
+            Codec(self.config.mcu.wheels, self.config.mcu.trailing_comma).stop,
+        )
         if plugged:
             self.port.plug(self.mcu)
         self.bus = MemoryBus()

@@ -88,12 +88,12 @@ def test_without_a_verb_it_runs(tmp_path: Path) -> None:
 def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
     shared: Daemon,
 ) -> None:
-    until(lambda: len(shared.out) >= 7, 5.0, "the whole banner")
+    until(lambda: len(shared.out) >= 8, 5.0, "the whole banner")
     assert "SIMULATOR" in shared.out[1]
-    assert shared.endpoint in shared.out[1]
-    assert "acsard/acsar/" in shared.out[1]
-    assert str(shared.config) in shared.out[2]
-    assert sum(line.strip().startswith("acsard ") for line in shared.out[3:]) == 3
+    assert shared.endpoint in shared.out[2]
+    assert "acsard/acsar/" in shared.out[2]
+    assert str(shared.config) in shared.out[3]
+    assert sum(line.strip().startswith("acsard ") for line in shared.out[4:]) == 3
 
 
 # topics and check need no daemon
