@@ -131,7 +131,8 @@ class Robot:
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
-            self._arbiter.require_neutral(inputs.now.mono_ns)
+            # Nobody has driven before the first opening: a zero sent while we started counts.
+            self._arbiter.require_neutral(inputs.now.mono_ns if inputs.opened > 1 else 0)
         if link != before:
             events.append(_link_event(link))
         if link != "up":
