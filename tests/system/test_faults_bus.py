@@ -39,6 +39,10 @@ from tests.system.harness import (
 )
 from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, words
 
+# Minutes even in their short form: the default run has to stay under three.
+pytestmark = pytest.mark.soak
+
+
 TIMEOUT_S = 0.25
 TICK_S = 0.01
 SLACK_S = 0.1

@@ -99,6 +99,10 @@ def objection(guard: Guard, found: Outputs) -> str:
 # what passes
 
 
+def test_before_the_first_line_nothing_was_replaced(guard: Guard) -> None:
+    assert guard.trip == ""
+
+
 def test_no_line_is_no_line(guard: Guard) -> None:
     assert guard.check(outputs(None)) is None
     assert guard.trip == ""

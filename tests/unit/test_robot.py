@@ -216,6 +216,7 @@ def test_odometry_follows_the_wheels() -> None:
     assert sample.pose.x == pytest.approx(0.5)
     assert sample.twist == Twist(0.5, 0.0)
     assert sample.positions == pytest.approx((10.0,) * 4)
+    assert sample.covariance.xx == pytest.approx(1e-6 + 0.5e-4)  # 1e-4 m2 per metre
     snapshot = bench.robot.snapshot(bench.now_ns, Spread())
     assert (snapshot.pose, snapshot.measured) == (sample.pose, sample.twist)
     assert snapshot.speeds == ROLLING
@@ -389,6 +390,14 @@ def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
     bench.step(ms=100)
     ages = {s.name: s.age_s for s in bench.robot.snapshot(bench.now_ns, Spread()).sources}
     assert ages["app"] == 0.1
+
+
+def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
+    bench.opened = 0  # never yet
+    bench.step(GO)
+    waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns, Spread()).sources}
+    assert waits["app"] == ""
 
 
 def test_a_silent_mcu_is_rest_after_quiet() -> None:
@@ -703,6 +712,20 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     assert bench.out.applied.linear == pytest.approx(0.47)
     assert bench.step(GO).applied.linear == pytest.approx(0.44)
     assert bench.counters()["line_impossible"] == 3
+
+
+def test_a_lost_link_begins_the_count_of_impossible_lines_anew() -> None:
+    bench = impossible(Bench().driving(), 2)
+    bench.unplug().step()
+    impossible(bench.replug(), 3)
+    assert (bench.link(), bench.mode()) == ("up", "ready")
+
+
+def test_a_fault_clears_every_command() -> None:
+    bench = Bench().driving()
+    bench.step(guard_trip="a wheel is too fast")
+    sources = bench.robot.snapshot(bench.now_ns, Spread()).sources
+    assert {source.age_s for source in sources} == {None}
 
 
 def test_after_clear_impossible_lines_are_counted_anew() -> None:

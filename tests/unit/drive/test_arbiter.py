@@ -486,16 +486,25 @@ def test_a_command_without_a_stamp_is_as_old_as_its_arrival() -> None:
     assert bench.wait(5000).send(HIGH) == ""
 
 
-def test_a_sender_that_was_silent_for_long_may_have_set_its_clock() -> None:
+@pytest.mark.parametrize("offset_s", [1_800_000_000, -1_800_000_000])
+def test_a_sender_that_was_silent_for_long_may_have_set_its_clock(offset_s: int) -> None:
     bench = Bench(HIGH)
+    bench.offset_ns = offset_s * NS_PER_S
     bench.stamped(HIGH)
     bench.offset_ns -= HOUR_NS
     bench.wait(10_000)
     assert bench.stamped(HIGH) == "stale"
     bench.wait(10_001)
     refused = [bench.wait(100).stamped(HIGH) for _ in range(25)]
-    assert refused[:19] == ["stale"] * 19  # steady delays have yet to prove it
-    assert refused[-1] == ""
+    assert refused == ["stale"] * 20 + [""] * 5  # steady delays prove it in 2 s
+
+
+def test_a_sender_that_was_silent_for_just_ten_seconds_may_not() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    bench.offset_ns -= HOUR_NS
+    bench.wait(9_900)
+    assert {bench.wait(100).stamped(HIGH) for _ in range(50)} == {"stale"}
 
 
 def test_what_a_network_held_for_longer_than_that_is_not_taken_for_a_clock_that_was_set() -> None:
@@ -548,6 +557,7 @@ def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first()
     freshness.extra_delay_ns("sender 0", 0, 0)  # heard again: now number 1 is the oldest
     freshness.extra_delay_ns("one more", 0, 0)
     assert freshness.extra_delay_ns("sender 0", 0, 1000) > 0.0
+    assert freshness.extra_delay_ns("sender 2", 0, 1000) > 0.0
     assert freshness.extra_delay_ns("sender 1", 0, 1000) == 0.0
 
 

@@ -290,6 +290,14 @@ def test_a_gap_adds_what_the_robot_could_have_driven_in_it() -> None:
     assert after - before == pytest.approx(np.diag([0.36, 0.36, 1.0]))
 
 
+def test_a_gap_of_half_a_second_counts_too() -> None:
+    # last seen at 0.3 m/s and 0.5 rad/s: 0.15 m and 0.25 rad, squared
+    robot = odometry()
+    before = matrix(robot.fold(feedback(4.5, 7.5, 0.0)).covariance)
+    after = matrix(robot.fold(feedback(0.0, 0.0, 0.0, gap=0.5)).covariance)
+    assert after - before == pytest.approx(np.diag([0.0225, 0.0225, 0.0625]))
+
+
 def test_a_gap_of_a_standing_robot_adds_nothing() -> None:
     robot = odometry()
     robot.fold(feedback(0.0, 0.0, 0.01))
@@ -335,6 +343,13 @@ def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
     assert far_p.xx > near_p.xx
     assert far_p.yy > near_p.yy
     assert far_p.yawyaw > near_p.yawyaw
+
+
+def test_a_gap_changes_nothing_of_a_pose_that_says_nothing_any_more() -> None:
+    robot = odometry(OdometryConfig(distance_variance_per_metre=10.0))
+    before = robot.fold(feedback(40.0, 40.0, 1e9)).covariance
+    assert before.xx > 1e9 > before.yawyaw
+    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == before
 
 
 def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:

@@ -246,6 +246,30 @@ def test_a_wheel_that_stops_sooner_than_it_was_said_to_is_no_fault() -> None:
             assert sanity.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
 
 
+def test_a_healthy_wheel_is_expected_to_follow_by_its_response_time() -> None:
+    # A sixth of the way each step: after the second 10 (1 - (5/6)^2) = 3.06 rad/s, over 2 rad/s.
+    # Then eight more steps of 1/16 s are over half a second.
+    sanity = Sanity(FeedbackConfig(response_time=0.3125, fault_time=0.5))
+    found = [bool(sanity.watch(TEN, STILL, 0.0625)) for _ in range(10)]
+    assert found == [False] * 9 + [True]
+
+
+def test_a_model_that_has_just_reached_the_slack_is_not_yet_moving() -> None:
+    # A quarter of the way to 8 rad/s is 2 rad/s: step 2 is the first of nine that count.
+    sanity = Sanity(FeedbackConfig(response_time=0.1875, fault_time=0.5))
+    eight = WheelSpeeds(8.0, 8.0, 8.0, 8.0)
+    found = [bool(sanity.watch(eight, STILL, 0.0625)) for _ in range(10)]
+    assert found == [False] * 9 + [True]
+
+
+def test_a_line_without_time_moves_no_model_and_is_no_evidence() -> None:
+    sanity = Sanity(FeedbackConfig(response_time=0.3125, fault_time=0.5))
+    for _ in range(10):
+        assert not sanity.watch(TEN, STILL, 0.0)
+    found = [bool(sanity.watch(TEN, STILL, 0.0625)) for _ in range(10)]
+    assert found == [False] * 9 + [True]
+
+
 def test_evidence_must_last_longer_than_the_fault_time() -> None:
     sanity = Sanity(FeedbackConfig(fault_time=0.5))
     found = [bool(sanity.watch(TEN, STILL, 0.125)) for _ in range(5)]
