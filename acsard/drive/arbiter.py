@@ -81,7 +81,9 @@ class Freshness:
             low, high = min(proof[0], delay), max(proof[1], delay)
             if high - low > STEADY_NS:
                 proof = (delay, delay, arrived_ns)
-            elif arrived_ns - proof[2] >= PROVEN_NS or delay - least <= STEADY_NS:
+            elif delay - least <= STEADY_NS:
+                proof = None  # as prompt as ever: nothing to prove
+            elif arrived_ns - proof[2] >= PROVEN_NS:
                 least, proof = low, None
             else:
                 proof = (low, high, proof[2])

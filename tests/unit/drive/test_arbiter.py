@@ -646,3 +646,12 @@ def test_an_equal_source_is_told_who_came_first() -> None:
     assert bench.status(LEFT).waits_for == (
         "right, of the same priority, came first: until it is silent"
     )
+
+
+def test_holes_that_each_add_a_little_delay_do_not_add_up() -> None:
+    bench = Bench(HIGH)
+    bench.stamped(HIGH)
+    bench.wait(10_100)
+    assert bench.stamped(HIGH, late_ms=99.0) == ""
+    bench.wait(10_100)
+    assert bench.stamped(HIGH, late_ms=297.0) == "stale"
