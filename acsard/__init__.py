@@ -23,7 +23,7 @@ Where to look, in the order the modules may import each other:
                       incoming (sample -> command), report (outputs -> messages), queries
     robot.py          the order; guard.py: the last look at every outgoing line
     sim/              the vehicle and the fake microcontroller
-    runtime/          clock, ticker, serial port, Zenoh bus, logs, control loop, daemon
+    runtime/          clock, ticker, serial device and port, Zenoh bus, logs, control loop, daemon
     client.py         drive and follow a robot from Python
     cli/              one verb per file
 

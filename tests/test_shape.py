@@ -53,6 +53,7 @@ ORDER = (
     "runtime.ticker",
     "runtime.logs",
     "runtime.control_loop",
+    "runtime.serial_device",
     "runtime.serial_port",
     "runtime.sim_pty",
     "runtime.zenoh_session",
