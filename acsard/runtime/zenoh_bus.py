@@ -177,7 +177,7 @@ class ZenohBus:
         if stamp is not None and stamp.get_id() != self._own_id:
             stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
         arrival = Arrival(key, put, data, str(sample.encoding), arrived.mono_ns, stamp_ns, sender)
-        if key == "stop":
+        if key == "stop" and put:
             self._stops.append(arrival)
             return
         if len(self._arrivals) == ARRIVALS:
@@ -188,11 +188,13 @@ class ZenohBus:
         arrived_ns = clock.now().mono_ns
         asked = str(query.key_expr).removeprefix(self._prefix)
         service = topic.startswith("srv/")
-        if (service and asked != topic) or len(self._open_queries) > OPEN_QUERIES:
+        if service and asked != topic:
             return  # letting go of it ends it
         if topic == "srv/stop":
-            # The stop itself never waits in a line with other questions.
+            # The stop itself never waits in a line with other questions, nor is it turned away.
             self._stops.append(Arrival("stop", True, b"", "", arrived_ns, None, ""))
+        if len(self._open_queries) > OPEN_QUERIES:
+            return
         number = next(self._query_numbers)
         self._open_queries[number] = query
         waiting = self._services if service else self._questions
