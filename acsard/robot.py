@@ -99,6 +99,8 @@ class Robot:
         samples = self._fold(inputs, events)
         answers = self._serve(inputs, events)
         self._hear(inputs)
+        self._choice = self._arbiter.choose(inputs.now.mono_ns)
+        self._life.fire(Trigger.NO_COMMAND if self._choice.twist is None else Trigger.COMMAND)
         line = self._drive(inputs) if inputs.tick else None
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
@@ -236,14 +238,10 @@ class Robot:
         self.counters[f"command_{refusal.reason}"] += 1
         self._refused = refusal.text[:MAX_TEXT]
 
-    # choose, gate, limit, invert
+    # limit, invert
 
     def _drive(self, inputs: Inputs) -> bytes | None:
-        now_ns = inputs.now.mono_ns
-        self._choice = self._arbiter.choose(now_ns)
-        twist = self._choice.twist
-        self._life.fire(Trigger.NO_COMMAND if twist is None else Trigger.COMMAND)
-        limiter = self._limiter
+        now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
         self._before = (limiter.state, self._limited_ns)

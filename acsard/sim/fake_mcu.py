@@ -289,14 +289,7 @@ def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
 
 
 FAULTS = (
-    "mute",
-    "noise",
-    "partial_line",
-    "slow_reply",
-    "spaces",
-    "trailing_comma",
-    "comma_latched",
-    "no_watchdog",
-    "unprompted",
-)
+    "mute", "noise", "partial_line", "slow_reply", "spaces", "trailing_comma", "comma_latched",
+    "no_watchdog", "unprompted",
+)  # fmt: skip
 """The faults that need no argument, by method name: what `acsard sim --fault` offers."""
