@@ -76,6 +76,7 @@ class Robot:
         self._lost_dt = 0.0
         self._told_ns: dict[str, int] = {}
         self._port_trouble = ""
+        self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int, lateness_us: Spread) -> Snapshot:
@@ -133,8 +134,8 @@ class Robot:
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
-            # Nobody has driven before the first opening: a zero sent while we started counts.
-            self._arbiter.require_neutral(inputs.now.mono_ns if inputs.opened > 1 else 0)
+            # Nobody has driven before the first link: a zero sent while we started counts.
+            self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         if link != before:
             events.append(_link_event(link))
         if link != "up":
@@ -146,6 +147,7 @@ class Robot:
             if link == "down" and before != "down":
                 self._arbiter.require_neutral(inputs.now.mono_ns)
         else:
+            self._linked_once = True
             self._life.link(up=True)
         return tuple([sample for line in feedback if (sample := self._believe(line, events))])
 

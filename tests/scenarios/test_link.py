@@ -102,6 +102,15 @@ def test_a_long_silence_wants_neutral_again(world: World) -> None:
     assert "neutral first" in world.state.reason
 
 
+def test_a_zero_from_before_a_long_stall_is_not_neutral_after_it(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.send(0.0)
+    world.stall(1.2)
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "ready"
+    assert "neutral first" in world.state.reason
+
+
 def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     x = world.state.x

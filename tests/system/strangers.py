@@ -92,6 +92,18 @@ session.close()
 )
 """One zero, then `speed` m/s as fast as one process can for `seconds`."""
 
+DELETES = (
+    _OPEN
+    + """
+session = open_session(sys.argv[1])
+publisher = session.declare_publisher("acsard/acsar/stop")
+print("deleting", flush=True)
+while True:
+    publisher.delete()
+"""
+)
+"""DELETEs on `stop` as fast as one process can, for ever."""
+
 
 COMMANDER = (
     _OPEN
@@ -127,20 +139,25 @@ key = "acsard/acsar/cmd/app"
 text = '{"linear": {"x": %.5f}, "angular": {"z": 0}}'
 session.put(key, text % 0)
 time.sleep(0.05)
-publisher, count, payload, until = session.declare_publisher(key), 0, "", 0.0
+publisher, count, payload, until, sent = session.declare_publisher(key), 0, "", 0.0, []
 start = time.monotonic()
 print("flooding", repr(start), flush=True)
 while (now := time.monotonic()) < start + seconds:
-    if now >= until:
+    if now < until:
+        publisher.put(payload)
+    else:
         payload, until = text % (base + slope * (now - start)), now + 0.0005
-    publisher.put(payload)
+        publisher.put(payload)
+        sent.append((round(now - start, 6), round(time.monotonic() - start, 6)))
     count += 1
 print("flooded", count, flush=True)
+print("sent", json.dumps(sent), flush=True)
 session.close()
 """
 )
-"""One zero, then as fast as one process can: each command says when it was sent, by its speed
-`base + slope * t` m/s."""
+"""One zero, then as fast as one process can: each command says when it was written, by its speed
+`base + slope * t` m/s. Says of each in the end when it was written and when its first put was over:
+a process that floods a machine is itself held up between the two, and between two commands."""
 
 HOARDER = (
     _OPEN.replace(

@@ -20,12 +20,14 @@ from tests.system.harness import (
     Bus,
     Daemon,
     Following,
+    Program,
     alive_at,
     client_config,
     seconds,
     twist,
     until,
 )
+from tests.system.strangers import DELETES, words
 
 PUBLISHED = {
     "odom": "Odometry",
@@ -110,7 +112,7 @@ def test_an_unknown_fmt_is_an_error_that_says_what_to_write(bus: Bus) -> None:
         (answer,) = bus.ask(f"{key}?fmt=xml")
         assert not answer.ok
         assert answer.encoding.startswith("text/plain")
-        assert answer.payload.decode() == "fmt=xml: write fmt=json or fmt=msgpack"
+        assert answer.payload.decode() == "fmt=xml: write fmt=json, fmt=msgpack or fmt=cdr"
 
 
 def test_a_last_value_is_the_present_one(bus: Bus) -> None:
@@ -306,14 +308,50 @@ def test_a_put_of_anything_on_stop_latches(bus: Bus, payload: bytes) -> None:
         assert bus.state()["x"] == pytest.approx(x, abs=0.01)
 
 
-def test_a_delete_on_stop_latches_nothing(bus: Bus) -> None:
+def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) -> None:
+    refused, before = bus.count("command_not_a_put"), bus.count("commands")
     bus.session.delete("acsard/acsar/stop")
     # A command that follows on the same link has been taken when it is counted.
-    before = bus.count("commands")
     bus.put("cmd/app", twist(0.0))
     until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
-    assert bus.state()["mode"] != "stopped"
+    state = bus.state()
+    assert state["counters"]["command_not_a_put"] == refused + 1
+    assert state["refused"] == "stop: a DELETE is not a stop"
+    assert state["mode"] != "stopped"
     bus.at_rest()
+
+
+def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
+    bus: Bus, shared: Daemon, tmp_path: Path
+) -> None:
+    def overrun() -> int:
+        return bus.count("bus_overrun")
+
+    with restored(bus), bus.follow("state") as states:
+        with Program(words(DELETES, shared.endpoint), tmp_path) as flood:
+            flood.says("deleting")
+            took = []
+            for _ in range(10):
+                # More come than are held, before the stop and behind it.
+                lost = overrun()
+                until(lambda: overrun() > lost, 5.0, "DELETEs are pushed out before")  # noqa: B023
+                assert bus.state()["mode"] != "stopped"
+                put = time.monotonic()
+                bus.session.put("acsard/acsar/stop", b"")
+                lost = overrun()
+                told = states.find(
+                    lambda state: state["mode"] == "stopped", 2.0, "stopped", after=put
+                )
+                took.append(told.at - put)
+                until(lambda: overrun() > lost, 5.0, "DELETEs are pushed out behind")  # noqa: B023
+                assert bus.get("srv/clear")["success"]
+        state = bus.state()
+    print(
+        f"10 stops in a flood of DELETEs: {state['counters']['bus_overrun']} samples pushed out, "
+        f"stopped after at most {max(took) * 1e3:.1f} ms"
+    )
+    assert state["counters"]["command_not_a_put"] > 0
+    assert max(took) < 0.2
 
 
 # what is published
@@ -438,6 +476,26 @@ def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) 
     print(f"400 queries at once: {answered} answered, {busy} told to ask again")
     assert answered >= 64
     assert bus.get("info")["id"] == "acsar"
+
+
+def test_a_stop_query_stops_although_too_many_others_are_open_for_it_to_be_answered(
+    bus: Bus, shared: Daemon
+) -> None:
+    # A get on every key is dozens of queries. Only the daemon knows how many wait for their
+    # replies, but beyond its 512 it answers no further one: so also the stop itself.
+    stops, unanswered, deadline = 0, 0, time.monotonic() + 20.0
+    with restored(bus), Bus(shared.endpoint) as crowd, bus.follow("state") as states:
+        while unanswered < 3 and time.monotonic() < deadline:
+            open_ones = [crowd.session.get("acsard/acsar/**", timeout=5.0) for _ in range(300)]
+            asked = time.monotonic()
+            answers = list(crowd.session.get("acsard/acsar/srv/stop", timeout=5.0))
+            states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=asked)
+            stops, unanswered = stops + 1, unanswered + (not answers)
+            for one in open_ones:
+                list(one)  # to the end, so that the next round begins anew
+            assert bus.get("srv/clear")["success"]
+    print(f"{unanswered} of {stops} stops came with 512 queries open; all of them stopped")
+    assert unanswered > 0, "there were never so many open"
 
 
 def test_two_clients_hear_the_same_odometry(bus: Bus, shared: Daemon) -> None:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -42,10 +42,6 @@ from tests.system.harness import (
 )
 from tests.system.strangers import BUSY, COMMANDER, words
 
-# Minutes even in their short form: the default run has to stay under three.
-pytestmark = pytest.mark.soak
-
-
 TIMEOUT_S = 0.25
 TICK_S = 0.01
 WIRE_S = 33 * 10 / 115200
@@ -60,6 +56,28 @@ ZERO_TEXT = ZERO_LINE.strip()
 def commander(daemon: Daemon, speed: float, source: str = "app", zeros: int = 1) -> Program:
     """A process that sends stamped commands at 20 Hz until it is ended."""
     return Program(words(COMMANDER, daemon.endpoint, source, speed, zeros), daemon.config.parent)
+
+
+@contextmanager
+def robot(where: Path) -> Iterator[tuple[FarPeer, Daemon]]:
+    """A daemon and its MCU."""
+    with FarPeer(where) as peer, Daemon(where, peer.path) as daemon:
+        yield peer, daemon
+
+
+@pytest.fixture(scope="module")
+def one_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FarPeer, Daemon]]:
+    """A daemon and its MCU for short faults, after which the robot can always be driven again."""
+    with robot(tmp_path_factory.mktemp("far")) as both:
+        yield both
+
+
+@pytest.fixture
+def far(one_robot: tuple[FarPeer, Daemon]) -> tuple[FarPeer, Daemon]:
+    """`one_robot` at rest: a line of the commander before must not be taken for one of the next."""
+    peer = one_robot[0]
+    until(lambda: [h.line for h in peer.lines[-1:]] == [ZERO_TEXT], 5.0, "at rest")
+    return one_robot
 
 
 def last_put(program: Program) -> float:
@@ -81,48 +99,91 @@ def gaps(lines: list[Heard]) -> list[float]:
 # a commander dies
 
 
-def killed_commanders(tmp_path: Path, count: int) -> list[float]:
-    """Seconds from the last command of a commander that is killed to the first slower line."""
+class Ramp(NamedTuple):
+    """How long after the last accepted command a ramp began, s."""
+
+    step: float
+    """The first slower step, by the daemon's own stamps."""
+    line: float
+    """Its line at the far end of the pty, by the clock of this machine."""
+
+
+LATE_S = 0.005
+"""What a late timer tick may add on a busy machine; how many needed it is printed."""
+
+
+def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
+    """From the last command the daemon accepted of a commander that is killed to the ramp.
+
+    When it was accepted is what `state` says: its stamp less the source's age. A put that died
+    on its way with its commander does not count, nor does the way of one that arrived.
+    """
     rng, found = random.Random(1), []
-    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon:
+    with (
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+        bus.follow("cmd_vel_out") as steps,
+    ):
+        wall = time.time() - time.monotonic()
         for _ in range(count):
             with commander(daemon, 0.1) as driver:
-                peer.awaits(text(0.1), after=time.monotonic())
+                steady = peer.awaits(text(0.1), after=time.monotonic()).at
                 time.sleep(rng.uniform(0.0, 0.1))  # killed at any moment between two commands
                 driver.signal(signal.SIGKILL)
                 driver.ended(5.0)
-            sent = last_put(driver)
-            until(
-                lambda: peer.lines[-1].line == ZERO_TEXT,
-                5.0,
-                "at rest",
-            )
-            lines = peer.lines
-            steady = max(n for n, h in enumerate(lines) if h.line.startswith(text(0.1)))
-            found.append(lines[steady + 1].at - sent)
-    exact = sum(took <= TIMEOUT_S + TICK_S for took in found)
+                killed = time.monotonic()
+            rest = steps.find(lambda step: speed(step) == 0.0, 5.0, "at rest", after=killed).value
+            state = states.find(
+                lambda state: seconds(state["stamp"]) >= stamp(rest),  # noqa: B023
+                5.0, "the state at rest", after=killed,
+            ).value  # fmt: skip
+            age = next(source["age"] for source in state["sources"] if source["name"] == "app")
+            accepted = seconds(state["stamp"]) - age
+            # Killed early, its last command may still find the robot on its way up.
+            rest_of_it = [seen.value for seen in steps.seen if stamp(seen.value) > accepted]
+            full = itertools.dropwhile(lambda step: speed(step) < 0.0999, rest_of_it)
+            slower = next(step for step in full if speed(step) < 0.0999)
+            until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "zero on the wire")
+            line = next(h for h in peer.since(steady) if not h.line.startswith(text(0.1)))
+            found.append(Ramp(stamp(slower) - accepted, line.at + wall - accepted))
+    took, lines = [ramp.step for ramp in found], [ramp.line for ramp in found]
+    promised = TIMEOUT_S + TICK_S
+    late = [one - promised for one in took if one > promised]
     print(
-        f"SIGKILL of a commander, last put -> ramp on the wire: {exact} of {count} within 260 ms; "
-        f"min {min(found) * 1e3:.1f} median {statistics.median(found) * 1e3:.1f} "
-        f"max {max(found) * 1e3:.1f} ms"
+        f"SIGKILL of a commander, last accepted command -> first slower step: "
+        f"{count - len(late)} of {count} within {promised * 1e3:.0f} ms, "
+        f"{len(late)} by a late tick up to {max(late, default=0.0) * 1e3:.2f} ms over; "
+        f"min {min(took) * 1e3:.1f} median {statistics.median(took) * 1e3:.1f} "
+        f"max {max(took) * 1e3:.2f} ms; its line at the far end: "
+        f"{sum(one <= promised for one in lines)} within, "
+        f"median {statistics.median(lines) * 1e3:.1f} max {max(lines) * 1e3:.2f} ms"
     )
     return found
 
 
+def stamp(step: Any) -> float:
+    return seconds(step["header"]["stamp"])
+
+
+def speed(step: Any) -> float:
+    return float(step["twist"]["linear"]["x"])
+
+
 def test_when_a_commander_is_killed_the_ramp_starts_within_its_timeout_and_a_tick(
-    tmp_path: Path,
+    far: tuple[FarPeer, Daemon],
 ) -> None:
-    found = killed_commanders(tmp_path, 3)
-    assert max(found) <= TIMEOUT_S + TICK_S + SLACK_S
-    assert statistics.median(found) <= TIMEOUT_S + TICK_S + 0.005
+    found = killed_commanders(*far, 2)
+    assert max(ramp.step for ramp in found) <= TIMEOUT_S + TICK_S + LATE_S
+    assert max(ramp.line for ramp in found) <= TIMEOUT_S + TICK_S + SLACK_S
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
 def test_when_200_commanders_are_killed_200_ramps_start_in_time(tmp_path: Path) -> None:
-    found = killed_commanders(tmp_path, 200)
-    assert max(found) <= TIMEOUT_S + TICK_S + SLACK_S
-    assert statistics.median(found) <= TIMEOUT_S + TICK_S + 0.005
+    with robot(tmp_path) as (peer, daemon):
+        found = killed_commanders(peer, daemon, 200)
+    assert max(ramp.step for ramp in found) <= TIMEOUT_S + TICK_S + LATE_S
+    assert max(ramp.line for ramp in found) <= TIMEOUT_S + TICK_S + SLACK_S
 
 
 TWO = [
@@ -257,7 +318,7 @@ def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], lis
 def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without_leaks(
     tmp_path: Path, peer: Peer
 ) -> None:
-    noticed, zeros = replugged(tmp_path, peer, 5)
+    noticed, zeros = replugged(tmp_path, peer, 3)
     assert statistics.median(noticed) <= 0.02
     assert max(noticed) <= 0.02 + SLACK_S
     assert max(zeros) <= 0.5 + SLACK_S
@@ -310,28 +371,36 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
         bus.commanding(0.5) as driver,
     ):
         until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")
-        before = bus.state()
         with peer.deaf():
-            taken, known, begun = peer.stuff(), len(peer.lines), time.monotonic()
+            noise, known = [peer.stuff()], len(peer.lines)
+
+            def full() -> bool:
+                # The kernel moves what it took on to where it is read: that makes room again.
+                noise.append(peer.stuff())
+                return noise[-3:] == [0, 0, 0]
+
+            until(full, 5.0, "no room is left")
+            taken, begun = sum(noise), time.monotonic()
+            before = bus.state()
             driver.wish = twist(0.2)
-            while (now := time.monotonic()) < begun + 0.8:
+            while (now := time.monotonic()) < begun + 0.5:
                 # Its own 100 Hz; unheard, it stops as the contract says.
                 peer.say(PLAIN((10.0 if now < begun + 0.3 else 0.0,) * 4))
                 time.sleep(TICK_S)
-            full = bus.state()
+            after = bus.state()
             heard = time.monotonic()
         until(lambda: len(peer.lines) > known + taken // 2 + 1, 5.0, "it reads again")
         waited = [
             one.line for one in peer.lines[known:] if one.line.strip() and one.at < heard + 0.005
         ]
-        periods = Periods.between(before, full)
+        periods = Periods.between(before, after)
         print(
             f"full for {heard - begun:.2f} s: the kernel held {taken} bytes of noise, "
             f"{len(waited)} lines of ours in the first 5 ms, {periods.superseded} superseded, "
-            f"link {full['link']}"
+            f"link {after['link']}"
         )
-        assert full["link"] == "up"
-        assert periods.superseded >= 60
+        assert after["link"] == "up"
+        assert periods.superseded >= 35
         assert periods.accounted == pytest.approx(periods.elapsed, abs=2)
         # Those sent between the last read and the stuffing, a torn one and the newest.
         assert len(waited) <= 6
@@ -350,17 +419,15 @@ def busy(where: Path) -> ExitStack:
     return stack
 
 
-def starved(tmp_path: Path, length: float) -> None:
+def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
     with (
-        FarPeer(tmp_path) as peer,
-        Daemon(tmp_path, peer.path) as daemon,
         Bus(daemon.endpoint) as bus,
         commander(daemon, 0.3) as driver,
         bus.follow("cmd_vel_out") as steps,
         bus.follow("state") as states,
     ):
-        peer.awaits(text(0.3))
-        with busy(tmp_path):
+        peer.awaits(text(0.3), after=time.monotonic())
+        with busy(daemon.config.parent):
             # Published after a step, so that stamp and counters belong together.
             begun, ended = time.monotonic(), time.monotonic() + length
             before = states.find(lambda _: True, 5.0, "a state", after=begun).value
@@ -393,14 +460,15 @@ def starved(tmp_path: Path, length: float) -> None:
 
 
 def test_starved_of_both_cores_every_missed_period_is_counted_and_none_made_up_in_a_burst(
-    tmp_path: Path,
+    far: tuple[FarPeer, Daemon],
 ) -> None:
-    starved(tmp_path, 1.0)
+    starved(*far, 0.6)
 
 
 @pytest.mark.soak
 def test_starved_of_both_cores_for_60_s(tmp_path: Path) -> None:
-    starved(tmp_path, 60.0)
+    with robot(tmp_path) as (peer, daemon):
+        starved(peer, daemon, 60.0)
 
 
 @contextmanager
@@ -425,14 +493,11 @@ def no_burst(lines: list[Heard]) -> float:
 
 
 def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_has_gone(
-    tmp_path: Path,
+    far: tuple[FarPeer, Daemon],
 ) -> None:
-    with (
-        FarPeer(tmp_path) as peer,
-        Daemon(tmp_path, peer.path) as daemon,
-        commander(daemon, 0.3) as driver,
-    ):
-        peer.awaits(text(0.3))
+    peer, daemon = far
+    with commander(daemon, 0.3) as driver:
+        peer.awaits(text(0.3), after=time.monotonic())
         with stalled(daemon):
             begun, count = time.monotonic(), len(driver.out)
             until(lambda: len(driver.out) >= count + 3, 5.0, "commands pile up")
@@ -440,16 +505,17 @@ def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_ha
             driver.ended(5.0)
             until(lambda: time.monotonic() > begun + 0.5, 5.0, "half a second")
             woken = time.monotonic()
-        until(lambda: len(peer.since(woken)) > 40, 5.0, "40 lines")
+        until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
         print(f"stall: smallest gap after it {no_burst(peer.since(woken)) * 1e3:.2f} ms")
         assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
 
 
 def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_by_the_ramp(
-    tmp_path: Path,
+    far: tuple[FarPeer, Daemon],
 ) -> None:
-    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, commander(daemon, 0.3):
-        peer.awaits(text(0.3))
+    peer, daemon = far
+    with commander(daemon, 0.3):
+        peer.awaits(text(0.3), after=time.monotonic())
         with stalled(daemon):
             begun = time.monotonic()
             until(lambda: time.monotonic() > begun + 0.5, 5.0, "half a second")
@@ -464,18 +530,19 @@ def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_b
 
 
 def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first(
-    tmp_path: Path,
+    far: tuple[FarPeer, Daemon],
 ) -> None:
+    peer, daemon = far
     # Shorter than the 2 s after which clients give the daemon up and connect anew.
-    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, commander(daemon, 0.3):
-        peer.awaits(text(0.3))
+    with commander(daemon, 0.3):
+        peer.awaits(text(0.3), after=time.monotonic())
         with stalled(daemon):
             begun = time.monotonic()
             until(lambda: time.monotonic() > begun + 1.2, 5.0, "seconds")
             woken = time.monotonic()
         with Bus(daemon.endpoint) as bus:
             until(lambda: "neutral first" in bus.state()["reason"], 5.0, "what it waits for")
-            until(lambda: len(peer.since(woken)) > 40, 5.0, "40 lines")
+            until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
             assert no_burst(peer.since(woken)) >= 0.0
             assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
             bus.put("cmd/app", ZERO)
@@ -488,7 +555,7 @@ def test_after_50_stalls_of_any_length_the_first_line_is_zero_and_none_comes_in_
     tmp_path: Path,
 ) -> None:
     rng, least, resumed = random.Random(2), 1.0, 0
-    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon:
+    with robot(tmp_path) as (peer, daemon):
         for _ in range(50):
             with commander(daemon, 0.2):
                 peer.awaits(text(0.2), after=time.monotonic())

@@ -6,7 +6,9 @@ Every promise has a short version here; the full count is
 
 from __future__ import annotations
 
+import bisect
 import itertools
+import json
 import random
 import signal
 import socket
@@ -38,10 +40,6 @@ from tests.system.harness import (
     wheels,
 )
 from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, words
-
-# Minutes even in their short form: the default run has to stay under three.
-pytestmark = pytest.mark.soak
-
 
 TIMEOUT_S = 0.25
 TICK_S = 0.01
@@ -304,12 +302,12 @@ def test_after_a_partition_heals_fast_or_slowly_no_stale_command_is_obeyed(
 ) -> None:
     with ThreadPoolExecutor(2) as pool:
         both = pool.map(
-            lambda way: holes(tmp_path / way, [(way, 1.0)]), tuple[Way, Way](("fast", "slow"))
+            lambda way: holes(tmp_path / way, [(way, 0.6)]), tuple[Way, Way](("fast", "slow"))
         )
         found = list(itertools.chain.from_iterable(both))
     told(found)
     assert [hole.stale for hole in found] == [0, 0]
-    assert all(hole.held > 4000 for hole in found), "a backlog came back"
+    assert all(hole.held > 3000 for hole in found), "a backlog came back"
     assert all(hole.refused > 0 for hole in found), "and was refused"
 
 
@@ -335,8 +333,31 @@ SLOPE = 0.5
 BASE = 0.25
 
 
-def flooded(where: Path, length: float) -> list[float]:
-    """Ages in s of the commands obeyed in a flood, by the speeds applied and the steps' stamps.
+class Flooded(NamedTuple):
+    """How old what a flood's steps obeyed was, s. The first two hold also the way to the daemon,
+    on which a flooder's own threads and Zenoh's wait for a core."""
+
+    age: list[float]
+    """Since the command was written, be there a newer one or not."""
+    overtaken: list[float]
+    """Since the next one had been put: how long one went on to count that was out of date."""
+    arrived: list[float]
+    """Since it arrived in the daemon, by its own account in `state`, asked again and again."""
+    held_up: list[float]
+    """How long the flooder itself stood between two clock readings, where that was over 5 ms: it
+    never waits for anything but a core, so this tells that there was none to be had."""
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"{name} p50 {statistics.median(found) * 1e3:.1f} "
+            f"p99 {sorted(found)[int(0.99 * len(found))] * 1e3:.1f} max {max(found) * 1e3:.1f} ms, "
+            f"{sum(one > 0.02 for one in found)} of {len(found)} over 20 ms"
+            for name, found in zip(self._fields[:3], self[:3], strict=True)
+        )
+
+
+def flooded(where: Path, length: float) -> Flooded:
+    """How fresh the commands obeyed in a flood were, by the speeds applied and the steps' stamps.
 
     Not by the lines at the other end of the pty: the kernel's thread that carries them starves on
     a machine that a flood keeps busy, up to making the link stale; the robot then stands, and
@@ -355,7 +376,11 @@ def flooded(where: Path, length: float) -> list[float]:
         before, memory = bus.state(), resident_kb(daemon.pid)
         with Program(words(CODED_FLOOD, daemon.endpoint, BASE, SLOPE, length), where) as flood:
             begun = float(flood.says("flooding").split()[1])
+            asked = []
+            while time.monotonic() < begun + length - 0.1:
+                asked.append(bus.state())
             count = int(flood.says("flooded").split()[1])
+            sent = json.loads(flood.says("sent").removeprefix("sent"))
             assert flood.ended(5.0) == 0
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
         start = begun + time.time() - time.monotonic()
@@ -364,50 +389,71 @@ def flooded(where: Path, length: float) -> list[float]:
             for step in applied.seen
         ]
     stale = sum(seen.value["link"] == "stale" and seen.at > begun for seen in states.seen)
+    written, put = [one[0] for one in sent], [one[1] for one in sent]
     stood = 0.0
-    ages = []
+    found = Flooded([], [], [], [])
     for at, speed in steps:
         if speed < BASE:
             stood = at
         elif at < length and at > stood + 0.1:
-            ages.append(at - (speed - BASE) / SLOPE)
-    ordered, periods = sorted(ages), Periods.between(before, after)
+            code = (speed - BASE) / SLOPE
+            # By 0.1 ms: a code holds 0.02 ms, commands are 0.5 ms apart.
+            newer = bisect.bisect(written, code + 0.0001)
+            found.age.append(at - code)
+            found.overtaken.append(at - put[newer] if newer < len(put) else 0.0)
+    # Before its first one counts, the last command is the zero it opened with.
+    flooding = [state for state in asked if seconds(state["stamp"]) > start + 0.1]
+    found.arrived.extend(
+        source["age"]
+        for state in flooding
+        for source in state["sources"]
+        if source["name"] == "app" and state["mode"] == "driving"
+    )
+    waits = [b - a for a, b in [*sent, *itertools.pairwise(written)]]
+    found.held_up.extend(wait for wait in waits if wait > 0.005)
+    periods = Periods.between(before, after)
     taken = after["counters"]["commands"] - before["counters"].get("commands", 0)
     print(
-        f"flood of {count / length:.0f}/s for {length:g} s, {taken} commands taken: age of the "
-        f"one obeyed p50 {statistics.median(ages) * 1e3:.1f} "
-        f"p99 {ordered[int(0.99 * len(ages))] * 1e3:.1f} max {ordered[-1] * 1e3:.1f} ms "
-        f"(n={len(ages)}, {sum(age > 0.02 for age in ages)} over 20 ms); "
+        f"flood of {count / length:.0f}/s for {length:g} s, {taken} commands taken; "
         f"{periods.missed} of {periods.elapsed:.0f} periods missed, memory {grown:+d} kB, "
-        f"{stale} states with a stale link"
+        f"{stale} states with a stale link; the flooder was held up over 5 ms "
+        f"{len(found.held_up)} times; {found}"
     )
     assert count > 10_000 * length
     assert periods.missed <= 0.03 * periods.elapsed + 1
     assert grown < 10_000
     assert after["mode"] != "fault"
-    return ages
+    return found
 
 
 def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
-    ages = flooded(tmp_path, 1.5)
-    assert len(ages) > 100
-    assert statistics.median(ages) <= 0.02
-    assert max(ages) <= 0.02 + SLACK_S
+    found = flooded(tmp_path, 1.0)
+    assert len(found.age) > 50
+    assert len(found.arrived) > 20
+    assert statistics.median(found.age) <= 0.02
+    assert max(found.overtaken) <= 0.02 + SLACK_S
+    assert max(found.arrived) <= 0.02 + SLACK_S
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
-    ages = []
+    found, quiet = Flooded([], [], [], []), 0
     for number in range(7):
         where = tmp_path / str(number)
         where.mkdir()
-        ages += flooded(where, 9.0)
-    late = sum(age > 0.02 for age in ages)
-    print(f"{len(ages)} steps in floods: {late} with a command older than 20 ms, "
-          f"max {max(ages) * 1e3:.1f} ms")  # fmt: skip
-    assert late <= 0.01 * len(ages)
-    assert max(ages) <= 0.02 + SLACK_S
+        these = flooded(where, 9.0)
+        for all_of_it, more in zip(found, these, strict=True):
+            all_of_it.extend(more)
+        if len(these.held_up) <= 1:  # about once in 9 s even on an idle machine
+            quiet += 1
+            assert max(these.overtaken) <= 0.02
+            assert max(these.arrived) <= 0.02
+    print(f"all, {quiet} of 7 floods with cores to be had throughout: {found}")
+    # The others tell of the machine: of its 2 cores the flood takes all that it can get.
+    for ages in found[:3]:
+        assert sum(age > 0.02 for age in ages) <= 0.01 * len(ages)
+        assert max(ages) <= 0.02 + SLACK_S
 
 
 # subscribers that stand still
@@ -471,7 +517,7 @@ def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[
 
 
 def test_four_stopped_subscribers_hold_up_no_line(tmp_path: Path) -> None:
-    without, stopped = hoarded(tmp_path, 1, 1.0)
+    without, stopped = hoarded(tmp_path, 1, 0.4)
     assert max(stopped) <= max(without) + 0.005 + SLACK_S
 
 
