@@ -19,11 +19,14 @@ Where to look, in the order the modules may import each other:
     mcu/              wire time, lines, frames (the protocol), session (is the MCU there?)
     drive/            kinematics, odometry, sanity (can this feedback be true?), arbiter (who
                       commands?), limits, modes (the table), lifecycle (what latched it)
-    messages/         schema (the published structs), topics (**the** key table), encodings,
+    messages/         schema (the published structs), topics (**the** key table), cdr, encodings,
                       incoming (sample -> command), report (outputs -> messages), queries
+    ros/              the two ROS trees: names and hashes, tokens, attachments, what stands for
+                      which native key, the configuration as parameters
     robot.py          the order; guard.py: the last look at every outgoing line
     sim/              the vehicle and the fake microcontroller
-    runtime/          clock, ticker, serial device and port, Zenoh bus, logs, control loop, daemon
+    runtime/          clock, ticker, serial device and port, Zenoh bus (inbox, outlets, replies),
+                      logs, control loop, daemon
     client.py         drive and follow a robot from Python
     cli/              one verb per file
 

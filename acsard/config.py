@@ -12,9 +12,9 @@ import tomllib
 from msgspec import convert, to_builtins
 
 from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes, wire_ns, wire_use
-from acsard.settings import BusConfig, Config
+from acsard.settings import BusConfig, Config, RosConfig
 from acsard.validation import build, show
-from acsard.values import WHEELS, AcsardError
+from acsard.values import ROOT, WHEELS, AcsardError
 
 LEAST_JERK = 0.01
 """m/s3 or rad/s3; at less a robot takes over ten seconds to reach walking pace."""
@@ -101,6 +101,16 @@ def warnings(config: Config) -> list[str]:
             f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
             "a second robot there would share its keys; give each its own id"
         )
+    ros = config.ros
+    if (
+        (ros.bridge or ros.rmw)
+        and not ros.namespace
+        and not all(_is_loopback(h) for h in hosts if h)
+    ):
+        found.append(
+            'ros.namespace = "" on a bus that leaves this machine: a second robot there would '
+            "share its ROS topics; give each its own namespace"
+        )
     return found
 
 
@@ -111,6 +121,7 @@ def _contradictions(config: Config) -> list[str]:
         *_name_problems(config),
         *_limit_problems(config),
         *_bus_problems(config.bus),
+        *_ros_problems(config.ros),
     ]
 
 
@@ -187,6 +198,11 @@ def _limit_problems(config: Config) -> list[str]:
 
 def _bus_problems(bus: BusConfig) -> list[str]:
     found = []
+    if bus.mode == "client" and not bus.connect:
+        found.append(
+            'bus.mode = "client": connects to nothing; write bus.connect = ["tcp/127.0.0.1:7447"] '
+            'or bus.mode = "peer"'
+        )
     if not bus.listen:
         found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
     for key, endpoints in (("listen", bus.listen), ("connect", bus.connect)):
@@ -205,6 +221,15 @@ def _bus_problems(bus: BusConfig) -> list[str]:
                     "there can drive the robot: bus.insecure = true"
                 )
     return found
+
+
+def _ros_problems(ros: RosConfig) -> list[str]:
+    if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
+        return [
+            f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, which the '
+            'bridge\'s would fall among; write another, like "robot1"'
+        ]
+    return []
 
 
 def _host(endpoint: str) -> str | None:

@@ -33,6 +33,20 @@ Text = Annotated[
         extra={"unit": "a text of 1 to 256 characters"},
     ),
 ]
+RosNode = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,63}\Z",
+        extra={"unit": "a ROS name: letters, digits and _, not a digit first", "example": "acsard"},
+    ),
+]
+RosNamespace = Annotated[
+    str,
+    Meta(
+        pattern=r"^(|[A-Za-z_][A-Za-z0-9_]{0,63}(/[A-Za-z_][A-Za-z0-9_]{0,63}){0,3})\Z",
+        extra={"unit": "ROS names with / between them, or empty", "example": "robot1"},
+    ),
+]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
 Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
 Angle = Annotated[float, Meta(ge=-6.2832, le=6.2832, extra={"unit": "rad"})]
@@ -170,9 +184,20 @@ class RatesConfig(Struct, frozen=True):
 
 
 class BusConfig(Struct, frozen=True):
+    mode: Literal["peer", "client"] = "peer"
     listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
     connect: tuple[Text, ...] = ()
     insecure: bool = False
+
+
+class RosConfig(Struct, frozen=True):
+    bridge: bool = True
+    rmw: bool = True
+    announce: bool = True
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    namespace: RosNamespace = ""
+    node: RosNode = "acsard"
+    cmd_vel_type: Literal["auto", "twist", "twist_stamped"] = "auto"
 
 
 class LogConfig(Struct, frozen=True):
@@ -200,6 +225,7 @@ class Config(Struct, frozen=True):
     footprint: FootprintConfig = FootprintConfig()
     rates: RatesConfig = RatesConfig()
     bus: BusConfig = BusConfig()
+    ros: RosConfig = RosConfig()
     log: LogConfig = LogConfig()
     sim: SimConfig = SimConfig()
 

@@ -15,6 +15,9 @@ WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
 NS_PER_S = 1_000_000_000
 
+ROOT = "acsard"
+"""Begins every key of the native tree: `acsard/<robot.id>/...`."""
+
 
 class AcsardError(Exception):
     """Base of the errors acsard raises on purpose; anything else that is raised is a bug."""

@@ -65,6 +65,8 @@ def json_line(encoding: str, payload: bytes) -> str:
 
     try:
         form = detect(encoding, payload)
+        if form == "cdr":
+            raise DecodeError("unknown_encoding", "CDR does not say of what type it is")
         codec = msgspec.json if form == "json" else msgspec.msgpack
         return msgspec.json.encode(codec.decode(payload)).decode()
     except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):

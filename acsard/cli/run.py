@@ -92,8 +92,8 @@ def main(args: argparse.Namespace) -> int:
 def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
     """What a person sees first."""
     from acsard import __version__
-    from acsard.messages.topics import ROOT
     from acsard.runtime.daemon import SIMULATOR
+    from acsard.values import ROOT
 
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:

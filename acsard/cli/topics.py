@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_config, load
+
+if TYPE_CHECKING:
+    from acsard.messages.schema import Topics
+    from acsard.settings import RosConfig
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -16,6 +21,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--ros", action="store_true", help="list the ROS 2 names instead")
     parser.set_defaults(main=main)
 
 
@@ -25,7 +31,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.messages.queries import topic_table
 
     _, config = load(args.config)
-    table = topic_table(config.robot.id)
+    table = ros_table(config.ros) if args.ros else topic_table(config.robot.id)
     if args.json:
         print(encode(table, "json").decode())
         return 0
@@ -36,3 +42,21 @@ def main(args: argparse.Namespace) -> int:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
         print("  ".join([*cells, row[4]]).rstrip())
     return 0
+
+
+def ros_table(ros: RosConfig) -> Topics:
+    """The ROS topics and services, each with the native key it stands for."""
+    from acsard.messages.schema import TopicInfo, Topics
+    from acsard.messages.topics import by_key
+    from acsard.ros.names import full_name
+    from acsard.ros.trees import PARAMETERS, ros_names
+
+    rows = []
+    for row in ros_names(ros) if ros.bridge or ros.rmw else ():
+        native = by_key(row.native)
+        note = "the configuration, read-only"
+        if not row.native.startswith(PARAMETERS):
+            note = f"as {row.native}" + (f": {native.note}" if native else "")
+        name = full_name(ros.namespace, row.name)
+        rows.append(TopicInfo(name, row.direction, row.type, native.rate if native else "", note))
+    return Topics(rows)

@@ -1,7 +1,8 @@
-"""msgpack and JSON by name, and what an incoming sample is encoded in.
+"""msgpack, JSON and CDR by name, and what an incoming sample is encoded in.
 
-An Encoding that says so is believed; without one the first byte decides: `{` (after white space)
-is JSON, a msgpack map header is msgpack. Decoding raises `DecodeError` and nothing else.
+An Encoding that says so is believed; without one the first bytes decide: `{` (after white space)
+is JSON, a msgpack map header is msgpack, `00 00` or `00 01` is CDR. Decoding raises `DecodeError`
+and nothing else.
 """
 
 from __future__ import annotations
@@ -10,14 +11,19 @@ from typing import Generic, Literal, TypeVar
 
 import msgspec
 
+from acsard.messages.cdr import Cdr, CdrError
 from acsard.values import AcsardError
 
-Format = Literal["msgpack", "json"]
-FORMATS: tuple[Format, ...] = ("msgpack", "json")
+Format = Literal["msgpack", "json", "cdr"]
+FORMATS: tuple[Format, ...] = ("msgpack", "json", "cdr")
 
 T = TypeVar("T")
 
-_MIME: dict[Format, str] = {"msgpack": "application/msgpack", "json": "application/json"}
+_MIME: dict[Format, str] = {
+    "msgpack": "application/msgpack",
+    "json": "application/json",
+    "cdr": "application/cdr",
+}
 _pack = msgspec.msgpack.Encoder()
 _text = msgspec.json.Encoder()
 
@@ -36,40 +42,66 @@ def encoding_name(form: Format, type_name: str = "") -> str:
 
 
 def encode(message: object, form: Format) -> bytes:
-    """The message as bytes."""
+    """The message as bytes; raises `DecodeError` for CDR of a type it cannot tell."""
+    if form == "cdr":
+        return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
+
+
+def _codec(cls: type[T]) -> Cdr[T]:
+    try:
+        return Cdr(cls)
+    except TypeError:
+        raise DecodeError(
+            "unknown_format", f"{cls.__name__} is no ROS message and has no CDR form: use JSON"
+        ) from None
 
 
 def detect(encoding: str, payload: bytes) -> Format:
     """How the payload is encoded; raises `DecodeError` when that cannot be told."""
     mime = encoding.partition(";")[0]
-    if mime == "application/msgpack":
-        return "msgpack"
-    if mime in ("application/json", "text/json"):
+    for form in FORMATS:
+        if mime == _MIME[form]:
+            return form
+    if mime == "text/json":
         return "json"
     first = payload.lstrip(b" \t\r\n")[:1]
     if first == b"{":
         return "json"
     if first and (0x80 <= first[0] <= 0x8F or first[0] in (0xDE, 0xDF)):
         return "msgpack"
+    if payload[:2] in (b"\x00\x00", b"\x00\x01"):
+        return "cdr"
     raise DecodeError(
-        "unknown_encoding", f"neither a JSON object nor a msgpack map: {payload[:16]!r}"
+        "unknown_encoding",
+        f"neither a JSON object, a msgpack map nor CDR: {payload[:16]!r}",
     )
 
 
 class Decoder(Generic[T]):
-    """Decodes payloads of one type from either encoding."""
+    """Decodes payloads of one type in any of the encodings."""
 
     def __init__(self, cls: type[T]) -> None:
+        self._cls = cls
         self._pack = msgspec.msgpack.Decoder(cls)
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
         """The message; raises `DecodeError` for anything that is not one."""
         form = detect(encoding, payload)
+        if form == "cdr":
+            return decode_cdr(self._cls, payload)
         try:
             return self._pack.decode(payload) if form == "msgpack" else self._text.decode(payload)
         except msgspec.ValidationError as error:
             raise DecodeError("wrong_shape", str(error)) from None
         except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
             raise DecodeError("malformed", str(error)) from None
+
+
+def decode_cdr(cls: type[T], payload: bytes) -> T:
+    """The message in a CDR payload; raises `DecodeError`."""
+    try:
+        return _codec(cls).decode(payload)
+    except CdrError as error:
+        raise DecodeError("malformed", str(error)) from None

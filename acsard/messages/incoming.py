@@ -7,12 +7,14 @@ in any field, or came by a wildcard key or a DELETE refreshes nothing.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from msgspec import UNSET, Struct, UnsetType
 
 from acsard.drive.kinematics import Kinematics
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import Header, JointState, SetPose, Twist, Vector3
+from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
+from acsard.ros.attachments import unpack
 from acsard.settings import JointsConfig
 from acsard.values import Command, Pose, Request, Verb, WheelSpeeds
 from acsard.values import Twist as BodyTwist
@@ -21,8 +23,15 @@ MAX_COMMAND_BYTES = 4096
 """A TwistStamped is under 300 bytes as JSON; more than this is not a command."""
 
 
+Via = Literal["native", "bridge", "rmw"]
+"""The tree a sample or query came by."""
+
+
 class Arrival(Struct, frozen=True):
-    """A sample as the bus shell took it from Zenoh, key below `acsard/<id>/`."""
+    """A sample as the bus shell took it from Zenoh, key below `acsard/<id>/`.
+
+    One that came on a ROS key has the native key it stands for.
+    """
 
     key: str
     put: bool
@@ -32,6 +41,8 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's own timestamp, when it is the sender's."""
     sender: str
+    via: Via = "native"
+    attachment: bytes = b""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,6 +53,9 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
     header: Header | UnsetType = UNSET
     twist: Twist | UnsetType = UNSET
 
+
+TWIST_CDR_BYTES = 52
+"""A Twist in CDR has so many bytes, a TwistStamped at least 68: nothing else tells them apart."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -64,17 +78,17 @@ class Receiver:
             raise DecodeError("not_a_put", "a DELETE is not a command")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+        stamp_ns, sender = _stamp(arrival)
         if kind == "cmd":
             twist, header = self._twist(arrival)
         else:
             twist, header = self._wheel_speeds(arrival)
-        stamp_ns, sender = arrival.stamp_ns, arrival.sender or arrival.key
         if header is not None and header.stamp.to_ns() > 0:
             stamp_ns = header.stamp.to_ns()
         return Command(source, twist, arrival.arrived_ns, stamp_ns, sender)
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:
-        got = _twists.decode(arrival.encoding, arrival.payload)
+        got = _twist_payload(arrival)
         header = None
         linear, angular = got.linear, got.angular
         if not isinstance(got.twist, UnsetType):
@@ -121,3 +135,23 @@ class Receiver:
         ):
             raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
         return Request(verb, number, Pose(got.x, got.y, got.yaw), asked_ns)
+
+
+def _stamp(arrival: Arrival) -> tuple[int | None, str]:
+    """When it was sent by whose clock, as far as its envelope says; raises `DecodeError`."""
+    if arrival.via == "rmw":
+        attached = unpack(arrival.attachment)
+        return attached.stamp_ns, attached.gid.hex()
+    # A bridge says nothing of the ROS node behind it: all those on a key share a clock's name.
+    name = arrival.key if arrival.via == "native" else f"{arrival.via}/{arrival.key}"
+    return arrival.stamp_ns, arrival.sender or name
+
+
+def _twist_payload(arrival: Arrival) -> _TwistPayload:
+    if detect(arrival.encoding, arrival.payload) != "cdr":
+        return _twists.decode(arrival.encoding, arrival.payload)
+    if len(arrival.payload) < TWIST_CDR_BYTES + 8:
+        twist = decode_cdr(Twist, arrival.payload)
+        return _TwistPayload(linear=twist.linear, angular=twist.angular)
+    stamped = decode_cdr(TwistStamped, arrival.payload)
+    return _TwistPayload(header=stamped.header, twist=stamped.twist)

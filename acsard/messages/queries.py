@@ -13,8 +13,9 @@ import msgspec
 from msgspec import Struct
 
 from acsard.config import effective
+from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
-from acsard.messages.incoming import Receiver
+from acsard.messages.incoming import Receiver, Via
 from acsard.messages.schema import (
     MESSAGES,
     HardwareInterface,
@@ -26,6 +27,9 @@ from acsard.messages.schema import (
     Topics,
 )
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.ros.attachments import Attachment, unpack
+from acsard.ros.parameters import Parameters
+from acsard.ros.trees import PARAMETERS
 from acsard.settings import Config
 from acsard.values import Answer, Outputs, Request, Verb
 
@@ -45,6 +49,8 @@ class Query(Struct, frozen=True):
     payload: bytes
     encoding: str
     arrived_ns: int | None = None
+    via: Via = "native"
+    attachment: bytes = b""
 
 
 class Reply(Struct, frozen=True):
@@ -55,6 +61,7 @@ class Reply(Struct, frozen=True):
     payload: bytes
     encoding: str
     ok: bool = True
+    attachment: bytes = b""
 
 
 class Queries:
@@ -68,12 +75,18 @@ class Queries:
             "topics": topic_table(config.robot.id),
         }
         self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
-        self._waiting: dict[int, tuple[str, Format]] = {}
+        self._parameters = Parameters(effective(config))
+        self._waiting: dict[int, tuple[str, Format, Attachment | None]] = {}
 
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """The replies to a query, none when it is not for us; a `Request` when it is a service."""
+        """The replies to a query, none when it is not for us; a `Request` when it is a service.
+
+        Raises `DecodeError` for a ROS request that cannot be answered: ROS clients hear no errors.
+        """
+        if query.via != "native":
+            return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
         try:
             form = _format(query)
             if query.topic.startswith("srv/"):
@@ -85,14 +98,30 @@ class Queries:
         except DecodeError as error:
             return [self._error(query, str(error))]
 
-    def answered(self, answer: Answer) -> Reply | None:
-        """The reply that carries a robot's answer; None when nobody waits for it."""
+    def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
+        """The reply that carries a robot's answer now; None when nobody waits for it."""
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
-        key, form = waiting
-        message = ServiceReply(answer.success, answer.message)
-        return Reply(answer.id, key, encode(message, form), encoding_name(form, "ServiceReply"))
+        key, form, asked = waiting
+        payload = encode(ServiceReply(answer.success, answer.message), form)
+        encoding = encoding_name(form, "ServiceReply")
+        return Reply(answer.id, key, payload, encoding, attachment=_echo(asked, wall_ns))
+
+    def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
+        """A std_srvs/Trigger, or one of the parameter services."""
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+        if query.topic.startswith("srv/"):
+            verb = cast(Verb, query.topic.removeprefix("srv/"))
+            self._waiting[query.number] = (query.topic, "cdr", asked)
+            return Request(verb, query.number, asked_ns=query.arrived_ns)
+        try:
+            service = query.topic.removeprefix(PARAMETERS)
+            payload = self._parameters.answer(service, query.payload)
+        except CdrError as error:
+            raise DecodeError("malformed", str(error)) from None
+        attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
+        return [Reply(query.number, query.topic, payload, encoding, attachment=attachment)]
 
     def _service(self, query: Query, form: Format) -> list[Reply] | Request:
         verb = query.topic.removeprefix("srv/")
@@ -110,7 +139,7 @@ class Queries:
             message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.number, query.topic, payload, name)]
-        self._waiting[query.number] = (query.topic, form)
+        self._waiting[query.number] = (query.topic, form, None)
         return request
 
     def _values(
@@ -134,13 +163,20 @@ class Queries:
         return Reply(query.number, query.topic, text.encode(), "text/plain", ok=False)
 
 
+def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
+    """What rmw_zenoh finds the caller of a reply by: the request's sequence and GID."""
+    return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
+
+
 def _format(query: Query) -> Format:
     """The encoding asked for: `?fmt=`, else a service's own payload's, else JSON for people."""
     for form in FORMATS:
         if query.fmt == form:
             return form
     if query.fmt:
-        raise DecodeError("unknown_format", f"fmt={query.fmt}: write fmt=json or fmt=msgpack")
+        raise DecodeError(
+            "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
+        )
     if query.topic.startswith("srv/") and query.payload:
         try:
             return detect(query.encoding, query.payload)

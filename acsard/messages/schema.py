@@ -12,8 +12,11 @@ from msgspec import Meta, Struct
 
 from acsard.values import NS_PER_S
 
-Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
-Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S)]
+# What `cdr.py` has to know: the width of an int in CDR, the length of an array.
+Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
+Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
+Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
+Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True):
@@ -28,8 +31,9 @@ class Time(Message, frozen=True):
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:
-        """The time `wall_ns` nanoseconds after 1970."""
-        return cls(*divmod(wall_ns, NS_PER_S))
+        """The time `wall_ns` nanoseconds after 1970; held to what an int32 can tell (1901-2038)."""
+        sec, nanosec = divmod(wall_ns, NS_PER_S)
+        return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
 
     def to_ns(self) -> int:
         """Nanoseconds since 1970."""
@@ -85,14 +89,14 @@ class PoseWithCovariance(Message, frozen=True):
     """A pose and its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
 
     pose: Pose
-    covariance: list[float]
+    covariance: Covariance
 
 
 class TwistWithCovariance(Message, frozen=True):
     """A twist and its 6x6 covariance, row major, m/s and rad/s."""
 
     twist: Twist
-    covariance: list[float]
+    covariance: Covariance
 
 
 class Odometry(Message, frozen=True):
@@ -175,7 +179,7 @@ class KeyValue(Message, frozen=True):
 class DiagnosticStatus(Message, frozen=True):
     """`level` 0 ok, 1 warning, 2 error, 3 stale."""
 
-    level: int
+    level: Byte
     name: str
     message: str
     hardware_id: str

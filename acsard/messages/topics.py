@@ -10,9 +10,7 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
-from acsard.values import Verb
-
-ROOT = "acsard"
+from acsard.values import ROOT, Verb
 
 Direction = Literal["out", "in", "query"]
 

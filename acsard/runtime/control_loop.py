@@ -64,8 +64,9 @@ class BusInput(Struct, frozen=True):
 class Bus(Protocol):
     """The bus as the loop sees it."""
 
-    wanted: set[str]
-    """Published keys that somebody listens to."""
+    @property
+    def wanted(self) -> set[str]:
+        """Published keys that somebody listens to."""
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
@@ -162,7 +163,11 @@ class ControlLoop:
             except DecodeError as error:
                 refusals.append(Refusal(error.reason, f"{arrival.key}: {error}"))
         for query in got.queries:
-            served = self._queries.serve(query, self._current, self.outputs)
+            try:
+                served = self._queries.serve(query, self._current, self.outputs)
+            except DecodeError as error:
+                refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
+                served = []
             if isinstance(served, Request):
                 requests.append(served)
                 continue
@@ -190,7 +195,7 @@ class ControlLoop:
         for key, message in self.report.due(outputs, bus.wanted, self._look):
             bus.publish(key, message)
         for answer in outputs.answers:
-            reply = self._queries.answered(answer)
+            reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:
                 bus.reply(reply)
                 bus.done(reply.number)

@@ -113,9 +113,11 @@ async def _run(
             mcu = FakeMcu(config, clock.now().mono_ns)
             path = stack.enter_context(SimPty(mcu)).path
         sources = tuple(source.name for source in config.commands.sources)
-        bus = ZenohBus(config.bus, config.robot.id, sources)
+        bus = ZenohBus(config.bus, config.ros, config.robot.id, sources)
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
+        if config.bus.mode == "client":
+            log.info("connecting", text=f"waits for the router at {', '.join(config.bus.connect)}")
         await stack.enter_async_context(bus)
         await stack.enter_async_context(port)
         control = ControlLoop(config, _info(config, path), port, bus, clock.now(), log.event)

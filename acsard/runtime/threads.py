@@ -15,9 +15,9 @@ T = TypeVar("T")
 
 
 async def in_thread(
-    call: Callable[[], T], timeout: float, late: Callable[[T], None] | None = None
+    call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """The result of `call`, or `TimeoutError` after `timeout` s.
+    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever).
 
     `late` gets (in the thread) a result that nobody waits for any more, to give it back.
     """

@@ -25,13 +25,16 @@ MESSAGE_BYTES = 65536
 """Largest message taken from a link; commands are held to far less in code."""
 
 
-def daemon_session(bus: BusConfig, robot_id: str, sources: tuple[str, ...]) -> zenoh.Session:
+def daemon_session(
+    bus: BusConfig, robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+) -> zenoh.Session:
     """The daemon's session: a peer that listens where it is told, finds nobody by itself.
 
-    Raises `ExitError` when the address is taken. Blocks; call it in a thread.
+    `limited` are the ROS keys commands come in on. Raises `ExitError` when the address is taken.
+    Blocks, as a client until its router is there; call it in a thread.
     """
-    settings = _base("peer") | {
-        "listen/endpoints": list(bus.listen),
+    settings = _base(bus.mode) | {
+        "listen/endpoints": list(bus.listen) if bus.mode == "peer" else [],
         "connect/endpoints": list(bus.connect),
         # Peers behind a router find each other by gossip only; without a router there is nobody.
         "scouting/gossip/enabled": bool(bus.connect),
@@ -45,7 +48,7 @@ def daemon_session(bus: BusConfig, robot_id: str, sources: tuple[str, ...]) -> z
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
         "queries_default_timeout": 3000,
-        "downsampling": [_command_limits(robot_id, sources)],
+        "downsampling": [_command_limits(robot_id, sources, limited)],
     }
     if bus.connect:
         settings |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
@@ -98,10 +101,13 @@ def _base(mode: str) -> dict[str, object]:
     }
 
 
-def _command_limits(robot_id: str, sources: tuple[str, ...]) -> dict[str, object]:
+def _command_limits(
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
     names = [*sources, "*"]
     keys = [full_key(robot_id, f"{kind}/{n}") for kind in ("cmd", "wheel_cmd") for n in names]
+    keys += limited
     return {
         "id": "commands",
         "messages": ["put", "delete"],

@@ -8,13 +8,14 @@ import msgspec
 import pytest
 
 from acsard.cli.echo import json_line
-from acsard.messages.encodings import FORMATS, Format, encode, encoding_name
+from acsard.messages.encodings import Format, encode, encoding_name
+from acsard.messages.schema import Twist, Vector3
 from tests.unit.messages.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["json", "msgpack"])
 @pytest.mark.parametrize("named", [True, False])
 def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
     line = json_line(encoding_name(form, "State") if named else "", encode(BODY, form))
@@ -25,6 +26,12 @@ def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
 def test_a_whole_message_is_shown_in_full() -> None:
     line = json_line("", encode(OUTPUTS, "msgpack"))
     assert msgspec.json.decode(line) == msgspec.json.decode(encode(OUTPUTS, "json"))
+
+
+@pytest.mark.parametrize("encoding", ["", "application/cdr"])
+def test_cdr_does_not_say_its_type_and_is_shown_as_the_bytes_it_is(encoding: str) -> None:
+    payload = encode(Twist(Vector3(0.5), Vector3(z=0.2)), "cdr")
+    assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
 
 
 def test_white_space_between_is_dropped() -> None:
@@ -56,6 +63,9 @@ def test_a_number_that_is_not_finite_is_null() -> None:
         ("application/json", b"\x80"),
         ("application/msgpack", b"\xc1"),
         ("application/msgpack", b"{}"),
+        ("application/cdr", b""),
+        ("application/cdr", b"\x05"),
+        ("application/cdr", b"\x81\xa1a\x01"),
     ],
 )
 def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, payload: bytes) -> None:

@@ -1,6 +1,8 @@
-"""msgpack and JSON by name and by first byte; whatever comes, only `DecodeError` goes up."""
+"""msgpack, JSON and CDR by name and by first bytes; whatever comes, only `DecodeError` goes up."""
 
 from __future__ import annotations
+
+import struct
 
 import msgspec
 import pytest
@@ -16,9 +18,10 @@ from acsard.messages.encodings import (
     encode,
     encoding_name,
 )
-from acsard.messages.schema import Twist, Vector3
+from acsard.messages.schema import Info, RobotState, Time, Twist, Vector3
 
 TWIST = Twist(Vector3(0.5), Vector3(z=0.2))
+AS_CDR = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0.2)
 AS_JSON = b'{"linear":{"x":0.5,"y":0.0,"z":0.0},"angular":{"x":0.0,"y":0.0,"z":0.2}}'
 
 twists = Decoder(Twist)
@@ -33,7 +36,9 @@ def refusal(encoding: str, payload: bytes) -> str:
 def test_an_encoding_names_the_format_the_type_and_its_version() -> None:
     assert encoding_name("msgpack", "Odometry") == "application/msgpack;acsard.Odometry.v1"
     assert encoding_name("json", "Odometry") == "application/json;acsard.Odometry.v1"
+    assert encoding_name("cdr", "Odometry") == "application/cdr;acsard.Odometry.v1"
     assert encoding_name("json") == "application/json"
+    assert encoding_name("cdr") == "application/cdr"
 
 
 def test_json_is_the_maps_of_the_ros_message() -> None:
@@ -42,6 +47,38 @@ def test_json_is_the_maps_of_the_ros_message() -> None:
 
 def test_msgpack_is_the_same_maps() -> None:
     assert msgspec.msgpack.decode(encode(TWIST, "msgpack")) == msgspec.json.decode(AS_JSON)
+
+
+def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
+    assert encode(TWIST, "cdr") == AS_CDR
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"x": 0.5},
+        [0.5],
+        0.5,
+        None,
+        Info("r7", "1.2.3", 42, "/dev/x", True, 100.0, [], []),
+        RobotState(Time(), "", "", 0, 0, 0, 0, 0, [], "", "", [], "", {}),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
+    with pytest.raises(DecodeError, match=f"{type(value).__name__} is no ROS message") as caught:
+        encode(value, "cdr")
+    assert caught.value.reason == "unknown_format"
+
+
+@pytest.mark.parametrize("cls", [dict, Info, RobotState])
+@pytest.mark.parametrize("encoding", ["", "application/cdr"])
+def test_what_is_no_ros_message_is_not_read_from_cdr_either(
+    cls: type[object], encoding: str
+) -> None:
+    with pytest.raises(DecodeError) as caught:
+        Decoder(cls).decode(encoding, AS_CDR)
+    assert caught.value.reason == "unknown_format"
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -59,9 +96,12 @@ def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named:
         ("text/json", "json"),
         ("application/msgpack", "msgpack"),
         ("application/msgpack;whatever", "msgpack"),
+        ("application/cdr", "cdr"),
+        ("application/cdr;acsard.Twist.v1", "cdr"),
+        ("application/cdr;whatever", "cdr"),
     ],
 )
-@pytest.mark.parametrize("payload", [AS_JSON, encode(TWIST, "msgpack"), b"", b"\xff"])
+@pytest.mark.parametrize("payload", [AS_JSON, encode(TWIST, "msgpack"), AS_CDR, b"", b"\xff"])
 def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload: bytes) -> None:
     assert detect(encoding, payload) == form
 
@@ -77,18 +117,25 @@ def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload:
         (b"\x8f", "msgpack"),
         (b"\xde\x00\x10", "msgpack"),
         (b"\xdf\x00\x00\x00\x10", "msgpack"),
+        (b"\x00\x00", "cdr"),
+        (b"\x00\x01", "cdr"),
+        (b"\x00\x00\x00\x00", "cdr"),
+        (b"\x00\x01\x00\x03", "cdr"),
+        (b"\x00\x01\xff\xff{}", "cdr"),
     ],
 )
-def test_without_one_the_first_byte_decides(encoding: str, payload: bytes, form: str) -> None:
+def test_without_one_the_first_bytes_decide(encoding: str, payload: bytes, form: str) -> None:
     assert detect(encoding, payload) == form
 
 
 @pytest.mark.parametrize(
     "payload",
     [b"", b"   ", b"[1]", b'"stop"', b"1", b"null", b"\x90", b"\x93\x01", b"\x7f", b"\xa1x",
-     b"\xc0", b"\xdc\x00\x00", b"\xdd", b"\x00\x01\x00\x00", b"\xef\xbb\xbf{}"],
+     b"\xc0", b"\xdc\x00\x00", b"\xdd", b"\x00", b"\x00\x02\x00\x00",
+     b"\x00\x03\x00\x00", b"\x01\x00\x00\x00", b"\x00\x07\x00\x00", b"\n\x00\x01",
+     b"\xef\xbb\xbf{}"],
 )  # fmt: skip
-def test_what_is_neither_a_json_object_nor_a_msgpack_map_is_not_guessed(payload: bytes) -> None:
+def test_what_is_no_json_object_no_msgpack_map_and_no_cdr_is_not_guessed(payload: bytes) -> None:
     assert refusal("", payload) == "unknown_encoding"
 
 
@@ -134,7 +181,40 @@ def test_msgpack_that_is_not_the_message_is_refused_by_reason(payload: bytes, re
     assert refusal("application/msgpack", payload) == reason
 
 
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x00\x01",
+        b"\x00\x01\x00",
+        b"\x00\x01\x00\x00",
+        b"\x00\x02" + AS_CDR[2:],
+        b"\x00\x03" + AS_CDR[2:],
+        AS_CDR[4:],
+        AS_CDR[:-1],
+        AS_CDR[:-8],
+    ],
+)
+def test_cdr_that_is_not_the_message_is_refused_as_malformed(payload: bytes) -> None:
+    assert refusal("application/cdr", payload) == "malformed"
+
+
+@pytest.mark.parametrize("surplus", [1, 3, 4, 7, 100])
+def test_surplus_bytes_after_cdr_are_padding(surplus: int) -> None:
+    assert twists.decode("", AS_CDR + b"\xff" * surplus) == TWIST
+
+
+def test_cdr_in_the_other_byte_order_is_read_too() -> None:
+    swapped = b"\x00\x00\x00\x00" + struct.pack(">6d", 0.5, 0, 0, 0, 0, 0.2)
+    assert twists.decode("", swapped) == TWIST
+    assert twists.decode("application/cdr", swapped) == TWIST
+
+
 def test_a_payload_of_the_other_format_than_it_says_is_refused() -> None:
+    assert refusal("application/cdr", AS_JSON) == "malformed"
+    assert refusal("application/cdr", encode(TWIST, "msgpack")) == "malformed"
+    assert refusal("application/json", AS_CDR) == "malformed"
+    assert refusal("application/msgpack", AS_CDR) in ("malformed", "wrong_shape")
     assert refusal("application/msgpack", AS_JSON) in ("malformed", "wrong_shape")
     assert refusal("application/json", encode(TWIST, "msgpack")) == "malformed"
 
@@ -158,7 +238,7 @@ def test_deep_nesting_is_refused(start: bytes, nested: bytes, depth: int) -> Non
     assert refusal("", start + nested * depth) in ("wrong_shape", "malformed")
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["json", "msgpack"])
 def test_deep_nesting_is_refused_also_where_any_value_is_welcome(form: Format) -> None:
     anything = Decoder(dict[str, object])
     deep = b'{"x":' * 50_000 if form == "json" else b"\x81\xa1x" * 50_000
@@ -167,8 +247,16 @@ def test_deep_nesting_is_refused_also_where_any_value_is_welcome(form: Format) -
     assert caught.value.reason == "malformed"
 
 
-@given(st.binary(max_size=80), st.sampled_from(["", "application/json", "application/msgpack"]))
-@settings(max_examples=300)
+headed = st.builds(
+    bytes.__add__, st.sampled_from([AS_CDR[:4], bytes(4)]), st.binary(min_size=40, max_size=80)
+)
+
+
+@given(
+    st.binary(max_size=80) | headed,
+    st.sampled_from(["", "application/json", "application/msgpack", "application/cdr"]),
+)
+@settings(max_examples=400)
 def test_any_bytes_are_a_message_or_a_decode_error(payload: bytes, encoding: str) -> None:
     try:
         got = twists.decode(encoding, payload)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import struct
 from typing import Any
 
 import msgspec
@@ -13,8 +14,11 @@ from acsard.drive.arbiter import Arbiter
 from acsard.drive.kinematics import Kinematics
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.messages.incoming import MAX_COMMAND_BYTES, Arrival, Receiver
+from acsard.messages.schema import JointState, TwistStamped
+from acsard.messages.schema import Twist as TwistMessage
+from acsard.ros.attachments import Attachment
 from acsard.settings import CommandsConfig, DriveConfig, JointsConfig
-from acsard.values import Command, Pose, Request, Twist
+from acsard.values import Command, Pose, Request, Twist, WheelSpeeds
 
 KINEMATICS = Kinematics(DriveConfig())
 RECEIVER = Receiver(JointsConfig(), KINEMATICS)
@@ -31,11 +35,19 @@ def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
     return Arrival(key=key, payload=payload, arrived_ns=ARRIVED_NS, **given)
 
 
-def command(body: object, form: Format = "msgpack", **changes: Any) -> Command:
-    return RECEIVER.command(arrival(encode(body, form), **changes))
+def written(body: dict[str, Any], form: Format) -> bytes:
+    """A body as bytes; CDR has no names, so that it takes the message and not its fields."""
+    if form != "cdr":
+        return encode(body, form)
+    cls = TwistStamped if "twist" in body else JointState if "name" in body else TwistMessage
+    return encode(msgspec.convert(body, cls), form)
 
 
-def wheels(body: object, form: Format = "msgpack", **changes: Any) -> Command:
+def command(body: dict[str, Any], form: Format = "msgpack", **changes: Any) -> Command:
+    return RECEIVER.command(arrival(written(body, form), **changes))
+
+
+def wheels(body: dict[str, Any], form: Format = "msgpack", **changes: Any) -> Command:
     return command(body, form, key="wheel_cmd/app", **changes)
 
 
@@ -212,6 +224,137 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
     assert refused(joints(1.0, 1.0, 1.0, 1.0), key="cmd/app") == "wrong_shape"
 
 
+# as ROS 2 itself writes it
+
+ORDERS = [b"\x00\x00\x00\x00", b"\x00\x01\x00\x00"]
+"""Headers of CDR: big endian, little endian."""
+
+
+def cdr(header: bytes, layout: str, *values: object) -> bytes:
+    return header + struct.pack((">" if header == ORDERS[0] else "<") + layout, *values)
+
+
+def native_twist(header: bytes = ORDERS[1], linear: float = 0.5, angular: float = 0.2) -> bytes:
+    return cdr(header, "6d", linear, 0, 0, 0, 0, angular)
+
+
+def native_stamped(header: bytes, frame: bytes, sec: int = 3, nanosec: int = 4) -> bytes:
+    pad = -(12 + len(frame) + 1) % 8
+    layout = f"iII{len(frame) + 1}s{pad}x6d"
+    return cdr(header, layout, sec, nanosec, len(frame) + 1, frame, 0.5, 0, 0, 0, 0, 0.2)
+
+
+def native_joints(header: bytes, velocity: list[float]) -> bytes:
+    names = b""
+    for joint in JOINTS:
+        names += bytes(-len(names) % 4)
+        names += cdr(header, f"I{len(joint) + 1}s", len(joint) + 1, joint.encode())[4:]
+    body = cdr(header, "iIIB3xI", 0, 0, 1, 0, len(JOINTS)) + names + bytes(-len(names) % 4)
+    body += cdr(header, "II", 0, len(velocity))[4:]
+    body += bytes(-(len(body) - 4) % 8)
+    return body + cdr(header, f"{len(velocity)}dI", *velocity, 0)[4:]
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "application/cdr"])
+def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -> None:
+    payload = native_twist(header)
+    assert len(payload) == 52
+    got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "cmd/app")
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize(("frame", "size"), [(b"", 68), (b"base_link", 76)])
+def test_a_native_stamped_twist_is_a_command_with_its_stamp(
+    header: bytes, frame: bytes, size: int
+) -> None:
+    payload = native_stamped(header, frame)
+    assert len(payload) == size
+    got = RECEIVER.command(arrival(payload, stamp_ns=5))
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, "cmd/app")
+
+
+@pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
+def test_a_native_stamped_twist_may_have_any_frame(frame: bytes) -> None:
+    assert RECEIVER.command(arrival(native_stamped(ORDERS[1], frame))).twist == Twist(0.5, 0.2)
+
+
+@pytest.mark.parametrize("surplus", range(8))
+@pytest.mark.parametrize("fill", [b"\x00", b"\xff"])
+def test_up_to_seven_surplus_bytes_make_no_other_command(surplus: int, fill: bytes) -> None:
+    more = fill * surplus
+    assert RECEIVER.command(arrival(native_twist() + more)).twist == Twist(0.5, 0.2)
+    for frame in (b"", b"base_link"):
+        got = RECEIVER.command(arrival(native_stamped(ORDERS[1], frame) + more))
+        assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
+
+
+@pytest.mark.parametrize("header", ORDERS)
+def test_native_wheel_speeds_are_the_twist_they_give(header: bytes) -> None:
+    payload = native_joints(header, [4.0, 2.0, 2.0, 4.0])
+    got = RECEIVER.command(arrival(payload, key="wheel_cmd/app"))
+    assert got.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize("bad", NOT_FINITE)
+def test_a_native_number_that_is_not_finite_is_refused(header: bytes, bad: float) -> None:
+    for place in range(6):
+        axes = [0.1 * place] * 6
+        axes[place] = bad
+        assert refusal(arrival(cdr(header, "6d", *axes))) == "not_finite"
+    for place in range(4):
+        speeds = [1.0] * 4
+        speeds[place] = bad
+        payload = native_joints(header, speeds)
+        assert refusal(arrival(payload, key="wheel_cmd/app")) == "not_finite"
+
+
+@pytest.mark.parametrize("size", [n for n in range(4, 68) if not 52 <= n <= 59])
+def test_no_native_twist_has_another_length(size: int) -> None:
+    payload = (native_twist() + bytes(68))[:size]
+    assert refusal(arrival(payload)) == "malformed"
+
+
+@pytest.mark.parametrize("size", range(4, 76))
+def test_a_native_stamped_twist_that_is_cut_is_no_stamped_twist(size: int) -> None:
+    payload = native_stamped(ORDERS[1], b"base_link")[:size]
+    if 52 <= size < 60:  # as long as a Twist, and nothing else tells them apart
+        assert RECEIVER.command(arrival(payload)).stamp_ns is None
+    else:
+        assert refusal(arrival(payload)) == "malformed"
+
+
+@pytest.mark.parametrize(
+    ("key", "payload"),
+    [
+        ("cmd/app", native_stamped(ORDERS[1], b"", nanosec=1_000_000_000)),
+        ("cmd/app", native_stamped(ORDERS[1], b"\xff\xfe")),
+        ("cmd/app", native_stamped(ORDERS[1], b"").replace(b"\x01\0\0\0\0", b"\x01\0\0\0x")),
+        ("cmd/app", b"\x00\x01\x00\x00" + b"\xff" * 64),
+        ("wheel_cmd/app", native_twist()),
+        ("wheel_cmd/app", native_joints(ORDERS[1], [1.0] * 4)[:-1]),
+    ],
+    ids=["nanosec", "not utf-8", "no end of string", "lengths", "another type", "cut"],
+)
+def test_a_native_payload_that_is_not_the_message_is_malformed(key: str, payload: bytes) -> None:
+    assert refusal(arrival(payload, key=key)) == "malformed"
+
+
+def test_native_wheel_speeds_are_all_four_or_none() -> None:
+    for count in (0, 3, 5):
+        payload = native_joints(ORDERS[1], [1.0] * count)
+        assert refusal(arrival(payload, key="wheel_cmd/app")) == "wrong_wheels"
+
+
+def test_a_native_command_has_the_same_limit_as_any_other() -> None:
+    largest = native_stamped(ORDERS[1], b"f" * 4027) + bytes(4)
+    assert len(largest) == MAX_COMMAND_BYTES
+    assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
+    assert refusal(arrival(largest + b"\0")) == "too_big"
+
+
 # how it came
 
 
@@ -281,7 +424,7 @@ def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes)
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["json", "msgpack"])
 def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
     payload = encode({"x": 1.5, "y": -2, "yaw": 0.5}, form)
     assert Receiver.request("set_pose", 7, "", payload) == Request(
@@ -322,7 +465,12 @@ BODIES: list[tuple[str, dict[str, Any]]] = [
     ("cmd/app", {"linear": {}, "angular": {}}),
     ("wheel_cmd/app", joints(1.0, -2.0, 3.5, 0.0)),
 ]
-VALID = [(key, encode(body, form)) for key, body in BODIES for form in FORMATS]
+VALID = [(key, written(body, form)) for key, body in BODIES for form in FORMATS]
+VALID += [
+    ("cmd/app", native_twist(ORDERS[0])),
+    ("cmd/app", native_stamped(ORDERS[0], b"base_link")),
+    ("wheel_cmd/app", native_joints(ORDERS[0], [1.0, -2.0, 3.5, 0.0])),
+]
 
 NASTY = [
     b"\x00", b"\xff", b"\xc0", b"\xc1", b"\xed\xa0\x80", b"\xdd\xff\xff\xff\xff",
@@ -353,10 +501,13 @@ def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
             case 4:
                 payload = payload[:a] + other[rnd.randrange(len(other) + 1) :]
             case 5:
-                # A number of the right length but none: only msgpack can write one.
+                # A number of the right length but none: JSON cannot write one.
                 number = rnd.choice([math.nan, math.inf, -math.inf, 1e308, -5e-324])
                 i = payload.find(b"\xcb", a)
-                if i >= 0:
+                if payload[:1] == b"\0":
+                    i = 4 + (a & ~7)
+                    payload = payload[:i] + struct.pack("<d", number) + payload[i + 8 :]
+                elif i >= 0:
                     payload = payload[:i] + msgspec.msgpack.encode(number) + payload[i + 9 :]
             case _:
                 payload = payload[:a] + rnd.choice(NASTY) + payload[b:]
@@ -365,7 +516,7 @@ def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
 
 def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> None:
     rnd = random.Random(20_000)
-    encodings = ["", "", "application/json", "application/msgpack"]
+    encodings = ["", "", "", "application/json", "application/msgpack", "application/cdr"]
     reasons: dict[str, int] = {}
     for _ in range(20_000):
         key, payload = rnd.choice(VALID)
@@ -403,3 +554,72 @@ def test_whatever_the_receiver_lets_through_the_arbiter_survives() -> None:
 def test_a_header_beside_a_bare_twist_is_neither_a_twist_nor_a_stamped_one() -> None:
     with pytest.raises(DecodeError):
         RECEIVER.command(arrival(b'{"header":{"stamp":{"sec":5}},"linear":{"x":1},"angular":{}}'))
+
+
+# what came on a ROS key
+
+GID = bytes(range(16))
+SENT_NS = 1_700_000_000_000_000_000
+
+
+def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
+    given: dict[str, Any] = {"key": "cmd/nav", "encoding": "application/cdr", "via": via} | changes
+    if via == "rmw":
+        given.setdefault("attachment", Attachment(1, SENT_NS, GID).pack())
+    return arrival(written(body, "cdr"), **given)
+
+
+def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
+    command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
+    assert command == Command("nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, GID.hex())
+
+
+def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
+    command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
+    assert (command.stamp_ns, command.sender) == (12_000_000_034, GID.hex())
+    assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
+
+
+@pytest.mark.parametrize(
+    ("attachment", "reason"),
+    [
+        (b"", "no_attachment"),
+        (b"rqh" + bytes(17), "bad_attachment"),
+        (Attachment(1, SENT_NS, GID).pack() + b"x", "bad_attachment"),
+    ],
+)
+def test_over_rmw_nothing_counts_without_its_attachment(attachment: bytes, reason: str) -> None:
+    assert refusal(by_ros("rmw", twist(), attachment=attachment)) == reason
+
+
+def test_by_a_bridge_any_attachment_is_ignored() -> None:
+    command = RECEIVER.command(by_ros("bridge", twist(), attachment=b"rqh" + bytes(17)))
+    assert command.twist == Twist(0.5, 0.2)
+    assert command.stamp_ns is None
+
+
+def test_by_a_bridge_the_sender_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
+    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/cmd/nav"
+    seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
+    assert (seen.stamp_ns, seen.sender) == (SENT_NS, "router")
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_joint_commands_are_wheel_speeds_of_their_source(via: str) -> None:
+    command = RECEIVER.command(
+        by_ros(via, joints(6.0, 2.0, 2.0, 6.0), key="wheel_cmd/ros2_control")
+    )
+    assert command.source == "ros2_control"
+    assert command.twist == KINEMATICS.twist(WheelSpeeds(6.0, 2.0, 2.0, 6.0))
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_joint_commands_before_the_controller_is_active_are_refused(via: str) -> None:
+    nan = by_ros(via, joints(math.nan, 0.0, 0.0, 0.0), key="wheel_cmd/ros2_control")
+    assert refusal(nan) == "not_finite"
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_no_command(via: str) -> None:
+    assert refusal(by_ros(via, twist(), key="cmd_*")) == "wildcard"
+    assert refusal(by_ros(via, twist(), put=False)) == "not_a_put"

@@ -10,16 +10,24 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config import effective, from_builtins
-from acsard.messages.encodings import FORMATS, Format, encode, encoding_name
+from acsard.messages.cdr import Cdr
+from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.messages.queries import Queries, Query, Reply
 from acsard.messages.report import Report
 from acsard.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
+from acsard.ros import parameters as rcl
+from acsard.ros.attachments import Attachment, unpack
+from acsard.ros.trees import PARAMETER_SERVICES, TRIGGERS
 from acsard.settings import Config, JointsConfig, RobotConfig
 from acsard.values import Answer, Outputs, Pose, Request
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
+NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
+"""The published keys whose types are ROS messages, and so have a CDR form."""
+
 CONFIG = Config(robot=RobotConfig("r7"))
+WALL_NS = 1_700_000_000_000_000_000
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
@@ -61,7 +69,7 @@ def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
 
 
 @pytest.mark.parametrize("topic", PUBLISHED, ids=lambda t: t.key)
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["msgpack", "json"])
 def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -> None:
     reply = answer(query(topic.key, fmt=form))
     assert reply == Reply(
@@ -72,9 +80,42 @@ def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -
     )
 
 
+@pytest.mark.parametrize("topic", [t for t in PUBLISHED if t.key in NATIVE], ids=lambda t: t.key)
+def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
+    reply = answer(query(topic.key, fmt="cdr"))
+    assert (reply.number, reply.key, reply.ok) == (7, topic.key, True)
+    assert reply.encoding == f"application/cdr;acsard.{topic.type}.v1"
+    assert reply.payload[:4] == b"\x00\x01\x00\x00"
+    told = Cdr(MESSAGES[topic.type]).decode(reply.payload)
+    assert told == report().current(topic.key, lambda: SNAPSHOT)
+
+
+@pytest.mark.parametrize(
+    ("topic", "asked", "kind"),
+    [
+        ("state", "state", "RobotState"),
+        ("state", "**", "RobotState"),
+        ("info", "info", "Info"),
+        ("config", "config", "dict"),
+        ("schema/<Type>", "schema/Odometry", "dict"),
+    ],
+)
+def test_what_is_no_ros_message_is_refused_as_cdr_in_words(
+    topic: str, asked: str, kind: str
+) -> None:
+    assert answer(query(topic, asked, fmt="cdr")) == Reply(
+        7,
+        topic,
+        f"{kind} is no ROS message and has no CDR form: use JSON".encode(),
+        "text/plain",
+        ok=False,
+    )
+
+
 @pytest.mark.parametrize("topic", PUBLISHED, ids=lambda t: t.key)
-def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any) -> None:
-    assert queries().serve(query(topic.key), nothing, None) == []
+@pytest.mark.parametrize("fmt", ["", "cdr"])
+def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any, fmt: str) -> None:
+    assert queries().serve(query(topic.key, fmt=fmt), nothing, None) == []
 
 
 @pytest.mark.parametrize("asked", ["odom", "**", "*", "acsard/*/odom"])
@@ -82,14 +123,14 @@ def test_a_last_value_may_be_asked_by_wildcard_and_has_its_own_key(asked: str) -
     assert answer(query("odom", asked)).key == "odom"
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["msgpack", "json"])
 def test_info_says_who_the_daemon_is(form: Format) -> None:
     assert answer(query("info", fmt=form)) == Reply(
         7, "info", encode(INFO, form), encoding_name(form, "Info")
     )
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["msgpack", "json"])
 def test_config_is_the_configuration_in_force(form: Format) -> None:
     reply = answer(query("config", fmt=form))
     codec = msgspec.json if form == "json" else msgspec.msgpack
@@ -137,13 +178,18 @@ def test_a_key_that_is_not_in_the_table_has_no_answer() -> None:
 
 
 @pytest.mark.parametrize("key", [t.key for t in TOPICS if t.direction != "in" and t.key != "alive"])
-@pytest.mark.parametrize("fmt", ["xml", "JSON", "yaml", " json"])
-def test_an_unknown_format_is_an_error_that_says_which_there_are(key: str, fmt: str) -> None:
+@pytest.mark.parametrize("fmt", ["xml", "JSON", "CDR", " json"])
+def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str) -> None:
     reply = answer(query(key, fmt=fmt))
     assert not reply.ok
     assert reply.number == 7
-    assert reply.payload.decode() == f"fmt={fmt}: write fmt=json or fmt=msgpack"
+    assert reply.payload.decode().startswith(f"fmt={fmt}: ")
     assert reply.encoding == "text/plain"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_the_error_for_an_unknown_format_says_which_there_are(form: Format) -> None:
+    assert f"fmt={form}" in answer(query("odom", fmt="xml")).payload.decode()
 
 
 @pytest.mark.parametrize("key", ["odom", "info", "config", "topics", "interfaces"])
@@ -213,7 +259,7 @@ def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -
 def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
     made = queries()
     assert made.serve(query(f"srv/{verb}", asked, payload=payload_for(verb)), nothing, None) == []
-    assert made.answered(Answer(7, True, "done")) is None
+    assert made.answered(Answer(7, True, "done"), WALL_NS) is None
 
 
 @pytest.mark.parametrize("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
@@ -230,7 +276,7 @@ def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
     made = queries()
     made.serve(query("srv/clear", number=12), nothing, None)
     made.serve(query("srv/stop", number=13), nothing, None)
-    reply = made.answered(Answer(13, success, "because"))
+    reply = made.answered(Answer(13, success, "because"), WALL_NS)
     assert reply == Reply(
         13,
         "srv/stop",
@@ -242,12 +288,12 @@ def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
 def test_an_answer_goes_back_once() -> None:
     made = queries()
     made.serve(query("srv/stop"), nothing, None)
-    assert made.answered(Answer(7, True, "")) is not None
-    assert made.answered(Answer(7, True, "")) is None
+    assert made.answered(Answer(7, True, ""), WALL_NS) is not None
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
 
 
 def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
-    assert queries().answered(Answer(0, True, "stopped")) is None
+    assert queries().answered(Answer(0, True, "stopped"), WALL_NS) is None
 
 
 @pytest.mark.parametrize(
@@ -259,6 +305,12 @@ def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
         ("", encode({"x": 1, "y": 2, "yaw": 3}, "msgpack"), "application/msgpack", "msgpack"),
         ("json", encode({"x": 1, "y": 2, "yaw": 3}, "msgpack"), "", "json"),
         ("msgpack", POSE, "", "msgpack"),
+        ("cdr", b"", "", "cdr"),
+        ("cdr", POSE, "", "cdr"),
+        ("", b"\x00\x01\x00\x00\x00", "", "cdr"),
+        ("", b"\x00\x01\x00\x00", "", "cdr"),
+        ("", b"\x00\x00\x00\x03\x00\x00\x00\x00", "", "cdr"),
+        ("json", b"\x00\x01\x00\x00\x00", "", "json"),
     ],
 )
 def test_a_service_answers_in_the_format_asked_for_else_in_the_payloads(
@@ -267,10 +319,18 @@ def test_a_service_answers_in_the_format_asked_for_else_in_the_payloads(
     made = queries()
     asked = query("srv/reset_odometry", fmt=fmt, payload=payload, encoding=encoding)
     assert isinstance(made.serve(asked, nothing, None), Request)
-    reply = made.answered(Answer(7, True, "done"))
+    reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
     assert reply.payload == encode(ServiceReply(True, "done"), form)
     assert reply.encoding == encoding_name(form, "ServiceReply")
+
+
+def test_a_service_asked_in_cdr_answers_as_a_ros_trigger_does() -> None:
+    made = queries()
+    made.serve(query("srv/stop", payload=b"\x00\x01\x00\x00\x00"), nothing, None)
+    reply = made.answered(Answer(7, True, "ok"), WALL_NS)
+    assert reply is not None
+    assert reply.payload == bytes.fromhex("00010000 01000000 03000000 6f6b00")
 
 
 @pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb != "set_pose"])
@@ -282,8 +342,8 @@ def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> Non
 @pytest.mark.parametrize(
     ("payload", "words"),
     [
-        (b"", "neither a JSON object nor a msgpack map"),
-        (b"nonsense", "neither a JSON object nor a msgpack map"),
+        (b"", "neither a JSON object, a msgpack map nor CDR"),
+        (b"nonsense", "neither a JSON object, a msgpack map nor CDR"),
         (b"{", "Input data was truncated"),
         (b"{}", "missing required field `x`"),
         (b'{"x": 1, "y": 2}', "missing required field `yaw`"),
@@ -306,4 +366,88 @@ def test_a_pose_that_is_none_is_answered_in_words_and_asks_nothing_of_the_robot(
     assert not said.success
     assert words in said.message
     assert said.message.endswith('; send {"x": 0, "y": 0, "yaw": 0}')
-    assert made.answered(Answer(7, True, "")) is None
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
+
+
+# ROS services
+
+ASKED = Attachment(7, 1_600_000_000_000_000_000, bytes(range(16)))
+EMPTY = b"\x00\x01\x00\x00\x00"
+
+
+def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: Any) -> Query:
+    given: dict[str, Any] = {"via": via, "payload": payload, "arrived_ns": 99} | changes
+    if via == "rmw":
+        given.setdefault("attachment", ASKED.pack())
+    return query(topic, **given)
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("verb", TRIGGERS)
+def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
+    made = queries()
+    got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
+    assert got == Request(verb, 7, asked_ns=99)  # type: ignore[arg-type]
+    reply = made.answered(Answer(7, True, "done"), WALL_NS)
+    assert reply is not None
+    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(True, "done")
+    assert reply.ok
+
+
+def test_over_rmw_a_reply_has_the_request_s_sequence_and_gid_and_its_own_time() -> None:
+    made = queries()
+    made.serve(ros_query("srv/clear"), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, False, "no"), WALL_NS)
+    assert reply is not None
+    assert unpack(reply.attachment) == Attachment(7, WALL_NS, ASKED.gid)
+
+
+def test_by_a_bridge_a_reply_needs_no_attachment() -> None:
+    made = queries()
+    made.serve(ros_query("srv/clear", "bridge", attachment=b"rqh" + bytes(17)), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, True, ""), WALL_NS)
+    assert reply is not None
+    assert reply.attachment == b""
+
+
+@pytest.mark.parametrize("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
+def test_a_trigger_takes_a_request_of_any_length(payload: bytes) -> None:
+    got = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
+    assert isinstance(got, Request)
+
+
+@pytest.mark.parametrize("topic", ["srv/clear", "parameters/list_parameters"])
+@pytest.mark.parametrize("attachment", [b"", bytes(20)])
+def test_over_rmw_a_request_without_its_attachment_is_not_answered(
+    topic: str, attachment: bytes
+) -> None:
+    made = queries()
+    with pytest.raises(DecodeError) as caught:
+        made.serve(ros_query(topic, attachment=attachment), nothing, OUTPUTS)
+    assert caught.value.reason == ("bad_attachment" if attachment else "no_attachment")
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_the_parameter_services_tell_the_configuration(via: str) -> None:
+    payload = Cdr(rcl.Names).encode(rcl.Names(["robot.id"]))
+    (reply,) = reply_to(ros_query("parameters/get_parameters", via, payload))
+    (value,) = Cdr(rcl.Values).decode(reply.payload).values
+    assert value.string_value == "r7"
+    if via == "rmw":
+        assert unpack(reply.attachment) == Attachment(7, OUTPUTS.now.wall_ns, ASKED.gid)
+    else:
+        assert reply.attachment == b""
+
+
+@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+def test_a_parameter_request_that_cannot_be_read_is_not_answered(service: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        queries().serve(ros_query(f"parameters/{service}", payload=b"\x00"), nothing, OUTPUTS)
+    assert caught.value.reason == "malformed"
+
+
+def reply_to(asked: Query) -> list[Reply]:
+    got = queries().serve(asked, nothing, OUTPUTS)
+    assert isinstance(got, list)
+    return got

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.messages import schema
+from acsard.messages.cdr import Cdr
 from acsard.messages.schema import MESSAGES, JointState, Message, Quaternion, Time, Vector3
 
 STRUCTS = [
@@ -61,12 +62,19 @@ def test_every_message_that_crosses_the_bus_is_found_by_its_name() -> None:
     assert set(MESSAGES) == {cls.__name__ for cls in STRUCTS} - parts
 
 
-@given(st.integers(0, 2**62))
+@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
 def test_a_time_is_whole_seconds_and_the_nanoseconds_of_the_rest(wall_ns: int) -> None:
     time = Time.from_ns(wall_ns)
     assert 0 <= time.nanosec < 1_000_000_000
     assert time.sec * 1_000_000_000 + time.nanosec == wall_ns
     assert time.to_ns() == wall_ns
+
+
+@pytest.mark.parametrize(("wall_s", "sec"), [(2**31, 2**31 - 1), (-(2**31) - 1, -(2**31))])
+def test_a_clock_beyond_what_ros_can_tell_is_held_at_its_end(wall_s: int, sec: int) -> None:
+    time = Time.from_ns(wall_s * 10**9)
+    assert time.sec == sec
+    assert Cdr(Time).decode(Cdr(Time).encode(time)) == time
 
 
 def test_a_time_worked_by_hand() -> None:

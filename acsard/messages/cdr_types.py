@@ -1,0 +1,75 @@
+"""What CDR has to know of a struct type: its leaves in order, and how to build one of them.
+
+`float` is float64; an `int` says its width by `Meta(extra={"cdr": code})` with a code of the
+struct module (`B i I q Q`); a list whose `Meta` fixes its length is an array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from msgspec import inspect
+
+SIZES = {"d": 8, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
+"""Bytes of a number by its code; each is aligned to as many."""
+
+Build = Callable[[Iterator[object]], object]
+Limit = tuple[float, float]
+
+
+def struct_info(cls: Any) -> inspect.StructType:
+    """The fields of a struct type; raises `TypeError` for anything else."""
+    info = inspect.type_info(cls)
+    if not isinstance(info, inspect.StructType):
+        raise TypeError(f"{cls} is no struct")
+    return info
+
+
+def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
+    """The dotted path and type of every field that is no struct itself, nested ones included."""
+    for field in info.fields:
+        kind = plain(field.type)
+        if isinstance(kind, inspect.StructType):
+            yield from leaves(kind, f"{path}{field.name}.")
+        else:
+            yield path + field.name, field.type
+
+
+def builder(info: inspect.StructType) -> Build:
+    """Makes a struct of the values of its leaves."""
+    kinds = [plain(field.type) for field in info.fields]
+    children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
+    return lambda values: info.cls(*[child(values) for child in children])
+
+
+def plain(kind: inspect.Type) -> inspect.Type:
+    """The type below its metadata."""
+    return kind.type if isinstance(kind, inspect.Metadata) else kind
+
+
+def number_code(kind: inspect.Type) -> str:
+    """The struct code of a number, "" for anything else."""
+    match plain(kind):
+        case inspect.FloatType():
+            return "d"
+        case inspect.BoolType():
+            return "?"
+        case inspect.IntType():
+            extra = kind.extra if isinstance(kind, inspect.Metadata) else None
+            if not extra or "cdr" not in extra:
+                raise TypeError("an int without its width")
+            return str(extra["cdr"])
+    return ""
+
+
+def limit(kind: inspect.Type) -> Limit | None:
+    """The least and greatest value of an int that has bounds of its own."""
+    number = plain(kind)
+    if not isinstance(number, inspect.IntType):
+        return None
+    low = [number.ge, None if number.gt is None else number.gt + 1]
+    high = [number.le, None if number.lt is None else number.lt - 1]
+    least = max((bound for bound in low if bound is not None), default=float("-inf"))
+    most = min((bound for bound in high if bound is not None), default=float("inf"))
+    return None if (least, most) == (float("-inf"), float("inf")) else (least, most)

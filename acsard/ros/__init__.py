@@ -1,0 +1,1 @@
+"""ROS 2 over Zenoh, pure: names, tokens and attachments of its two transports."""

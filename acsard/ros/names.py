@@ -1,0 +1,61 @@
+"""ROS 2 names: types and their hashes, and how a topic or service is called on either transport.
+
+zenoh-bridge-ros2dds uses the bare name as key; rmw_zenoh_cpp adds domain, type and hash, so a
+wrong hash is silence. What must not live here: which topics the robot has (`ros/trees.py`).
+"""
+
+from __future__ import annotations
+
+# fmt: off
+TYPE_HASHES: dict[str, str] = {
+    "geometry_msgs/msg/Twist":
+        "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    "geometry_msgs/msg/TwistStamped":
+        "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+    "nav_msgs/msg/Odometry":
+        "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "tf2_msgs/msg/TFMessage":
+        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "sensor_msgs/msg/JointState":
+        "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "diagnostic_msgs/msg/DiagnosticArray":
+        "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    "std_srvs/srv/Trigger":
+        "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    "rcl_interfaces/srv/DescribeParameters":
+        "RIHS01_845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
+    "rcl_interfaces/srv/GetParameters":
+        "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+    "rcl_interfaces/srv/GetParameterTypes":
+        "RIHS01_da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca",
+    "rcl_interfaces/srv/ListParameters":
+        "RIHS01_3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+    "rcl_interfaces/srv/SetParameters":
+        "RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+    "rcl_interfaces/srv/SetParametersAtomically":
+        "RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
+}
+# fmt: on
+"""RIHS01 type hashes of Jazzy, Kilted and Lyrical, of every ROS type we speak. Literals, because
+they are part of the wire format; a test computes them anew from the message definitions."""
+
+
+def full_name(namespace: str, name: str) -> str:
+    """The fully qualified name of a topic or service, with its leading slash."""
+    return f"/{namespace}/{name}" if namespace else f"/{name}"
+
+
+def bridge_key(name: str) -> str:
+    """The key zenoh-bridge-ros2dds gives a fully qualified name."""
+    return name.removeprefix("/")
+
+
+def rmw_key(domain: int, name: str, type_name: str) -> str:
+    """The key rmw_zenoh_cpp gives a fully qualified name of this type."""
+    return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
+
+
+def dds_type(type_name: str) -> str:
+    """`pkg/msg/Name` as DDS writes it."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"

@@ -1,0 +1,156 @@
+"""The ROS names of this robot and what each stands for in the native tree.
+
+One list for both transports; the bus declares from it. What comes in on a ROS key is the same
+command, and what goes out the same message, as on the native key beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.messages.topics import Direction
+from acsard.ros.names import bridge_key, full_name, rmw_key
+from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
+from acsard.settings import RosConfig
+
+Transport = Literal["bridge", "rmw"]
+
+
+class RosName(Struct, frozen=True):
+    """A topic or service: its relative `name`, and the native key it stands for."""
+
+    name: str
+    native: str
+    direction: Direction
+    type: str
+    qos: Qos = Qos()
+
+
+class Endpoint(Struct, frozen=True):
+    """One key to declare on the bus."""
+
+    transport: Transport
+    native: str
+    direction: Direction
+    key: str
+    token: str
+    """Its liveliness token, "" for none; over rmw also what its GID is made of."""
+    latched: bool
+
+
+TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
+
+PARAMETER_SERVICES = {
+    "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
+    "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
+    "get_parameters": "rcl_interfaces/srv/GetParameters",
+    "list_parameters": "rcl_interfaces/srv/ListParameters",
+    "set_parameters": "rcl_interfaces/srv/SetParameters",
+    "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
+}
+
+PARAMETERS = "parameters/"
+"""Where the parameter services would be in the native tree, which has `config` instead."""
+
+PUBLISHED = (
+    RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
+    RosName("tf", "tf", "out", "tf2_msgs/msg/TFMessage", Qos(100)),
+    RosName("tf_static", "tf_static", "out", "tf2_msgs/msg/TFMessage", Qos(1, transient=True)),
+    RosName("joint_states", "wheel_states", "out", "sensor_msgs/msg/JointState"),
+    RosName("diagnostics", "diagnostics", "out", "diagnostic_msgs/msg/DiagnosticArray"),
+    RosName("cmd_vel_out", "cmd_vel_out", "out", "geometry_msgs/msg/TwistStamped"),
+)
+
+TWISTS = {"twist": "geometry_msgs/msg/Twist", "twist_stamped": "geometry_msgs/msg/TwistStamped"}
+
+SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
+"""The command source each commanding topic counts as."""
+
+
+def ros_names(ros: RosConfig) -> tuple[RosName, ...]:
+    """All topics and services; a twist topic that takes both types is there once for each."""
+    kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
+    return (
+        *PUBLISHED,
+        *(
+            RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
+            for name in ("cmd_vel", "cmd_vel_teleop")
+            for kind in kinds
+        ),
+        RosName(
+            "joint_commands",
+            f"wheel_cmd/{SOURCES['joint_commands']}",
+            "in",
+            "sensor_msgs/msg/JointState",
+        ),
+        *(
+            RosName(f"{ros.node}/{verb}", f"srv/{verb}", "query", "std_srvs/srv/Trigger")
+            for verb in TRIGGERS
+        ),
+        *(
+            RosName(f"{ros.node}/{name}", PARAMETERS + name, "query", type_name)
+            for name, type_name in PARAMETER_SERVICES.items()
+        ),
+    )
+
+
+def endpoints(ros: RosConfig, zid: str) -> tuple[Endpoint, ...]:
+    """The keys of every tree that is switched on, for a session with this Zenoh id."""
+    found: list[Endpoint] = []
+    if ros.bridge:
+        found += _bridge(ros, zid)
+    if ros.rmw:
+        found += _rmw(ros, zid)
+    return tuple(found)
+
+
+def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
+    """The tokens beside those of the endpoints: that there is a node, or a bridge."""
+    tokens = []
+    if ros.bridge and ros.announce:
+        tokens.append(bridge_presence(zid))
+    if ros.rmw:
+        tokens.append(_node(ros, zid).token)
+    return tuple(tokens)
+
+
+def command_keys(ros: RosConfig) -> tuple[str, ...]:
+    """The keys commands come in on."""
+    return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
+
+
+def _node(ros: RosConfig, zid: str) -> Node:
+    return Node(ros.domain, zid, ros.namespace, ros.node)
+
+
+def _kind(row: RosName) -> Kind:
+    return {"out": "MP", "in": "MS", "query": "SS"}[row.direction]  # type: ignore[return-value]
+
+
+def _bridge(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
+    """One key a name; a topic of two types cannot be announced, as a DDS reader has one."""
+    names = ros_names(ros)
+    for row in names:
+        twins = [other for other in names if other.name == row.name]
+        if row is not twins[0]:
+            continue
+        name = full_name(ros.namespace, row.name)
+        token = ""
+        if ros.announce and len(twins) == 1:
+            token = bridge_token(zid, _kind(row), name, row.type, row.qos)
+        yield _endpoint("bridge", row, bridge_key(name), token)
+
+
+def _rmw(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
+    node = _node(ros, zid)
+    for number, row in enumerate(ros_names(ros), start=1):
+        name = full_name(ros.namespace, row.name)
+        token = node.endpoint_token(number, _kind(row), name, row.type, row.qos)
+        yield _endpoint("rmw", row, rmw_key(ros.domain, name, row.type), token)
+
+
+def _endpoint(transport: Transport, row: RosName, key: str, token: str) -> Endpoint:
+    return Endpoint(transport, row.native, row.direction, key, token, row.qos.transient)

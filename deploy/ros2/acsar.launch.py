@@ -1,0 +1,115 @@
+"""The ROS side of the robot: its description always, ros2_control and RViz on request.
+
+acsard itself is not started here: it runs without ROS, as a service on the robot.
+
+    ros2 launch ./acsar.launch.py [use_ros2_control:=true] [use_rviz:=true] [namespace:=robot1]
+"""
+
+from pathlib import Path
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+HERE = Path(__file__).resolve().parent
+URDF = HERE / "acsar.urdf"
+CONTROLLERS = HERE / "controllers.yaml"
+RVIZ = HERE / "acsar.rviz"
+
+# tf2 writes to /tf with a leading slash; acsard and the bridge put TF below the namespace with the
+# rest. In the root namespace these remappings change nothing.
+TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "use_ros2_control",
+                default_value="false",
+                description="drive the wheels through diff_drive_controller (controllers.yaml)",
+            ),
+            DeclareLaunchArgument(
+                "use_rviz", default_value="false", description="open RViz with acsar.rviz"
+            ),
+            DeclareLaunchArgument(
+                "namespace",
+                default_value="",
+                description="ROS namespace of the robot: [ros] namespace of acsard.toml",
+            ),
+            OpaqueFunction(function=nodes),
+        ]
+    )
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    namespace = LaunchConfiguration("namespace").perform(context).strip("/")
+    with_control = IfCondition(LaunchConfiguration("use_ros2_control"))
+    with_rviz = IfCondition(LaunchConfiguration("use_rviz"))
+    prefix = f"/{namespace}" if namespace else ""
+    return [
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            namespace=namespace,
+            parameters=[
+                {
+                    "robot_description": ParameterValue(description(prefix), value_type=str),
+                    "publish_frequency": 50.0,
+                }
+            ],
+            remappings=TF,
+            output="both",
+        ),
+        # Takes the URDF from the topic robot_description, as it does since Jazzy.
+        Node(
+            package="controller_manager",
+            executable="ros2_control_node",
+            namespace=namespace,
+            parameters=[str(CONTROLLERS)],
+            remappings=[*TF, ("joint_states", "ros2_control/joint_states")],
+            output="both",
+            condition=with_control,
+        ),
+        # The controller listens on the cmd_vel everybody sends to; its odometry is kept apart from
+        # acsard's. Both remappings in one argument, as not every version takes it twice.
+        Node(
+            package="controller_manager",
+            executable="spawner",
+            namespace=namespace,
+            arguments=[
+                "diff_drive_controller",
+                "--param-file",
+                str(CONTROLLERS),
+                "--controller-ros-args",
+                f"-r ~/cmd_vel:={prefix}/cmd_vel -r ~/odom:={prefix}/ros2_control/odom",
+            ],
+            output="both",
+            condition=with_control,
+        ),
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            namespace=namespace,
+            arguments=["-d", str(RVIZ)],
+            remappings=[
+                *TF,
+                ("/odom", "odom"),
+                ("/scan", "scan"),
+                ("/robot_description", "robot_description"),
+            ],
+            output="log",
+            condition=with_rviz,
+        ),
+    ]
+
+
+def description(prefix: str) -> str:
+    """The URDF with the two topics of the hardware, which are absolute, below the namespace."""
+    text = URDF.read_text(encoding="utf-8")
+    for topic in ("/joint_commands", "/joint_states"):
+        text = text.replace(f">{topic}</param>", f">{prefix}{topic}</param>")
+    return text

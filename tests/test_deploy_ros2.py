@@ -1,0 +1,425 @@
+"""deploy/ros2 is true: what it tells ROS of the robot is what acsard's defaults say.
+
+Nothing here needs ROS; that the files also please ROS itself is not shown by these tests.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+import re
+import runpy
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import msgspec
+import pytest
+import zenoh
+from ruamel.yaml import YAML
+
+from acsard.ros.trees import ros_names
+from acsard.settings import Config, RosConfig
+
+FILES = Path(__file__).parents[1] / "deploy" / "ros2"
+CONFIG = Config()
+WHEEL_SIGNS = {  # x and y of each wheel's place
+    CONFIG.joints.front_right: (1, -1),
+    CONFIG.joints.front_left: (1, 1),
+    CONFIG.joints.rear_left: (-1, 1),
+    CONFIG.joints.rear_right: (-1, -1),
+}
+TIMEOUTS = {source.timeout for source in CONFIG.commands.sources}
+
+
+def urdf() -> ET.Element:
+    return ET.parse(FILES / "acsar.urdf").getroot()
+
+
+def one(element: ET.Element, path: str) -> ET.Element:
+    found = element.findall(path)
+    assert len(found) == 1, path
+    return found[0]
+
+
+def numbers(text: str | None) -> list[float]:
+    return [float(number) for number in (text or "").split()]
+
+
+def joint(name: str) -> ET.Element:
+    return one(urdf(), f"joint[@name='{name}']")
+
+
+def joint_to(link: str) -> ET.Element:
+    return next(j for j in urdf().findall("joint") if one(j, "child").get("link") == link)
+
+
+def wheel_links() -> list[ET.Element]:
+    names = [one(joint(name), "child").get("link") for name in CONFIG.joints.as_tuple()]
+    return [one(urdf(), f"link[@name='{name}']") for name in names]
+
+
+def yaml(name: str) -> Any:
+    return YAML(typ="safe").load((FILES / name).read_text())
+
+
+def ros_parameters(name: str, node: str) -> dict[str, Any]:
+    found: dict[str, Any] = yaml(name)[node]["ros__parameters"]
+    return found
+
+
+def bridge() -> zenoh.Config:
+    return zenoh.Config.from_file(str(FILES / "zenoh-bridge-ros2dds.json5"))
+
+
+def bridge_setting(path: str) -> Any:
+    return json.loads(bridge().get_json(path))
+
+
+def published_names(direction: str) -> set[str]:
+    return {f"/{row.name}" for row in ros_names(RosConfig()) if row.direction == direction}
+
+
+# acsar.urdf
+
+
+def test_the_joints_that_turn_are_the_wheels() -> None:
+    turning = [j.get("name") for j in urdf().findall("joint") if j.get("type") != "fixed"]
+    assert sorted(turning, key=str) == sorted(CONFIG.joints.as_tuple())
+    assert {joint(name).get("type") for name in CONFIG.joints.as_tuple()} == {"continuous"}
+
+
+@pytest.mark.parametrize("name", CONFIG.joints.as_tuple())
+def test_a_wheel_stands_on_the_floor_where_the_separation_puts_it(name: str) -> None:
+    radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
+    assert one(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
+    x, y, z = numbers(one(joint(name), "origin").get("xyz"))
+    assert (y, z) == pytest.approx((WHEEL_SIGNS[name][1] * half, radius))
+    assert math.copysign(1, x) == WHEEL_SIGNS[name][0]
+    assert numbers(one(joint(name), "axis").get("xyz")) == [0, 1, 0]
+    limit = one(joint(name), "limit").get("velocity")
+    assert numbers(limit) == [CONFIG.limits.wheel_speed]
+
+
+def test_every_wheel_has_the_radius_and_lies_on_its_side() -> None:
+    radius = CONFIG.drive.wheel_radius
+    for link in wheel_links():
+        for part in ("visual", "collision"):
+            assert numbers(one(link, f"{part}/geometry/cylinder").get("radius")) == [radius]
+            turn = numbers(one(link, f"{part}/origin").get("rpy"))
+            assert turn == pytest.approx([math.pi / 2, 0, 0])
+
+
+def test_frames_are_acsards() -> None:
+    lidar, footprint = CONFIG.lidar, CONFIG.footprint
+    for link, xyz, rpy in (
+        (
+            lidar.lidar_frame,
+            [lidar.lidar_x_offset, lidar.lidar_y_offset, lidar.lidar_z_offset],
+            [lidar.lidar_roll, lidar.lidar_pitch, lidar.lidar_yaw],
+        ),
+        (footprint.footprint_frame, [0, 0, footprint.footprint_z_offset], [0, 0, 0]),
+    ):
+        found = joint_to(link)
+        assert one(found, "parent").get("link") == CONFIG.odometry.base_frame
+        assert numbers(one(found, "origin").get("xyz")) == xyz
+        assert numbers(one(found, "origin").get("rpy")) == rpy
+
+
+def test_the_base_has_no_parent_and_everything_else_one() -> None:
+    links = {link.get("name") for link in urdf().findall("link")}
+    children = [one(j, "child").get("link") for j in urdf().findall("joint")]
+    parents = {one(j, "parent").get("link") for j in urdf().findall("joint")}
+    assert links - set(children) == {CONFIG.odometry.base_frame}
+    assert len(children) == len(set(children))
+    assert parents <= links
+
+
+def test_inertias_are_those_of_bodies() -> None:
+    inertias = urdf().findall("link/inertial/inertia")
+    assert len(inertias) == 6
+    assert urdf().find(f"link[@name='{CONFIG.odometry.base_frame}']/inertial") is None
+    for inertia in inertias:
+        small, middle, large = sorted(float(inertia.get(axis, 0)) for axis in ("ixx", "iyy", "izz"))
+        assert small > 0
+        assert large < small + middle
+
+
+def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
+    control = one(urdf(), "ros2_control")
+    assert control.get("type") == "system"
+    plugin = one(control, "hardware/plugin").text
+    assert plugin == "joint_state_topic_hardware_interface/JointStateTopicSystem"
+    parameters = {p.get("name"): p.text for p in control.findall("hardware/param")}
+    assert parameters["joint_commands_topic"] == "/joint_commands"
+    assert parameters["joint_states_topic"] == "/joint_states"
+    assert parameters["trigger_joint_command_threshold"] == "-1"
+    assert tuple(j.get("name") for j in control.findall("joint")) == CONFIG.joints.as_tuple()
+    for wheel in control.findall("joint"):
+        assert [c.get("name") for c in wheel.findall("command_interface")] == ["velocity"]
+        states = [s.get("name") for s in wheel.findall("state_interface")]
+        assert states == ["position", "velocity"]
+
+
+# controllers.yaml
+
+
+def test_the_controller_is_the_robot() -> None:
+    found = ros_parameters("controllers.yaml", "/**/diff_drive_controller")
+    joints, drive, limits = CONFIG.joints, CONFIG.drive, CONFIG.limits
+    wanted = {
+        "left_wheel_names": [joints.front_left, joints.rear_left],
+        "right_wheel_names": [joints.front_right, joints.rear_right],
+        "wheel_separation": drive.wheel_separation,
+        "wheel_radius": drive.wheel_radius,
+        "wheel_separation_multiplier": drive.wheel_separation_multiplier,
+        "left_wheel_radius_multiplier": drive.left_wheel_radius_multiplier,
+        "right_wheel_radius_multiplier": drive.right_wheel_radius_multiplier,
+        "odom_frame_id": CONFIG.odometry.odom_frame,
+        "base_frame_id": CONFIG.odometry.base_frame,
+        "enable_odom_tf": False,
+        "linear.x.max_velocity": limits.linear_speed,
+        "linear.x.min_velocity": -limits.linear_speed,
+        "linear.x.max_acceleration": limits.linear_acceleration,
+        "linear.x.max_deceleration": -limits.linear_deceleration,
+        "linear.x.max_acceleration_reverse": -limits.linear_acceleration,
+        "linear.x.max_deceleration_reverse": limits.linear_deceleration,
+        "angular.z.max_velocity": limits.angular_speed,
+        "angular.z.min_velocity": -limits.angular_speed,
+        "angular.z.max_acceleration": limits.angular_acceleration,
+        "angular.z.max_deceleration": -limits.angular_deceleration,
+        "angular.z.max_acceleration_reverse": -limits.angular_acceleration,
+        "angular.z.max_deceleration_reverse": limits.angular_deceleration,
+    }
+    assert {key: found.get(key) for key in wanted} == wanted
+    assert {found["cmd_vel_timeout"]} == TIMEOUTS
+
+
+def test_the_manager_runs_one_controller_fast_enough() -> None:
+    found = ros_parameters("controllers.yaml", "/**/controller_manager")
+    controllers = {key: value["type"] for key, value in found.items() if isinstance(value, dict)}
+    assert controllers == {"diff_drive_controller": "diff_drive_controller/DiffDriveController"}
+    assert found["update_rate"] * min(TIMEOUTS) > 10
+
+
+# nav2_params.yaml
+
+
+def test_nav2_moves_within_the_limits() -> None:
+    limits = CONFIG.limits
+    smoother = ros_parameters("nav2_params.yaml", "velocity_smoother")
+    fastest = [limits.linear_speed, 0, limits.angular_speed]
+    accelerations = [limits.linear_acceleration, 0, limits.angular_acceleration]
+    decelerations = [limits.linear_deceleration, 0, limits.angular_deceleration]
+    assert smoother["max_velocity"] == fastest
+    assert smoother["min_velocity"] == [-v for v in fastest]
+    assert smoother["max_accel"] == accelerations
+    assert smoother["max_decel"] == [-a for a in decelerations]
+    assert {smoother["velocity_timeout"]} == TIMEOUTS
+    follow = ros_parameters("nav2_params.yaml", "controller_server")["FollowPath"]
+    assert (follow["vx_max"], follow["wz_max"]) == (limits.linear_speed, limits.angular_speed)
+    assert (follow["ax_max"], follow["az_max"]) == (accelerations[0], accelerations[2])
+    assert follow["ax_min"] == -limits.linear_deceleration
+    behaviors = ros_parameters("nav2_params.yaml", "behavior_server")
+    assert behaviors["max_rotational_vel"] <= limits.angular_speed
+    assert behaviors["rotational_acc_lim"] <= limits.angular_acceleration
+
+
+def test_nav2_commands_often_enough() -> None:
+    controller = ros_parameters("nav2_params.yaml", "controller_server")["controller_frequency"]
+    smoother = ros_parameters("nav2_params.yaml", "velocity_smoother")["smoothing_frequency"]
+    assert min(controller, smoother) * min(TIMEOUTS) >= 4
+
+
+def test_nav2_knows_the_frames_and_topics() -> None:
+    odom, base = CONFIG.odometry.odom_frame, CONFIG.odometry.base_frame
+    footprint = CONFIG.footprint.footprint_frame
+    allowed = {
+        "odom_frame_id": {odom},
+        "local_frame": {odom},
+        "global_frame": {odom, "map"},
+        "robot_base_frame": {base},
+        "base_frame_id": {footprint},
+        "odom_topic": {"odom"},
+    }
+    seen = set()
+    for key, value in leaves(yaml("nav2_params.yaml")):
+        if key in allowed:
+            assert value in allowed[key], key
+            seen.add(key)
+    assert seen == set(allowed)
+
+
+def test_nav2s_chain_ends_at_cmd_vel_in_one_type() -> None:
+    monitor = ros_parameters("nav2_params.yaml", "collision_monitor")
+    assert monitor["cmd_vel_in_topic"] == "cmd_vel_smoothed"
+    assert f"/{monitor['cmd_vel_out_topic']}" in published_names("in")
+    stamped = [v for k, v in leaves(yaml("nav2_params.yaml")) if k == "enable_stamped_cmd_vel"]
+    assert stamped == [False] * 4
+
+
+def test_nav2s_footprint_has_the_wheels_inside() -> None:
+    footprints = [v for k, v in leaves(yaml("nav2_params.yaml")) if k == "footprint"]
+    assert len(footprints) == 2
+    for text in footprints:
+        corners = json.loads(text)
+        for name, link in zip(CONFIG.joints.as_tuple(), wheel_links(), strict=True):
+            x, y, _ = numbers(one(joint(name), "origin").get("xyz"))
+            wheel = one(link, "visual/geometry/cylinder")
+            (radius,), (width,) = numbers(wheel.get("radius")), numbers(wheel.get("length"))
+            assert abs(x) + radius <= max(abs(corner[0]) for corner in corners) + 1e-9
+            assert abs(y) + width / 2 <= max(abs(corner[1]) for corner in corners) + 1e-9
+
+
+def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for key, value in tree.items():
+        found += leaves(value) if isinstance(value, dict) else [(key, value)]
+    return found
+
+
+# acsar.launch.py
+
+
+def launch_tree() -> ast.Module:
+    return ast.parse((FILES / "acsar.launch.py").read_text())
+
+
+def test_the_launch_file_compiles_and_names_files_that_exist() -> None:
+    compile(launch_tree(), "acsar.launch.py", "exec")
+    named = {
+        node.right.value
+        for node in ast.walk(launch_tree())
+        if isinstance(node, ast.BinOp)
+        and isinstance(node.op, ast.Div)
+        and isinstance(node.right, ast.Constant)
+    }
+    assert named == {"acsar.urdf", "controllers.yaml", "acsar.rviz"}
+    assert all((FILES / str(name)).is_file() for name in named)
+
+
+def test_the_launch_file_has_its_arguments_and_no_broadcaster() -> None:
+    texts = {n.value for n in ast.walk(launch_tree()) if isinstance(n, ast.Constant)}
+    assert {"use_ros2_control", "use_rviz", "namespace", "diff_drive_controller"} <= texts
+    assert "joint_state_broadcaster" not in texts
+
+
+@pytest.mark.parametrize(("namespace", "prefix"), [("", ""), ("robot1", "/robot1")])
+def test_the_launch_file_puts_the_namespace_before_every_topic(
+    namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run with stand-ins for `launch` and `launch_ros`, which come with ROS only."""
+    modules = ("launch", "launch.actions", "launch.conditions", "launch.substitutions")
+    for module in (*modules, "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, module, MagicMock())
+    descriptions = MagicMock(ParameterValue=lambda value, value_type: value)
+    monkeypatch.setitem(sys.modules, "launch_ros.parameter_descriptions", descriptions)
+    monkeypatch.setattr(sys.modules["launch_ros.actions"], "Node", lambda **kwargs: kwargs)
+    monkeypatch.setattr(
+        sys.modules["launch.substitutions"],
+        "LaunchConfiguration",
+        lambda name: MagicMock(perform=lambda context: namespace),
+    )
+    launch = runpy.run_path(str(FILES / "acsar.launch.py"))
+    launch["generate_launch_description"]()
+    nodes = {node["executable"]: node for node in launch["nodes"](MagicMock())}
+    assert set(nodes) == {"robot_state_publisher", "ros2_control_node", "spawner", "rviz2"}
+    assert {node["namespace"] for node in nodes.values()} == {namespace}
+    assert {name for name, node in nodes.items() if "condition" not in node} == {
+        "robot_state_publisher"
+    }
+    description = ET.fromstring(
+        nodes["robot_state_publisher"]["parameters"][0]["robot_description"]
+    )
+    parameters = {p.get("name"): p.text for p in description.findall("ros2_control//param")}
+    assert parameters["joint_commands_topic"] == f"{prefix}/joint_commands"
+    assert parameters["joint_states_topic"] == f"{prefix}/joint_states"
+    remappings = nodes["spawner"]["arguments"][-1]
+    assert f"~/cmd_vel:={prefix}/cmd_vel" in remappings
+    assert f"~/odom:={prefix}/odom" not in remappings
+
+
+# acsar.rviz
+
+
+def test_rviz_shows_the_robot_in_odom() -> None:
+    manager = yaml("acsar.rviz")["Visualization Manager"]
+    assert manager["Global Options"]["Fixed Frame"] == CONFIG.odometry.odom_frame
+    displays = {d["Class"].rpartition("/")[2]: d for d in manager["Displays"]}
+    assert {"TF", "RobotModel", "Odometry", "LaserScan"} <= set(displays)
+    assert displays["Odometry"]["Topic"]["Value"] in published_names("out")
+    assert displays["Odometry"]["Covariance"]["Value"] is True
+    assert displays["LaserScan"]["Topic"]["Value"] == "/scan"
+
+
+# zenoh-bridge-ros2dds.json5
+
+
+def test_the_bridge_is_a_client_of_the_daemon_where_it_listens() -> None:
+    text = (FILES / "zenoh-bridge-ros2dds.json5").read_text()
+    zenoh.Config.from_json5(text)
+    assert bridge_setting("mode") == "client"
+    assert bridge_setting("connect/endpoints") == list(CONFIG.bus.listen)
+    assert bridge_setting("connect/timeout_ms") == -1
+    assert bridge_setting("scouting/multicast/enabled") is False
+    assert bridge_setting("plugins/ros2dds/domain") == RosConfig().domain
+
+
+def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
+    allow = bridge_setting("plugins/ros2dds/allow")
+    triggers = {
+        f"/{row.name}" for row in ros_names(RosConfig()) if row.type == "std_srvs/srv/Trigger"
+    }
+    wanted = {
+        "publishers": published_names("in"),
+        "subscribers": published_names("out"),
+        "service_clients": triggers,
+        "service_servers": set(),
+        "action_servers": set(),
+        "action_clients": set(),
+    }
+    assert {kind: set(names) for kind, names in allow.items()} == wanted
+    assert all(len(names) == len(set(names)) for names in allow.values())
+    assert wanted["publishers"] == {"/cmd_vel", "/cmd_vel_teleop", "/joint_commands"}
+    assert len(wanted["subscribers"]) == 6
+    assert len(triggers) == 5
+
+
+# README.md
+
+
+def test_the_readme_names_every_file() -> None:
+    text = (FILES / "README.md").read_text()
+    for path in FILES.iterdir():
+        if path.is_file() and path.name != "README.md":
+            assert f"`{path.name}`" in text, path.name
+
+
+def test_the_readme_has_every_ros_key_with_its_default() -> None:
+    text = (FILES / "README.md").read_text()
+    for field in msgspec.structs.fields(RosConfig):
+        default = json.dumps(field.default)
+        assert re.search(rf"^{field.name} = {re.escape(default)}( |$)", text, re.M), field.name
+
+
+def test_the_readme_names_every_topic_and_service() -> None:
+    text = (FILES / "README.md").read_text()
+    for row in ros_names(RosConfig()):
+        if not row.type.startswith("rcl_interfaces/"):
+            assert f"`{row.name}`" in text, row.name
+
+
+def test_the_toml_of_the_readme_is_accepted() -> None:
+    text = (FILES / "README.md").read_text()
+    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
+    assert len(blocks) >= 6
+    for block in blocks:
+        tables: dict[str, Any] = msgspec.toml.decode(block)
+        for table, values in tables.items():
+            kind = type(getattr(CONFIG, table))
+            known = {field.name for field in msgspec.structs.fields(kind)}
+            assert set(values) <= known
+            msgspec.convert(values, kind)

@@ -1,0 +1,206 @@
+"""What ROS 2 calls a topic, and that the type hashes in its keys are those of the definitions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Any
+
+import pytest
+
+from acsard.ros.names import TYPE_HASHES, bridge_key, dds_type, full_name, rmw_key
+from tests.vectors import ros_types
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRIGGER = "std_srvs/srv/Trigger"
+
+
+# names
+
+
+@pytest.mark.parametrize(
+    ("namespace", "name", "full"),
+    [
+        ("", "odom", "/odom"),
+        ("robot1", "cmd_vel", "/robot1/cmd_vel"),
+        ("fleet/robot1", "cmd_vel", "/fleet/robot1/cmd_vel"),
+        ("", "acsard/stop", "/acsard/stop"),
+    ],
+)
+def test_a_namespace_is_the_front_of_the_full_name(namespace: str, name: str, full: str) -> None:
+    assert full_name(namespace, name) == full
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("/odom", "odom"),
+        ("/a/b", "a/b"),
+        ("/bot1/a/b", "bot1/a/b"),
+        ("/tf_static", "tf_static"),
+        ("/acsard/stop", "acsard/stop"),
+    ],
+)
+def test_the_bridge_key_is_the_full_name_without_its_slash(name: str, key: str) -> None:
+    assert bridge_key(name) == key
+
+
+@pytest.mark.parametrize(
+    ("type_name", "dds"),
+    [
+        (ODOMETRY, "nav_msgs::msg::dds_::Odometry_"),
+        ("geometry_msgs/msg/Twist", "geometry_msgs::msg::dds_::Twist_"),
+        (TRIGGER, "std_srvs::srv::dds_::Trigger_"),
+    ],
+)
+def test_dds_has_its_own_way_to_write_a_type(type_name: str, dds: str) -> None:
+    assert dds_type(type_name) == dds
+
+
+@pytest.mark.parametrize(
+    ("domain", "name", "type_name", "key"),
+    [
+        (0, "/odom", ODOMETRY,
+         "0/odom/nav_msgs::msg::dds_::Odometry_/"
+         "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"),
+        (0, "/robot1/cmd_vel", "geometry_msgs/msg/Twist",
+         "0/robot1/cmd_vel/geometry_msgs::msg::dds_::Twist_/"
+         "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"),
+        (0, "/acsard/stop", TRIGGER,
+         "0/acsard/stop/std_srvs::srv::dds_::Trigger_/"
+         "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"),
+        (42, "/tf", "tf2_msgs/msg/TFMessage",
+         "42/tf/tf2_msgs::msg::dds_::TFMessage_/"
+         "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+    ],
+)  # fmt: skip
+def test_the_rmw_key_has_domain_name_type_and_hash(
+    domain: int, name: str, type_name: str, key: str
+) -> None:
+    assert rmw_key(domain, name, type_name) == key
+
+
+def test_a_type_without_a_hash_has_no_rmw_key() -> None:
+    with pytest.raises(KeyError):
+        rmw_key(0, "/scan", "sensor_msgs/msg/LaserScan")
+
+
+# hashes: RIHS01 is the sha256 of the type's description as JSON, with all it refers to
+
+Field = tuple[str, str]
+
+NESTED = 1
+BASE = {
+    "int8": 2, "uint8": 3, "int16": 4, "uint16": 5, "int32": 6, "uint32": 7, "int64": 8,
+    "uint64": 9, "float32": 10, "float64": 11, "bool": 15, "byte": 16, "string": 17,
+    "char": 3,  # the `char` of a message definition is a uint8
+}  # fmt: skip
+ARRAY, BOUNDED, SEQUENCE = 48, 96, 144
+"""What a type id grows by."""
+
+NO_MEMBERS = [("uint8", "structure_needs_at_least_one_member")]
+"""A struct without fields gets one."""
+
+
+def split(text: str) -> list[Field]:
+    fields = [tuple(field.split()) for field in text.split(",") if field.strip()]
+    return [(kind, name) for kind, name in fields] or NO_MEMBERS
+
+
+def definitions() -> dict[str, list[Field]]:
+    """The fields of every type by name; a service is a type whose fields are its three messages."""
+    known = {}
+    for line in ros_types.MESSAGES.strip().splitlines():
+        name, _, fields = line.partition(":")
+        known[name] = split(fields)
+    for line in ros_types.SERVICES.strip().splitlines():
+        name, _, both = line.partition(":")
+        request, _, response = both.partition("|")
+        known[f"{name}_Request"] = split(request)
+        known[f"{name}_Response"] = split(response)
+        known[f"{name}_Event"] = [
+            ("service_msgs/msg/ServiceEventInfo", "info"),
+            (f"{name}_Request[<=1]", "request"),
+            (f"{name}_Response[<=1]", "response"),
+        ]
+        known[name] = [
+            (f"{name}_Request", "request_message"),
+            (f"{name}_Response", "response_message"),
+            (f"{name}_Event", "event_message"),
+        ]
+    return known
+
+
+KNOWN = definitions()
+
+
+def parse(kind: str) -> tuple[str, int, int]:
+    """The base of a field's type, what is added to its id, and its capacity."""
+    match = re.fullmatch(r"([\w/]+)(?:\[(<=)?(\d*)\])?", kind)
+    assert match is not None, kind
+    base, bounded, size = match.groups()
+    if size is None:
+        return base, 0, 0
+    if not size:
+        return base, SEQUENCE, 0
+    return base, BOUNDED if bounded else ARRAY, int(size)
+
+
+def describe(name: str) -> dict[str, Any]:
+    fields = []
+    for kind, field in KNOWN[name]:
+        base, more, capacity = parse(kind)
+        nested = base not in BASE
+        described = {
+            "type_id": (NESTED if nested else BASE[base]) + more,
+            "capacity": capacity,
+            "string_capacity": 0,
+            "nested_type_name": base if nested else "",
+        }
+        fields.append({"name": field, "type": described})
+    return {"type_name": name, "fields": fields}
+
+
+def referred(name: str) -> set[str]:
+    """All types that a type is made of, however deep."""
+    found: set[str] = set()
+    for kind, _ in KNOWN[name]:
+        base = parse(kind)[0]
+        if base not in BASE:
+            found |= {base} | referred(base)
+    return found
+
+
+def rihs01(name: str) -> str:
+    text = json.dumps(
+        {
+            "type_description": describe(name),
+            "referenced_type_descriptions": [describe(other) for other in sorted(referred(name))],
+        }
+    )
+    return "RIHS01_" + hashlib.sha256(text.encode()).hexdigest()
+
+
+@pytest.mark.parametrize("type_name", TYPE_HASHES)
+def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
+    assert rihs01(type_name) == TYPE_HASHES[type_name]
+
+
+@pytest.mark.parametrize(
+    ("type_name", "published"),
+    [
+        ("builtin_interfaces/msg/Time",
+         "RIHS01_b106235e25a4c5ed35098aa0a61a3ee9c9b18d197f398b0e4206cea9acf9c197"),
+        ("geometry_msgs/msg/TransformStamped",
+         "RIHS01_0a241f87d04668d94099cbb5ba11691d5ad32c2f29682e4eb5653424bd275206"),
+    ],
+)  # fmt: skip
+def test_the_hash_written_here_is_the_one_ros_computes(type_name: str, published: str) -> None:
+    """On types that are no literals of ours, so that both cannot be wrong alike."""
+    assert rihs01(type_name) == published
+
+
+def test_no_definition_is_kept_that_no_hash_needs() -> None:
+    needed = set(TYPE_HASHES).union(*map(referred, TYPE_HASHES))
+    assert set(KNOWN) == needed

@@ -1,0 +1,153 @@
+"""The configuration as ROS parameters: listed, read and described, never set."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.config import effective
+from acsard.messages.cdr import Cdr, CdrError
+from acsard.ros import parameters as rcl
+from acsard.ros.parameters import Parameters
+from acsard.ros.trees import PARAMETER_SERVICES
+from acsard.settings import Config
+
+TABLES: dict[str, object] = {
+    "robot": {"id": "acsar"},
+    "mcu": {"baud_rate": 115200, "trailing_comma": False, "wheels": {"front_left": "+b"}},
+    "drive": {"wheel_radius": 0.05},
+    "odometry": {"diagonal": (1.0, 2.0)},
+    "bus": {"connect": [], "listen": ["tcp/127.0.0.1:7448"]},
+    "commands": {"sources": [{"name": "nav", "priority": 10}, {"name": "app", "priority": 50}]},
+}
+
+
+def ask(service: str, request: Any, reply: type[Any]) -> Any:
+    answer = Parameters(TABLES).answer(service, Cdr(type(request)).encode(request))
+    return Cdr(reply).decode(answer)
+
+
+def names(prefixes: list[str], depth: int = 0) -> list[str]:
+    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
+    return found.names
+
+
+def value(name: str) -> rcl.ParameterValue:
+    found: rcl.Values = ask("get_parameters", rcl.Names([name]), rcl.Values)
+    return found.values[0]
+
+
+ALL = [
+    "robot.id",
+    "mcu.baud_rate",
+    "mcu.trailing_comma",
+    "mcu.wheels.front_left",
+    "drive.wheel_radius",
+    "odometry.diagonal",
+    "bus.connect",
+    "bus.listen",
+    "commands.sources.nav.priority",
+    "commands.sources.app.priority",
+]
+
+
+def test_every_key_is_listed_with_the_tables_it_is_in() -> None:
+    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
+    assert found.names == ALL
+    assert found.prefixes == [
+        "bus",
+        "commands.sources.app",
+        "commands.sources.nav",
+        "drive",
+        "mcu",
+        "mcu.wheels",
+        "odometry",
+        "robot",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("prefixes", "depth", "expected"),
+    [
+        ([], 1, []),
+        ([], 2, [n for n in ALL if n.count(".") == 1]),
+        ([], 3, [n for n in ALL if n.count(".") <= 2]),
+        (["mcu"], 0, ["mcu.baud_rate", "mcu.trailing_comma", "mcu.wheels.front_left"]),
+        (["mcu"], 1, ["mcu.baud_rate", "mcu.trailing_comma"]),
+        (["mcu", "robot"], 1, ["robot.id", "mcu.baud_rate", "mcu.trailing_comma"]),
+        (["robot.id"], 0, ["robot.id"]),
+        (["mc"], 0, []),
+        (["nowhere"], 0, []),
+    ],
+)
+def test_prefixes_and_depth_choose_among_them(
+    prefixes: list[str], depth: int, expected: list[str]
+) -> None:
+    assert names(prefixes, depth) == expected
+
+
+def test_each_value_has_its_ros_type() -> None:
+    assert value("robot.id") == rcl.ParameterValue(rcl.STRING, string_value="acsar")
+    assert value("mcu.baud_rate") == rcl.ParameterValue(rcl.INTEGER, integer_value=115200)
+    assert value("mcu.trailing_comma") == rcl.ParameterValue(rcl.BOOL)
+    assert value("drive.wheel_radius") == rcl.ParameterValue(rcl.DOUBLE, double_value=0.05)
+    assert value("odometry.diagonal") == rcl.ParameterValue(
+        rcl.DOUBLE_ARRAY, double_array_value=[1.0, 2.0]
+    )
+    assert value("bus.listen") == rcl.ParameterValue(
+        rcl.STRING_ARRAY, string_array_value=["tcp/127.0.0.1:7448"]
+    )
+    assert value("bus.connect") == rcl.ParameterValue(rcl.STRING_ARRAY)
+    assert value("commands.sources.app.priority").integer_value == 50
+
+
+def test_a_name_that_is_not_there_has_no_value_and_no_type() -> None:
+    assert value("robot.weight") == rcl.ParameterValue()
+    asked = rcl.Names(["robot.weight", "robot.id"])
+    assert ask("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
+
+
+def test_a_description_says_type_and_that_it_is_read_only() -> None:
+    asked = rcl.Names(["drive.wheel_radius"])
+    (found,) = ask("describe_parameters", asked, rcl.Descriptors).descriptors
+    assert found == rcl.ParameterDescriptor("drive.wheel_radius", rcl.DOUBLE, read_only=True)
+
+
+def test_setting_is_refused_with_the_mend() -> None:
+    wish = rcl.Parameter("robot.id", rcl.ParameterValue(rcl.STRING, string_value="other"))
+    asked = rcl.SetRequest([wish, wish])
+    results = ask("set_parameters", asked, rcl.SetReply).results
+    assert [result.successful for result in results] == [False, False]
+    assert "acsard.toml" in results[0].reason
+    one: rcl.SetAtomicallyReply = ask("set_parameters_atomically", asked, rcl.SetAtomicallyReply)
+    assert not one.result.successful
+    assert value("robot.id").string_value == "acsar"
+
+
+@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+def test_a_request_cut_anywhere_is_refused(service: str) -> None:
+    wish = rcl.Parameter("robot.id", rcl.ParameterValue(rcl.STRING, string_value="other"))
+    request: Any = {
+        "list_parameters": rcl.ListRequest(["mcu"], 0),
+        "set_parameters": rcl.SetRequest([wish]),
+        "set_parameters_atomically": rcl.SetRequest([wish]),
+    }.get(service, rcl.Names(["robot.id"]))
+    payload = Cdr(type(request)).encode(request)
+    serve = Parameters(TABLES).answer
+    assert serve(service, payload)
+    for end in range(len(payload)):
+        with pytest.raises(CdrError):
+            serve(service, payload[:end])
+
+
+def test_the_whole_configuration_can_be_had() -> None:
+    serve = Parameters(effective(Config())).answer
+    listed = Cdr(rcl.ListReply).decode(
+        serve("list_parameters", Cdr(rcl.ListRequest).encode(rcl.ListRequest([], 0)))
+    )
+    got = Cdr(rcl.Values).decode(
+        serve("get_parameters", Cdr(rcl.Names).encode(rcl.Names(listed.names)))
+    )
+    assert "limits.linear_speed" in listed.names
+    assert all(one.type != rcl.NOT_SET for one in got.values)

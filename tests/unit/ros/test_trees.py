@@ -1,0 +1,138 @@
+"""The ROS names of the robot: each stands for a native key, in both trees."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.messages.topics import TOPICS
+from acsard.ros.names import TYPE_HASHES
+from acsard.ros.trees import PARAMETERS, Endpoint, command_keys, endpoints, node_tokens, ros_names
+from acsard.settings import CommandsConfig, RosConfig
+
+ZID = "abc"
+
+
+def found(ros: RosConfig) -> list[Endpoint]:
+    return list(endpoints(ros, ZID))
+
+
+def keys(ros: RosConfig, transport: str) -> dict[str, str]:
+    """The key of each native one; twists only once."""
+    return {e.native: e.key for e in found(ros) if e.transport == transport}
+
+
+def test_both_trees_have_the_same_names() -> None:
+    assert set(keys(RosConfig(), "bridge")) == set(keys(RosConfig(), "rmw"))
+
+
+def test_the_bridge_s_keys_are_the_bare_names() -> None:
+    assert keys(RosConfig(), "bridge") == {
+        "odom": "odom",
+        "tf": "tf",
+        "tf_static": "tf_static",
+        "wheel_states": "joint_states",
+        "diagnostics": "diagnostics",
+        "cmd_vel_out": "cmd_vel_out",
+        "cmd/nav": "cmd_vel",
+        "cmd/teleop": "cmd_vel_teleop",
+        "wheel_cmd/ros2_control": "joint_commands",
+        "srv/stop": "acsard/stop",
+        "srv/clear": "acsard/clear",
+        "srv/activate": "acsard/activate",
+        "srv/deactivate": "acsard/deactivate",
+        "srv/reset_odometry": "acsard/reset_odometry",
+        "parameters/describe_parameters": "acsard/describe_parameters",
+        "parameters/get_parameter_types": "acsard/get_parameter_types",
+        "parameters/get_parameters": "acsard/get_parameters",
+        "parameters/list_parameters": "acsard/list_parameters",
+        "parameters/set_parameters": "acsard/set_parameters",
+        "parameters/set_parameters_atomically": "acsard/set_parameters_atomically",
+    }
+
+
+def test_a_namespace_and_a_node_name_are_in_front_of_all_of_them() -> None:
+    ros = RosConfig(namespace="lab/robot1", node="base")
+    bridge = keys(ros, "bridge")
+    assert all(key.startswith("lab/robot1/") for key in bridge.values())
+    assert bridge["tf"] == "lab/robot1/tf"
+    assert bridge["srv/stop"] == "lab/robot1/base/stop"
+    assert keys(ros, "rmw")["tf"].startswith("0/lab/robot1/tf/tf2_msgs::msg::dds_::TFMessage_/")
+
+
+def test_over_rmw_a_topic_of_two_types_has_a_key_for_each() -> None:
+    twists = [e.key for e in found(RosConfig()) if e.transport == "rmw" and e.native == "cmd/nav"]
+    assert [key.split("/")[2] for key in twists] == [
+        "geometry_msgs::msg::dds_::Twist_",
+        "geometry_msgs::msg::dds_::TwistStamped_",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "types"),
+    [("twist", ["Twist_"]), ("twist_stamped", ["TwistStamped_"])],
+)
+def test_one_type_of_twist_can_be_chosen(kind: str, types: list[str]) -> None:
+    ros = RosConfig(cmd_vel_type=kind)  # type: ignore[arg-type]
+    rmw = [e for e in found(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
+    assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 2
+
+
+@pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True), (False, False)])
+def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
+    ros = RosConfig(bridge=bridge, rmw=rmw)
+    transports = {e.transport for e in found(ros)}
+    assert transports == {name for name, on in (("bridge", bridge), ("rmw", rmw)) if on}
+    tokens = node_tokens(ros, ZID)
+    assert any(token.startswith("@ros2_lv/") for token in tokens) == rmw
+    assert any(token == "@/abc/@ros2_lv" for token in tokens) == bridge
+
+
+def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
+    patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
+    sources = {source.name for source in CommandsConfig().sources}
+    for row in ros_names(RosConfig()):
+        if row.native.startswith(PARAMETERS):
+            continue
+        if row.direction == "in":
+            head, _, source = row.native.partition("/")
+            assert source in sources
+            assert patterns[f"{head}/"].direction == "in"
+        else:
+            assert patterns[row.native].direction == row.direction
+            assert patterns[row.native].latched == row.qos.transient
+        assert row.type in TYPE_HASHES
+
+
+def test_only_what_is_latched_in_the_native_tree_is_latched() -> None:
+    assert {e.native for e in found(RosConfig()) if e.latched} == {"tf_static"}
+
+
+def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
+    tokens = [e.token for e in found(RosConfig()) if e.transport == "rmw"]
+    assert len(set(tokens)) == len(tokens)
+    numbers = [int(token.split("/")[4]) for token in tokens]
+    assert numbers == list(range(1, len(tokens) + 1))
+    kinds = {"out": "MP", "in": "MS", "query": "SS"}
+    for endpoint in found(RosConfig()):
+        if endpoint.transport == "rmw":
+            assert endpoint.token.split("/")[5] == kinds[endpoint.direction]
+
+
+def test_a_bridge_is_told_of_everything_that_has_one_type() -> None:
+    silent = {e.native for e in found(RosConfig()) if e.transport == "bridge" and not e.token}
+    assert silent == {"cmd/nav", "cmd/teleop"}
+    chosen = RosConfig(cmd_vel_type="twist_stamped")
+    assert all(e.token for e in found(chosen))
+    assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(e.token for e in found(chosen))
+
+
+def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
+    ros = RosConfig(announce=False)
+    assert not any(e.token for e in found(ros) if e.transport == "bridge")
+    assert node_tokens(ros, ZID) == ("@ros2_lv/0/abc/0/0/NN/%/%/acsard",)
+
+
+def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
+    rate_limited = command_keys(RosConfig())
+    assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
+    assert len(rate_limited) == 3 + 5
