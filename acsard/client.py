@@ -165,7 +165,7 @@ class Client:
             raise ExitError(
                 Exit.UNREACHABLE,
                 f"no answer on {self.key(name)}; is the daemon running with robot.id "
-                f'"{self._id}", and is there such a key? `acsard topics` lists them',
+                f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
             )
         return found
 
@@ -220,10 +220,13 @@ class AsyncClient:
 
 @contextmanager
 def connect(
-    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app"
+    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
 ) -> Iterator[Client]:
-    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`)."""
-    session = client_session(endpoint)
+    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
+
+    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
+    """
+    session = client_session(endpoint, tls)
     try:
         yield Client(session, robot_id, source)
     finally:
@@ -232,10 +235,10 @@ def connect(
 
 @asynccontextmanager
 async def connect_async(
-    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app"
+    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
 ) -> AsyncIterator[AsyncClient]:
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
-    session = await in_thread(lambda: client_session(endpoint), 10.0)
+    session = await in_thread(lambda: client_session(endpoint, tls), 10.0)
     try:
         yield AsyncClient(Client(session, robot_id, source))
     finally:

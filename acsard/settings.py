@@ -33,6 +33,13 @@ Text = Annotated[
         extra={"unit": "a text of 1 to 256 characters"},
     ),
 ]
+CommonName = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^\x00-\x1f/]{1,64}\Z",
+        extra={"unit": "the common name of a certificate", "example": "operator"},
+    ),
+]
 RosNode = Annotated[
     str,
     Meta(
@@ -187,7 +194,17 @@ class BusConfig(Struct, frozen=True):
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
     connect: tuple[Text, ...] = ()
+    tls: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
+    ] = ""
     insecure: bool = False
+
+
+class AccessConfig(Struct, frozen=True):
+    viewers: tuple[CommonName, ...] = ("viewer",)
+    operators: tuple[CommonName, ...] = ("operator",)
+    maintainers: tuple[CommonName, ...] = ("maintainer",)
 
 
 class RosConfig(Struct, frozen=True):
@@ -202,7 +219,7 @@ class RosConfig(Struct, frozen=True):
 
 class LogConfig(Struct, frozen=True):
     level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["auto", "console", "json", "logfmt"] = "auto"
+    format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
 
 
 class SimConfig(Struct, frozen=True):
@@ -225,6 +242,7 @@ class Config(Struct, frozen=True):
     footprint: FootprintConfig = FootprintConfig()
     rates: RatesConfig = RatesConfig()
     bus: BusConfig = BusConfig()
+    access: AccessConfig = AccessConfig()
     ros: RosConfig = RosConfig()
     log: LogConfig = LogConfig()
     sim: SimConfig = SimConfig()

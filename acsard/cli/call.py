@@ -34,8 +34,8 @@ def main(args: argparse.Namespace) -> int:
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise ExitError(Exit.USAGE, f"write: {form}")
-    endpoint, robot_id = robot_address(args)
-    with connect(endpoint, robot_id=robot_id) as robot:
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
     print(encode(reply, "json").decode() if args.json else reply.message)
     return 0 if reply.success else 1

@@ -25,7 +25,8 @@ def main(args: argparse.Namespace) -> int:
     """Check and print."""
     import msgspec
 
-    from acsard.config import effective, warnings
+    from acsard.config import effective
+    from acsard.rules import warnings
 
     where, config = load(args.config)
     plain = effective(config)

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 from acsard import config as configuration
 from acsard.config import ConfigError
@@ -32,6 +33,11 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="where the daemon listens, e.g. tcp/127.0.0.1:7448"
+    )
+    parser.add_argument(
+        "--tls",
+        metavar="DIRECTORY",
+        help="your certificate for a tls/ endpoint (else $ACSARD_TLS, or bus.tls)",
     )
     parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)")
 
@@ -78,7 +84,25 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
         ) from None
 
 
-def robot_address(args: argparse.Namespace) -> tuple[str, str]:
-    """The endpoint and the id of the robot a tool talks to."""
+class Address(NamedTuple):
+    """How to reach a robot."""
+
+    endpoint: str
+    robot_id: str
+    tls: str
+    """Directory with our certificate, "" for none."""
+
+
+def robot_address(args: argparse.Namespace) -> Address:
+    """Where the robot is that a tool talks to: the options, else the configuration."""
     _, config = load(args.config)
-    return args.connect or config.bus.listen[0], args.id or config.robot.id
+    bus = config.bus
+    # The daemon listens only as a peer; plain endpoints need no certificate.
+    known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
+    endpoint = args.connect or known[0]
+    tls = args.tls or os.environ.get("ACSARD_TLS") or bus.tls
+    return Address(endpoint, args.id or config.robot.id, tls if _is_tls(endpoint) else "")
+
+
+def _is_tls(endpoint: str) -> bool:
+    return endpoint.startswith("tls/")

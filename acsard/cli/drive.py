@@ -98,8 +98,8 @@ def main(args: argparse.Namespace) -> int:
 
     if not sys.stdin.isatty():
         raise ExitError(Exit.USAGE, "drive reads keys and needs a terminal; use acsard.client")
-    endpoint, robot_id = robot_address(args)
-    with connect(endpoint, robot_id=robot_id, source=args.source) as robot:
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         print(HELP)
         before = termios.tcgetattr(sys.stdin)
         for number in (signal.SIGTERM, signal.SIGHUP):

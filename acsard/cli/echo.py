@@ -28,10 +28,10 @@ def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
     from acsard.client import connect
 
-    endpoint, robot_id = robot_address(args)
+    endpoint, robot_id, tls = robot_address(args)
     left = args.n
     _hint(args.topic)
-    with connect(endpoint, robot_id=robot_id) as robot:
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         try:
             for sample in robot.samples(args.topic, args.timeout):
                 print(json_line(str(sample.encoding), sample.payload.to_bytes()), flush=True)

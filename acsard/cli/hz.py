@@ -31,10 +31,10 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.client import connect
 
-    endpoint, robot_id = robot_address(args)
+    endpoint, robot_id, tls = robot_address(args)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
-    with connect(endpoint, robot_id=robot_id) as robot:
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         subscriber = robot.session.declare_subscriber(
             robot.key(args.topic), lambda _: times.append(time.monotonic())
         )

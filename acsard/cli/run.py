@@ -45,6 +45,7 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("mcu", "baud_rate", args.baud_rate),
         ("robot", "id", args.id),
         ("bus", "listen", [args.listen] if args.listen else None),
+        ("bus", "tls", os.environ.get("ACSARD_TLS")),  # systemd's credentials, say
     ):
         if value is not None:
             given.setdefault(section, {})[key] = value
@@ -54,8 +55,9 @@ def overrides(args: argparse.Namespace) -> Overrides:
 def main(args: argparse.Namespace) -> int:
     """Run until a signal."""
     import asyncio
+    import faulthandler
 
-    from acsard.config import warnings
+    from acsard.rules import warnings
     from acsard.runtime import daemon
     from acsard.runtime.logs import Log, Writer
     from acsard.values import Event
@@ -80,6 +82,9 @@ def main(args: argparse.Namespace) -> int:
         for text in warnings(config):
             log.event(Event("configuration", text, "warning"))
 
+    # The watchdog ends a daemon that hangs by SIGABRT: where it hung goes to standard error.
+    if sys.stderr is not None:  # None when it was closed before the start
+        faulthandler.enable()
     try:
         asyncio.run(daemon.run(config, log, announce))
     finally:

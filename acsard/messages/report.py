@@ -35,6 +35,9 @@ from acsard.settings import Config
 from acsard.values import NS_PER_S, Instant, Outputs, Sample, Snapshot
 from acsard.values import Twist as BodyTwist
 
+EXPIRY_DAYS = 30
+"""From when on a certificate that ends is a warning."""
+
 Look = Callable[[], Snapshot]
 
 
@@ -58,8 +61,11 @@ class _Rate:
 class Report:
     """Builds messages from outputs; remembers only the last sample and the last outputs."""
 
-    def __init__(self, config: Config, start: Instant) -> None:
+    def __init__(
+        self, config: Config, start: Instant, certificate_ends_ns: int | None = None
+    ) -> None:
         self._config = config
+        self._certificate_ends_ns = certificate_ends_ns
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._sample: Sample | None = None
@@ -191,13 +197,26 @@ class Report:
                 SourceState(s.name, s.priority, s.age_s, s.waits_for) for s in snapshot.sources
             ],
             refused=snapshot.refused,
+            certificate=self._certificate(outputs.now)[1],
             counters=snapshot.counters,
         )
+
+    def _certificate(self, now: Instant) -> tuple[int, str]:
+        """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""
+        if not self._config.bus.tls:
+            return 0, ""
+        if self._certificate_ends_ns is None:
+            return 1, "unknown: the library to read it is missing (pip install 'acsard[lan]')"
+        days = (self._certificate_ends_ns - now.wall_ns) / NS_PER_S / 86400
+        if days < 0:
+            return 2, f"ended {-days:.0f} days ago: nobody can join any more"
+        return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, late = self._config, snapshot.counters, snapshot.lateness_us
         ok, warning, error = 0, 1, 2
         use = wire_use(config.rate_hz, config.mcu.baud_rate, line_bytes(config.mcu.trailing_comma))
+        certificate = self._certificate(outputs.now)
         missed, periods = counters.get("missed_periods", 0), max(1, late.count)
         mode_level = error if outputs.mode == "fault" else ok
         statuses = (
@@ -226,6 +245,7 @@ class Report:
                 {s.name: s.waits_for or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
+            *([("certificate", *certificate, {})] if certificate[1] else []),
         )
         return DiagnosticArray(
             Header(Time.from_ns(outputs.now.wall_ns)),

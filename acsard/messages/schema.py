@@ -167,6 +167,8 @@ class RobotState(Message, frozen=True):
     refused: str
     """The last command that was refused and why; empty when none was."""
     counters: dict[str, int]
+    certificate: str = ""
+    """How long the bus's TLS certificate is valid, in words; empty without TLS."""
 
 
 class KeyValue(Message, frozen=True):

@@ -92,9 +92,10 @@ class ControlLoop:
         bus: Bus,
         start: Instant,
         log: Callable[[Event], None],
+        certificate_ends_ns: int | None = None,
     ) -> None:
         self.robot = Robot(config)
-        self.report = Report(config, start)
+        self.report = Report(config, start, certificate_ends_ns)
         self.lateness_us = Histogram()
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""

@@ -10,17 +10,20 @@ import asyncio
 import gc
 import os
 import signal
-from collections.abc import Callable
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 
 from acsard import __version__
+from acsard.access import access_control
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.runtime import clock
+from acsard.runtime.certificates import ends_ns as ends_ns_of
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.logs import Log
 from acsard.runtime.serial_port import SerialPort
 from acsard.runtime.sim_pty import SimPty
+from acsard.runtime.systemd import PATIENCE_S, Systemd
 from acsard.runtime.ticker import Ticker
 from acsard.runtime.zenoh_bus import ZenohBus
 from acsard.runtime.zenoh_session import log_from_environment
@@ -55,8 +58,8 @@ class _Wakeup:
 class _Departure:
     """Signals -> the way down: the first begins it, a second cuts the ramp."""
 
-    def __init__(self, log: Log, wake: Callable[[], None]) -> None:
-        self._log, self._wake = log, wake
+    def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
+        self._log, self._wake, self._manager = log, wake, manager
         self._starting = asyncio.current_task()
         self.begun_ns: int | None = None
         self.hurried = False
@@ -75,6 +78,7 @@ class _Departure:
         self.hurried = self.begun_ns is not None
         if self.begun_ns is None:
             self.begun_ns = clock.now().mono_ns
+            self._manager.stopping()
         self._log.info("signal", signal=number.name, hurried=self.hurried)
         if self._starting is not None:
             self._starting.cancel()
@@ -94,18 +98,26 @@ Announce = Callable[[str, str], None]
 async def run(config: Config, log: Log, announce: Announce) -> None:
     """Run until a signal; raises `ExitError` when it cannot start."""
     wake = _Wakeup()
-    departure = _Departure(log, wake)
+    manager = Systemd(os.environ, os.getpid())
+    departure = _Departure(log, wake, manager)
     departure.watch()
     log_from_environment()
     try:
-        await _run(config, log, announce, departure, wake)
+        await _run(config, log, announce, departure, wake, manager)
     except asyncio.CancelledError:
         if departure.begun_ns is None:
             raise
+    finally:
+        manager.close()
 
 
 async def _run(
-    config: Config, log: Log, announce: Announce, departure: _Departure, wake: _Wakeup
+    config: Config,
+    log: Log,
+    announce: Announce,
+    departure: _Departure,
+    wake: _Wakeup,
+    manager: Systemd,
 ) -> None:
     async with AsyncExitStack() as stack:
         path = config.mcu.port
@@ -113,28 +125,34 @@ async def _run(
             mcu = FakeMcu(config, clock.now().mono_ns)
             path = stack.enter_context(SimPty(mcu)).path
         sources = tuple(source.name for source in config.commands.sources)
-        bus = ZenohBus(config.bus, config.ros, config.robot.id, sources)
+        bus = ZenohBus(config.bus, config.ros, config.robot.id, sources, access_control(config))
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
-        if config.bus.mode == "client":
-            log.info("connecting", text=f"waits for the router at {', '.join(config.bus.connect)}")
-        await stack.enter_async_context(bus)
+        async with _patience(config, log, manager):
+            await stack.enter_async_context(bus)
         await stack.enter_async_context(port)
-        control = ControlLoop(config, _info(config, path), port, bus, clock.now(), log.event)
+        ends_ns = ends_ns_of(config.bus.tls) if config.bus.tls else None
+        info = _info(config, path)
+        control = ControlLoop(config, info, port, bus, clock.now(), log.event, ends_ns)
         announce(path, port.trouble)
+        manager.ready()
         departure.started()
         async with asyncio.TaskGroup() as tasks:
             helpers = [
                 tasks.create_task(port.keep_open()),
                 tasks.create_task(_repeat_latched(bus, control)),
             ]
-            await _control(config, control, departure, wake)
+            await _control(config, control, departure, wake, manager)
             for helper in helpers:
                 helper.cancel()
 
 
 async def _control(
-    config: Config, control: ControlLoop, departure: _Departure, wake: _Wakeup
+    config: Config,
+    control: ControlLoop,
+    departure: _Departure,
+    wake: _Wakeup,
+    manager: Systemd,
 ) -> None:
     """The control task: a step every period, and one for feedback in hand."""
     await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
@@ -148,9 +166,31 @@ async def _control(
             period = ticker.take()
             control.leaving = departure.begun_ns is not None
             late_ns = now.mono_ns - period.due_ns
-            control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
+            outputs = control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
+            manager.step(outputs)
             if departure.over(now.mono_ns, control.at_rest):
                 return
+
+
+@asynccontextmanager
+async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
+    """A client has nothing to do before its router is there, and says so while it waits."""
+    if config.bus.mode == "peer":
+        yield
+        return
+    why = f"waits for the router at {', '.join(config.bus.connect)}"
+    log.info("connecting", text=why)
+
+    async def repeat() -> None:
+        while True:
+            manager.waiting(why)
+            await asyncio.sleep(PATIENCE_S / 3)
+
+    task = asyncio.create_task(repeat())
+    try:
+        yield
+    finally:
+        task.cancel()
 
 
 async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:

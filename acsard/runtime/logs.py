@@ -16,8 +16,11 @@ from typing import Any, Literal, TextIO
 
 import structlog
 
+from acsard.runtime.journal import JournalStream, is_journal, render
 from acsard.settings import LogConfig
 from acsard.values import Event
+
+Form = Literal["console", "json", "logfmt", "journal"]
 
 QUEUED_LINES = 1000
 """More than the daemon says in an hour of trouble."""
@@ -78,10 +81,13 @@ class Log:
     """What the daemon writes about itself."""
 
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
+        form: Form = settings.format if settings.format != "auto" else _fitting(stream)
+        if form == "journal":
+            try:
+                stream = JournalStream()
+            except OSError:
+                form = "json"  # no journal here, or a sandbox without it
         self._writer = Writer(stream)
-        form = settings.format
-        if form == "auto":
-            form = "console" if stream.isatty() else "json"
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -118,8 +124,16 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
     return {key: line[key] for key in first if key in line} | dict(line)
 
 
-def _renderer(form: Literal["console", "json", "logfmt"]) -> Any:
+def _fitting(stream: TextIO) -> Form:
+    if is_journal(stream, os.environ):
+        return "journal"
+    return "console" if stream.isatty() else "json"
+
+
+def _renderer(form: Form) -> Any:
     match form:
+        case "journal":
+            return render
         case "console":
             return structlog.dev.ConsoleRenderer(pad_event_to=14)
         case "json":

@@ -38,9 +38,15 @@ class ZenohBus:
     """The robot's keys on the bus, while entered."""
 
     def __init__(
-        self, bus: BusConfig, ros: RosConfig, robot_id: str, sources: tuple[str, ...]
+        self,
+        bus: BusConfig,
+        ros: RosConfig,
+        robot_id: str,
+        sources: tuple[str, ...],
+        access: dict[str, object],
     ) -> None:
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
+        self._access = access
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
         self._inbox = Inbox(prefix, self._replies)
@@ -82,7 +88,7 @@ class ZenohBus:
 
     def _open(self) -> None:
         settings, limited = self._settings, command_keys(self._ros)
-        session = daemon_session(settings, self._id, self._sources, limited)
+        session = daemon_session(settings, self._id, self._sources, limited, self._access)
         self._session = session
         self._inbox.own_id = session.new_timestamp().get_id()
         if settings.connect and self._twin(session):

@@ -21,17 +21,24 @@ COMMAND_RATE_HZ = 1000.0
 MAX_SESSIONS = 32
 """Clients at once; idle connections of strangers must not keep a person out for long."""
 
+CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
+"""The files of a TLS directory."""
+
 MESSAGE_BYTES = 65536
 """Largest message taken from a link; commands are held to far less in code."""
 
 
 def daemon_session(
-    bus: BusConfig, robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+    bus: BusConfig,
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
 ) -> zenoh.Session:
     """The daemon's session: a peer that listens where it is told, finds nobody by itself.
 
-    `limited` are the ROS keys commands come in on. Raises `ExitError` when the address is taken.
-    Blocks, as a client until its router is there; call it in a thread.
+    `limited` are the ROS keys commands come in on, `access` is who may do what. Raises `ExitError`
+    when the address is taken. Blocks, as a client until its router is there; call it in a thread.
     """
     settings = _base(bus.mode) | {
         "listen/endpoints": list(bus.listen) if bus.mode == "peer" else [],
@@ -48,8 +55,11 @@ def daemon_session(
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
         "queries_default_timeout": 3000,
+        "access_control": access,
         "downsampling": [_command_limits(robot_id, sources, limited)],
     }
+    if bus.tls:
+        settings |= _tls(bus.tls)
     if bus.connect:
         settings |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
     try:
@@ -63,8 +73,10 @@ def daemon_session(
         ) from error
 
 
-def client_session(endpoint: str) -> zenoh.Session:
+def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     """A client of the daemon (or a router) at `endpoint`; raises `ExitError` when nobody answers.
+
+    `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
 
     A client, because peers behind one hub do not reach each other.
     """
@@ -77,6 +89,8 @@ def client_session(endpoint: str) -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
+    if tls:
+        settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
@@ -98,6 +112,22 @@ def _base(mode: str) -> dict[str, object]:
             "period_max_ms": 500,
             "period_increase_factor": 1.5,
         },
+    }
+
+
+def _tls(directory: str) -> dict[str, object]:
+    """Both ends show a certificate of the same CA, and a link ends with its certificate."""
+    certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": f"{directory}/{CA}",
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+        }
     }
 
 

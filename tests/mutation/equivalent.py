@@ -32,6 +32,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/drive/limits.py _approach: 'slope = slope if slope * wanted > 0 else 0.0' -> 'slope = slope if slope * wanted >= 0 else 0.0'": "where the product is 0 the slope is",
     "acsard/drive/sanity.py _signs: 'expected < 0 and (abs(speed) > 0.3 * size), abs(speed) > 1.5' -> 'expected < 0 and (abs(speed) >= 0.3 * size), abs(speed) > 1.5'": "the model nears its command and never quite meets it: nor does a line this bound",
     "acsard/drive/arbiter.py _Commander.__init__: 'self.came_ns = 0' -> 'pass'": "set by the first command, before it is read",
+    "acsard/robot.py Robot._drive: 'elif self._life.mode is Mode.DRIVING and twist is not None:' -> 'elif self._life.mode is Mode.DRIVING:'": "without a twist NO_COMMAND has just ended driving; the rest is for the type checker",
     "acsard/robot.py Robot.__init__: 'self._lost_dt = 0.0' -> 'self._lost_dt = -1.0'": "the first line has no dt, and a negative one folds nothing either",
     "acsard/drive/sanity.py _Wheel.__init__: 'self.seen = 0.0' -> 'self.seen = 1.0'": "one line more of evidence, for a wheel first seen at just this speed",
     "acsard/robot.py Robot.__init__: 'self._lost_dt = 0.0' -> 'self._lost_dt = 1.0'": "a gap before the first line adds nothing: nothing was moving",

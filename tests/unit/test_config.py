@@ -11,7 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from acsard.config import ConfigError, effective, from_builtins, parse, warnings
+from acsard.config import ConfigError, effective, from_builtins, parse
+from acsard.rules import warnings
 from acsard.settings import Config, Source
 from tests.unit.keys import KEYS, Key
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from itertools import pairwise
 
 import pytest
 from msgspec.structs import replace
@@ -398,6 +399,16 @@ def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there()
     bench.step(GO)
     waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns, Spread()).sources}
     assert waits["app"] == ""
+
+
+def test_a_silent_mcu_is_told_to_stand_ten_times_a_second_at_any_rate() -> None:
+    bench = Bench(Config(mcu=McuConfig(baud_rate=115200), control=ControlConfig(rate=250.0)))
+    bench.driving()
+    bench.reply = None
+    while bench.out.link == "up":
+        bench.step(GO)
+    said = [bench.now_ns for _ in range(1000) if bench.step(GO).line is not None]
+    assert {after - before for before, after in pairwise(said)} == {100 * MS}
 
 
 def test_a_silent_mcu_is_rest_after_quiet() -> None:

@@ -124,26 +124,53 @@ def test_every_problem_is_printed_with_the_file_it_is_in(
     assert lines[0].startswith(f"{places.option}: a = 1: unknown key")
 
 
-def asked(config: Path, connect: str | None = None, robot_id: str | None = None) -> tuple[str, str]:
-    return robot_address(argparse.Namespace(config=str(config), connect=connect, id=robot_id))
+def asked(
+    config: Path,
+    connect: str | None = None,
+    robot_id: str | None = None,
+    tls: str | None = None,
+) -> tuple[str, str, str]:
+    return robot_address(
+        argparse.Namespace(config=str(config), connect=connect, id=robot_id, tls=tls)
+    )
 
 
 def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
     places.option.write_text(
         '[robot]\nid = "r7"\n[bus]\nlisten = ["tcp/[::1]:9", "tcp/127.0.0.1:8"]\n'
     )
-    assert asked(places.option) == ("tcp/[::1]:9", "r7")
+    assert asked(places.option) == ("tcp/[::1]:9", "r7", "")
 
 
 def test_its_options_win_over_the_configuration(places: Places) -> None:
     places.fill()
-    assert asked(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8")
-    assert asked(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8")
+    assert asked(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
+    assert asked(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
+
+
+def test_a_tool_goes_where_a_daemon_that_is_a_client_goes(places: Places) -> None:
+    places.option.write_text(
+        '[bus]\nmode = "client"\nlisten = ["tcp/127.0.0.1:8"]\nconnect = ["tcp/127.0.0.1:7447"]\n'
+    )
+    assert asked(places.option)[0] == "tcp/127.0.0.1:7447"
+
+
+def test_a_certificate_goes_with_a_tls_endpoint_only(
+    places: Places, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places.option.write_text(
+        '[bus]\nlisten = ["tls/0.0.0.0:7449", "tcp/127.0.0.1:8"]\ntls = "/etc/acsard/tls"\n'
+    )
+    assert asked(places.option) == ("tcp/127.0.0.1:8", "acsar", "")
+    assert asked(places.option, "tls/robot:7449")[2] == "/etc/acsard/tls"
+    monkeypatch.setenv("ACSARD_TLS", "/home/a")
+    assert asked(places.option, "tls/robot:7449")[2] == "/home/a"
+    assert asked(places.option, "tls/robot:7449", tls="/home/b")[2] == "/home/b"
 
 
 def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("[bus]\nlisten = []\n")
     with pytest.raises(ExitError) as caught:
-        robot_address(argparse.Namespace(config=str(file), connect=None, id=None))
+        robot_address(argparse.Namespace(config=str(file), connect=None, id=None, tls=None))
     assert caught.value.code is Exit.BAD_CONFIG

@@ -29,6 +29,7 @@ from acsard.messages.schema import (
 )
 from acsard.messages.topics import PUBLISHED
 from acsard.settings import (
+    BusConfig,
     Config,
     ControlConfig,
     FootprintConfig,
@@ -554,3 +555,46 @@ def test_at_ten_hertz_the_gaps_are_even_too() -> None:
         if report.due(at(later(1.0 + step / 100 + late)), {"state"}, lambda: SNAPSHOT):
             found.append(step)
     assert {b - a for a, b in pairwise(found[2:])} == {10}
+
+
+# the certificate of the bus
+
+DAY_NS = 86400 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("days", "level", "words"),
+    [
+        (400, 0, "valid for 400 days"),
+        (30, 0, "valid for 30 days"),
+        (29, 1, "valid for 29 days"),
+        (-2, 2, "ended 2 days ago"),
+    ],
+)
+def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: str) -> None:
+    config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
+    made = Report(config, START, OUTPUTS.now.wall_ns + days * DAY_NS)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert state.certificate.startswith(words)
+    array = made.current("diagnostics", lambda: SNAPSHOT)
+    assert isinstance(array, DiagnosticArray)
+    (status,) = [one for one in array.status if one.name == "acsard: certificate"]
+    assert (status.level, status.message) == (level, state.certificate)
+
+
+def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
+    made = Report(replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls")), START)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert "acsard[lan]" in state.certificate
+
+
+def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
+    made = Report(CONFIG, START, 0)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert state.certificate == ""

@@ -1,0 +1,163 @@
+"""`acsard lan init | add`: certificates for a bus that leaves the machine.
+
+One authority of your own; the robot and each person or program get a certificate from it. The
+robot lets in who has one, and the common name in it decides what they may do (`[access]`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.runtime.exits import Exit, ExitError
+from acsard.runtime.zenoh_session import CA, CERTIFICATE, KEY
+
+if TYPE_CHECKING:
+    from acsard.cli.certificates import Authority
+
+DIRECTORY = "/etc/acsard/tls"
+PORT = 7449
+ROLES = ("viewer", "operator", "maintainer")
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "lan",
+        help="make certificates, so that other machines may join",
+        description="Certificates for a bus that leaves this machine. Needs the extra: "
+        "pip install 'acsard[lan]'.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    init = actions.add_parser(
+        "init",
+        help="an authority, the robot's certificate and one for each role",
+        description="Make an authority, the robot's certificate, and one certificate for each of "
+        "viewer, operator and maintainer, and print the lines of acsard.toml for them.",
+    )
+    init.add_argument(
+        "--address",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a name or address the robot is reached by, beside its host name; repeat it",
+    )
+    init.add_argument("--force", action="store_true", help="replace what is there")
+    init.set_defaults(main=main_init)
+    more = actions.add_parser(
+        "add",
+        help="one more certificate",
+        description="Make a certificate for one more person or program.",
+    )
+    more.add_argument("name", metavar="NAME", help="its common name, e.g. laptop-anna")
+    more.add_argument("--role", choices=ROLES, required=True, help="what it may do")
+    more.set_defaults(main=main_add)
+    for action in (init, more):
+        action.add_argument(
+            "--directory", default=DIRECTORY, metavar="DIR", help=f"default {DIRECTORY}"
+        )
+        action.add_argument(
+            "--days", type=int, default=730, metavar="N", help="validity, default 730 days"
+        )
+
+
+def main_init(args: argparse.Namespace) -> int:
+    """Make everything a first robot needs."""
+    maker = _authority()
+    directory = Path(args.directory)
+    if (directory / CA).exists() and not args.force:
+        raise ExitError(
+            Exit.FAILURE,
+            f"{directory / CA} exists: `acsard lan add` makes one more certificate with it; "
+            "--force makes a new authority, and all certificates of the old one are refused then",
+        )
+    host = socket.gethostname()
+    names = [host, f"{host}.local", "localhost", "127.0.0.1", *args.address]
+    _writable(directory)
+    authority = maker.make(directory, f"acsard at {host}", args.days)
+    authority.issue(directory, "robot", names, args.days)
+    for role in ROLES:
+        _client(authority, directory, role, args.days)
+    print(
+        _NEXT.format(
+            directory=directory.resolve(),
+            port=PORT,
+            host=host,
+            ca=CA,
+            certificate=CERTIFICATE,
+            key=KEY,
+        )
+    )
+    return 0
+
+
+def main_add(args: argparse.Namespace) -> int:
+    """Make one more client certificate."""
+    maker = _authority()
+    directory = Path(args.directory)
+    _writable(directory)
+    try:
+        authority = maker.load(directory)
+    except FileNotFoundError:
+        raise ExitError(
+            Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
+    place = directory / "clients" / args.name
+    if not args.name.isprintable() or "/" in args.name or args.name in ("", ".", ".."):
+        raise ExitError(Exit.USAGE, f"{args.name!r} is not a name for a certificate")
+    if place.exists():
+        raise ExitError(Exit.FAILURE, f"{place} exists; remove it, or choose another name")
+    _client(authority, directory, args.name, args.days)
+    print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do:\n")
+    print(f'[access]\n{args.role}s = ["{args.role}", "{args.name}"]')
+    return 0
+
+
+def _client(authority: Authority, directory: Path, name: str, days: int) -> None:
+    authority.issue(directory / "clients" / name, name, [], days)
+
+
+def _writable(directory: Path) -> None:
+    try:
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExitError(
+            Exit.NO_PERMISSION, f"cannot make {directory}: {error.strerror}; use --directory"
+        ) from None
+    if not os.access(directory, os.W_OK):
+        raise ExitError(
+            Exit.NO_PERMISSION, f"cannot write to {directory}: run it by sudo, or use --directory"
+        )
+
+
+def _authority() -> type[Authority]:
+    try:
+        from acsard.cli.certificates import Authority
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE, "needs the library cryptography; run: pip install 'acsard[lan]'"
+        ) from None
+    return Authority
+
+
+_NEXT = """\
+Wrote {directory}:
+  {ca}, {certificate}, {key}   the robot's
+  ca-key.pem                       the authority: whoever has it can let anyone in; keep it safe
+  clients/<role>/                  one directory each for viewer, operator, maintainer
+
+On the robot, in acsard.toml:
+
+[bus]
+listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:{port}"]
+tls = "{directory}"
+
+Copy clients/<role>/ to who may do that, and there:
+
+acsard echo state --connect tls/{host}.local:{port} --tls <that directory>
+"""

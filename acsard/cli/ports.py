@@ -1,0 +1,53 @@
+"""`acsard ports`: the serial ports of this machine, and which looks like the microcontroller."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "ports",
+        help="list the serial ports, who holds them, and which looks like the MCU",
+        description="List what is plugged in: device, stable names, driver, USB id, who holds it, "
+        "and which usual microcontroller board it looks like. Opens nothing. Exit 1 when there "
+        "is no port at all.",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """List the ports."""
+    import msgspec
+
+    from acsard.runtime.host import serial_devices
+
+    found = serial_devices()
+    if args.json:
+        print(msgspec.json.encode(found).decode())
+        return 0 if found else 1
+    if not found:
+        print(
+            "no serial ports: is the board plugged in, by a cable with data lines? "
+            "`dmesg | tail` says what the kernel saw",
+            file=sys.stderr,
+        )
+        return 1
+    for port in found:
+        kind = " ".join(filter(None, [port.usb_id, port.driver, port.description]))
+        print(f"{port.device}  {kind}".rstrip())
+        if port.board:
+            print(f"    looks like  {port.board}")
+        for name in port.names:
+            print(f"    also        {name}")
+        for holder in port.holders:
+            print(f"    held by     {holder.name} (pid {holder.pid})")
+    likely = [port for port in found if port.board]
+    if len(likely) == 1:
+        port = likely[0]
+        name = port.names[0] if port.names else port.device
+        print(f'\nfor acsard.toml:\n[mcu]\nport = "{name}"')
+    return 0
