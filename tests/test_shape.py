@@ -86,6 +86,7 @@ ORDER = (
     "cli.drive",
     "cli.call",
     "cli.ports",
+    "cli.service",
     "cli.doctor",
     "cli.certificates",
     "cli.lan",

@@ -13,10 +13,10 @@ import traceback
 from typing import NoReturn
 
 from acsard import __version__
-from acsard.cli import call, check, doctor, drive, echo, hz, lan, ports, run, sim, topics
+from acsard.cli import call, check, doctor, drive, echo, hz, lan, ports, run, service, sim, topics
 from acsard.runtime.exits import Exit, ExitError
 
-VERBS = (run, sim, check, topics, echo, hz, drive, call, doctor, ports, lan)
+VERBS = (run, sim, check, topics, echo, hz, drive, call, doctor, ports, lan, service)
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address

@@ -84,7 +84,9 @@ class Receiver:
         else:
             twist, header = self._wheel_speeds(arrival)
         if header is not None and header.stamp.to_ns() > 0:
+            # Another clock than the envelope's, which may be a router's for many: its own name.
             stamp_ns = header.stamp.to_ns()
+            sender = f"{sender}, header on {arrival.via}/{arrival.key}"
         return Command(source, twist, arrival.arrived_ns, stamp_ns, sender)
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:

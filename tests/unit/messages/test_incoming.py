@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from acsard.drive.arbiter import Arbiter
 from acsard.drive.kinematics import Kinematics
@@ -27,6 +28,9 @@ JOINTS = list(JointsConfig().as_tuple())
 ARRIVED_NS = 77_000_000_000
 AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
         ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
+HEADER_S = "cmd/app, header on native/cmd/app"
+"""Whose clock the stamp in a message is, when nothing else says who sent it."""
+
 NOT_FINITE = [math.nan, math.inf, -math.inf]
 
 
@@ -88,7 +92,7 @@ def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
         "twist": twist(),
     }
     assert command(body, form) == Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, "cmd/app"
+        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S
     )
 
 
@@ -272,7 +276,7 @@ def test_a_native_stamped_twist_is_a_command_with_its_stamp(
     payload = native_stamped(header, frame)
     assert len(payload) == size
     got = RECEIVER.command(arrival(payload, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, "cmd/app")
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S)
 
 
 @pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
@@ -576,7 +580,10 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
 
 def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
     command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
-    assert (command.stamp_ns, command.sender) == (12_000_000_034, GID.hex())
+    assert (command.stamp_ns, command.sender) == (
+        12_000_000_034,
+        f"{GID.hex()}, header on rmw/cmd/nav",
+    )
     assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
 
 
@@ -623,3 +630,19 @@ def test_joint_commands_before_the_controller_is_active_are_refused(via: str) ->
 def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_no_command(via: str) -> None:
     assert refusal(by_ros(via, twist(), key="cmd_*")) == "wildcard"
     assert refusal(by_ros(via, twist(), put=False)) == "not_a_put"
+
+
+def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_senders() -> None:
+    """A router stamps for all behind it; a header says what the sender's own clock is."""
+    arbiter = Arbiter(CommandsConfig())
+    reasons = []
+    for step in range(20):
+        at_ns = ARRIVED_NS + step * 50_000_000
+        now_ns = SENT_NS + step * 50_000_000
+        slow = stamped(*divmod(now_ns - 10**9, 10**9))
+        for body, key in ((twist(), "cmd/nav"), (slow, "cmd/teleop")):
+            came = replace(
+                by_ros("bridge", body, key=key, stamp_ns=now_ns, sender="router"), arrived_ns=at_ns
+            )
+            reasons.append(arbiter.accept(RECEIVER.command(came)))
+    assert set(reasons) == {""}

@@ -1,0 +1,1004 @@
+"""ROS 2 as strangers speak it over Zenoh: rmw_zenoh's side, the bridge's side, and DDS behind it.
+
+Nothing of acsard is imported: keys, tokens and attachments are written here a second time, CDR is
+made and read by rosbags. The programs run in processes of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xxhash
+import zenoh
+import zenoh.ext
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.system.harness import Bus, Daemon, Program, client_config, environment, until
+from tests.system.strangers import words
+
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
+TRIGGER = "std_srvs/srv/Trigger"
+LIST, GET = "rcl_interfaces/srv/ListParameters", "rcl_interfaces/srv/GetParameters"
+
+HASHES = {
+    TWIST: "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    STAMPED: "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+    ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    LIST: "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+    GET: "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+    "rcl_interfaces/srv/DescribeParameters": (
+        "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff"
+    ),
+    "rcl_interfaces/srv/GetParameterTypes": (
+        "da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca"
+    ),
+    "rcl_interfaces/srv/SetParameters": (
+        "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0"
+    ),
+    "rcl_interfaces/srv/SetParametersAtomically": (
+        "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd"
+    ),
+}
+
+PUBLISHED = {
+    "odom": (ODOMETRY, 10, False),
+    "tf": (TF, 100, False),
+    "tf_static": (TF, 1, True),
+    "joint_states": (JOINTS, 10, False),
+    "diagnostics": (DIAGNOSTICS, 10, False),
+    "cmd_vel_out": (STAMPED, 10, False),
+}
+"""What the robot publishes: type, depth, transient local."""
+
+TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
+
+PARAMETER_SERVICES = {
+    "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
+    "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
+    "get_parameters": GET,
+    "list_parameters": LIST,
+    "set_parameters": "rcl_interfaces/srv/SetParameters",
+    "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
+}
+
+SERVICES = {
+    **{f"acsard/{verb}": TRIGGER for verb in TRIGGERS},
+    **{f"acsard/{name}": kind for name, kind in PARAMETER_SERVICES.items()},
+}
+
+WHEELS = [f"{where}_wheel_joint" for where in ("front_right", "front_left", "rear_left")]
+WHEELS.append("rear_right_wheel_joint")
+
+
+QUICK = {
+    "limits": {
+        "linear_acceleration": 5.0,
+        "linear_deceleration": 5.0,
+        "linear_stop_deceleration": 5.0,
+    }
+}
+"""Limits under which a test of driving need not take long."""
+
+
+# messages, by rosbags
+
+_store: Any = get_typestore(Stores.ROS2_JAZZY)
+for _name, _text in {
+    "std_srvs/msg/TriggerReply": "bool success\nstring message",
+    "rcl_interfaces/msg/ListRequest": "string[] prefixes\nuint64 depth",
+    "rcl_interfaces/msg/GetRequest": "string[] names",
+    "rcl_interfaces/msg/GetReply": "rcl_interfaces/ParameterValue[] values",
+}.items():
+    _store.register(get_types_from_msg(_text, _name))
+
+
+def make(type_name: str, **fields: Any) -> Any:
+    """A message of rosbags."""
+    return _store.types[type_name](**fields)
+
+
+def encode(message: Any) -> bytes:
+    """CDR by rosbags, little endian."""
+    return bytes(_store.serialize_cdr(message, message.__msgtype__))
+
+
+def decode(type_name: str, payload: bytes) -> Any:
+    """A message of rosbags from CDR."""
+    return _store.deserialize_cdr(payload, type_name)
+
+
+def header(age: float | None = None, frame: str = "") -> Any:
+    """A header of so long ago, without a stamp when `age` is None."""
+    sec, nanosec = (0, 0) if age is None else divmod(int((time.time() - age) * 1e9), 10**9)
+    stamp = make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def _twist(linear: float, angular: float) -> Any:
+    return make(
+        TWIST,
+        linear=make("geometry_msgs/msg/Vector3", x=linear, y=0.0, z=0.0),
+        angular=make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=angular),
+    )
+
+
+def twist(linear: float, angular: float = 0.0) -> bytes:
+    """A Twist in CDR."""
+    return encode(_twist(linear, angular))
+
+
+def stamped(linear: float, angular: float = 0.0, age: float | None = 0.0) -> bytes:
+    """A TwistStamped in CDR."""
+    return encode(make(STAMPED, header=header(age, "base_link"), twist=_twist(linear, angular)))
+
+
+def joints(speed: float, names: Sequence[str] = WHEELS) -> bytes:
+    """A JointState in CDR as ros2_control's topic-based hardware sends it: velocities only."""
+    return encode(
+        make(
+            JOINTS,
+            header=header(0.0),
+            name=list(names),
+            position=_floats(),
+            velocity=_floats(*[speed] * len(names)),
+            effort=_floats(),
+        )
+    )
+
+
+def _floats(*values: float) -> Any:
+    return np.array(values, dtype=np.float64)
+
+
+PAYLOADS: dict[str, Callable[[float], bytes]] = {TWIST: twist, STAMPED: stamped, JOINTS: joints}
+"""How a speed is asked for in each type."""
+
+EMPTY_REQUEST = b"\0\1\0\0\0"
+"""A request without fields."""
+
+
+# names on the wire
+
+
+def dds_name(type_name: str) -> str:
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def rmw_key(name: str, type_name: str, domain: int = 0) -> str:
+    """The key of a fully qualified name without its leading slash."""
+    return f"{domain}/{name}/{dds_name(type_name)}/RIHS01_{HASHES[type_name]}"
+
+
+def gid_of(token: str) -> bytes:
+    """What rmw_zenoh makes of a liveliness token: low half first, each little endian."""
+    value = xxhash.xxh3_128_intdigest(token.encode())
+    return struct.pack("<QQ", value & (2**64 - 1), value >> 64)
+
+
+class Attached(NamedTuple):
+    """The attachment of rmw_zenoh."""
+
+    sequence: int
+    stamp_ns: int
+    gid: bytes
+
+    def pack(self) -> bytes:
+        return struct.pack("<qqB", self.sequence, self.stamp_ns, len(self.gid)) + self.gid
+
+    @classmethod
+    def read(cls, data: bytes) -> Attached:
+        """Of the 33 bytes it must be."""
+        assert len(data) == 33, data.hex()
+        sequence, stamp_ns, length = struct.unpack_from("<qqB", data)
+        assert length == 16, data.hex()
+        return cls(sequence, stamp_ns, data[17:])
+
+
+class Sample(NamedTuple):
+    """A sample as it came, and when."""
+
+    at: float
+    key: str
+    payload: bytes
+    attachment: bytes
+    origin: str
+    """The clock id of the session that put it."""
+
+
+class Samples:
+    """What comes to a subscriber, from now on."""
+
+    def __init__(self) -> None:
+        self.seen: list[Sample] = []
+        self._news = threading.Condition()
+
+    def add(self, sample: zenoh.Sample) -> None:
+        """Take a sample; Zenoh calls this."""
+        attachment, stamp = sample.attachment, sample.timestamp
+        seen = Sample(
+            time.monotonic(),
+            str(sample.key_expr),
+            sample.payload.to_bytes(),
+            b"" if attachment is None else attachment.to_bytes(),
+            "" if stamp is None else str(stamp.get_id()),
+        )
+        with self._news:
+            self.seen.append(seen)
+            self._news.notify_all()
+
+    def first(
+        self, what: str, wanted: Callable[[Sample], bool] = lambda _: True, within: float = 5.0
+    ) -> Sample:
+        """The first that is `wanted`."""
+        deadline, looked = time.monotonic() + within, 0
+        with self._news:
+            while True:
+                for seen in self.seen[looked:]:
+                    if wanted(seen):
+                        return seen
+                looked = len(self.seen)
+                left = deadline - time.monotonic()
+                if left <= 0 or not self._news.wait(left):
+                    raise AssertionError(f"not within {within:g} s: {what}; {looked} others came")
+
+    def has(self, count: int, within: float = 5.0) -> None:
+        """Wait for so many in all."""
+        until(lambda: len(self.seen) >= count, within, f"{count} samples")
+
+
+class Called(NamedTuple):
+    """What came back of a service call."""
+
+    replies: list[Sample]
+    errors: int
+    seconds: float
+
+    def trigger(self) -> tuple[bool, str]:
+        """The one reply, which must be a Trigger's."""
+        assert len(self.replies) == 1, self
+        assert self.errors == 0, self
+        reply = decode("std_srvs/msg/TriggerReply", self.replies[0].payload)
+        return reply.success, reply.message
+
+
+# clients of the two trees, over a plain session
+
+
+class Client:
+    """What both have in common; `namespace` is in front of every name."""
+
+    def __init__(self, session: zenoh.Session, namespace: str = "") -> None:
+        self.session = session
+        self.namespace = namespace
+
+    def full(self, name: str) -> str:
+        return f"{self.namespace}/{name}" if self.namespace else name
+
+    def key(self, name: str, type_name: str) -> str:
+        raise NotImplementedError
+
+    def put(self, name: str, type_name: str, payload: bytes) -> None:
+        raise NotImplementedError
+
+    def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
+        raise NotImplementedError
+
+    @contextmanager
+    def follow(self, name: str, type_name: str) -> Iterator[Samples]:
+        """Subscribe while entered."""
+        samples = Samples()
+        subscriber = self.session.declare_subscriber(self.key(name, type_name), samples.add)
+        try:
+            yield samples
+        finally:
+            subscriber.undeclare()
+
+    @contextmanager
+    def follow_late(self, name: str, type_name: str, depth: int = 100) -> Iterator[Samples]:
+        """Subscribe as for transient local: with what was said before."""
+        samples = Samples()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session,
+            self.key(name, type_name),
+            samples.add,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            subscriber_detection=True,
+        )
+        try:
+            yield samples
+        finally:
+            subscriber.undeclare()
+
+    def _ask(self, key: str, payload: bytes, attachment: bytes | None, **how: Any) -> Called:
+        replies, errors, begun = [], 0, time.monotonic()
+        for reply in self.session.get(
+            key, payload=payload, attachment=attachment, timeout=5.0, **how
+        ):
+            if reply.ok is None:
+                errors += 1
+                continue
+            samples = Samples()
+            samples.add(reply.ok)
+            replies += samples.seen
+        return Called(replies, errors, time.monotonic() - begun)
+
+    def heard(self, bus: Bus, name: str, type_name: str, payload: bytes) -> None:
+        """Put it, once, and wait until it was taken as a command."""
+        before = bus.count("commands")
+        self.put(name, type_name, payload)
+        until(lambda: bus.count("commands") > before, 5.0, f"a command on {name}")
+
+    def zeros(self, bus: Bus) -> None:
+        """A zero of every source, taken: from here on each could move the robot."""
+        before = bus.count("commands")
+        for name in ("cmd_vel", "cmd_vel_teleop"):
+            self.put(name, TWIST, twist(0.0))
+        self.put("joint_commands", JOINTS, joints(0.0))
+        until(lambda: bus.count("commands") >= before + 3, 5.0, "a zero of each source")
+
+    @contextmanager
+    def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
+        """A zero, and then so fast at 20 Hz while entered."""
+        self.heard(bus, name, type_name, PAYLOADS[type_name](0.0))
+        silenced = threading.Event()
+
+        def send() -> None:
+            while not silenced.is_set():
+                self.put(name, type_name, PAYLOADS[type_name](speed))
+                silenced.wait(0.05)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield
+        finally:
+            silenced.set()
+            thread.join()
+
+
+class RmwClient(Client):
+    """A node of rmw_zenoh, written from its protocol."""
+
+    def __init__(self, session: zenoh.Session, namespace: str = "", domain: int = 0) -> None:
+        super().__init__(session, namespace)
+        self.domain = domain
+        self.gid = os.urandom(16)
+        self._sequence = 0
+
+    def key(self, name: str, type_name: str) -> str:
+        return rmw_key(self.full(name), type_name, self.domain)
+
+    def attachment(self, age: float = 0.0) -> bytes:
+        """The next one, of so long ago."""
+        self._sequence += 1
+        return Attached(self._sequence, time.time_ns() - int(age * 1e9), self.gid).pack()
+
+    def put(self, name: str, type_name: str, payload: bytes) -> None:
+        self.session.put(self.key(name, type_name), payload, attachment=self.attachment())
+
+    def call(
+        self,
+        name: str,
+        type_name: str = TRIGGER,
+        payload: bytes = EMPTY_REQUEST,
+        attachment: bytes | None = None,
+    ) -> Called:
+        return self._ask(
+            self.key(name, type_name),
+            payload,
+            self.attachment() if attachment is None else attachment or None,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+
+    @contextmanager
+    def tokens(self) -> Iterator[list[str]]:
+        """The graph as every node watches it."""
+        with listed(self.session, f"@ros2_lv/{self.domain}/**") as found:
+            yield found
+
+
+class BridgeHalf(Client):
+    """The Zenoh half of zenoh-bridge-ros2dds."""
+
+    def key(self, name: str, type_name: str) -> str:
+        return self.full(name)
+
+    def put(self, name: str, type_name: str, payload: bytes) -> None:
+        self.session.put(self.key(name, type_name), payload)
+
+    def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
+        attachment = b"rqh" + os.urandom(16) + b"\1"
+        return self._ask(self.key(name, type_name), payload, attachment)
+
+
+@contextmanager
+def listed(session: zenoh.Session, pattern: str) -> Iterator[list[str]]:
+    """The liveliness tokens there are, kept up to date while entered."""
+    found: list[str] = []
+
+    def on_token(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.PUT:
+            found.append(key)
+        elif key in found:
+            found.remove(key)
+
+    subscriber = session.liveliness().declare_subscriber(pattern, on_token, history=True)
+    try:
+        yield found
+    finally:
+        subscriber.undeclare()
+
+
+@contextmanager
+def session_at(endpoint: str) -> Iterator[zenoh.Session]:
+    """A plain client."""
+    with zenoh.open(client_config(endpoint)) as session:
+        yield session
+
+
+# what becomes of commands
+
+
+def changes(before: Any, after: Any) -> dict[str, int]:
+    """The command counters that changed, by how much."""
+    was, now = before["counters"], after["counters"]
+    return {
+        key: now[key] - was.get(key, 0)
+        for key in now
+        if key.startswith("command") and now[key] != was.get(key, 0)
+    }
+
+
+def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said: str) -> None:
+    before = bus.state()
+    send()
+    counted = before["counters"].get(f"command_{reason}", 0)
+    until(
+        lambda: bus.count(f"command_{reason}") > counted,
+        3.0,
+        f"counted as {reason}, but {changes(before, bus.state())}",
+    )
+    lines = bus.count("lines_sent")
+    until(lambda: bus.count("lines_sent") >= lines + 2, 3.0, "two more lines")
+    after = bus.state()
+    assert said in after["refused"], after["refused"]
+    assert changes(before, after).keys() == {f"command_{reason}"}
+    for key in ("x", "y", "yaw", "linear", "angular", "wheels"):
+        assert after[key] == before[key], key
+
+
+def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
+    """Wait until all that was put before is through: a link keeps order, and `send` is counted.
+
+    More than once, if need be: within 1 ms of another sample on its key it is dropped.
+    """
+    before, sent = bus.count(f"command_{reason}"), 0.0
+
+    def counted() -> bool:
+        nonlocal sent
+        if time.monotonic() - sent > 0.2:
+            sent = time.monotonic()
+            send()
+        return bus.count(f"command_{reason}") > before
+
+    until(counted, 3.0, f"counted as {reason}")
+
+
+def settled(bus: Bus) -> None:
+    """At rest for good, which one reading of slow wheels cannot tell; then at the origin."""
+
+    def look() -> bool:
+        first = bus.at_rest()
+        lines = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= lines + 10, 3.0, "ten more lines")
+        last = bus.state()
+        return all(first[key] == last[key] for key in ("x", "y", "yaw"))
+
+    until(look, 5.0, "settled")
+    assert bus.get("srv/reset_odometry")["success"]
+
+
+def unharmed(daemon: Daemon) -> None:
+    assert daemon.process.poll() is None
+    for word in ("Traceback", "Error", "panicked"):
+        assert word not in daemon.stderr
+
+
+# an implementation of rmw_zenoh's protocol that is not ours
+
+SDK = """\
+import json, sys, time
+
+import zenoh, zenoh.ext
+import zenoh_ros2_sdk as sdk
+import zenoh_ros2_sdk.keyexpr, zenoh_ros2_sdk.subscriber
+from rosbags.typesys import Stores, get_typestore
+
+port, hashes = int(sys.argv[1]), json.loads(sys.argv[2])
+router = {"router_ip": "127.0.0.1", "router_port": port}
+store = get_typestore(Stores.ROS2_JAZZY)
+SERVICES = {
+    "std_srvs/srv/Trigger": ("# blank", "bool success\\nstring message"),
+    "rcl_interfaces/srv/ListParameters": (
+        "string[] prefixes\\nuint64 depth", "rcl_interfaces/ListParametersResult result"
+    ),
+    "rcl_interfaces/srv/GetParameters": (
+        "string[] names", "rcl_interfaces/ParameterValue[] values"
+    ),
+}
+
+def definition(type_name):
+    return {
+        "msg_definition": store.generate_msgdef(type_name, ros_version=2)[0],
+        "type_hash": "RIHS01_" + hashes[type_name],
+    }
+
+def plain(value):
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__
+                if name != "__msgtype__"}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [plain(item) for item in value] if isinstance(value, list) else value
+
+subscribers, last, publishers, callers = {}, {}, {}, {}
+manager = sdk.ZenohSession.get_instance("127.0.0.1", port)
+
+def follow(topic, type_name, qos=None):
+    subscribers[topic] = sdk.ROS2Subscriber(
+        topic, type_name, lambda message: last.__setitem__(topic, message), qos=qos,
+        **definition(type_name), **router)
+
+def late(topic, type_name):
+    # As rmw_zenoh's nodes do it; the SDK's own way does not find a topic in a namespace.
+    manager.register_message_type(definition(type_name)["msg_definition"], type_name)
+    dds_type = sdk.subscriber.ros2_to_dds_type(type_name)
+    key = sdk.keyexpr.topic_keyexpr(0, topic, dds_type, "RIHS01_" + hashes[type_name])
+    def on_sample(sample):
+        last[topic] = manager.store.deserialize_cdr(sample.payload.to_bytes(), type_name)
+    subscribers[topic] = zenoh.ext.declare_advanced_subscriber(
+        manager.session, key, on_sample, subscriber_detection=True,
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100),
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True))
+
+def newest(topic):
+    last.pop(topic, None)
+    end = time.monotonic() + 5
+    while topic not in last and time.monotonic() < end:
+        time.sleep(0.005)
+    return last.get(topic)
+
+def held(topic):
+    return last.get(topic)
+
+def message(type_name, **fields):
+    cls = manager.store.types[type_name]
+    return cls(**fields)
+
+def fields(type_name, speed, names):
+    vector = lambda x: message("geometry_msgs/msg/Vector3", x=x, y=0.0, z=0.0)
+    stamp = time.time_ns()
+    if type_name == "sensor_msgs/msg/JointState":
+        import numpy as np
+        return {"header": message("std_msgs/msg/Header", stamp=message(
+                    "builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9),
+                    frame_id=""),
+                "name": names, "position": np.array([]), "velocity": np.array([speed] * 4),
+                "effort": np.array([])}
+    twist = {"linear": vector(speed), "angular": vector(0.0)}
+    if type_name == "geometry_msgs/msg/Twist":
+        return twist
+    return {"header": message("std_msgs/msg/Header", stamp=message(
+                "builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9),
+                frame_id="base_link"),
+            "twist": message("geometry_msgs/msg/Twist", **twist)}
+
+def drive(prefix, topic, type_name, speed, names, wanted):
+    # Zeros first, then so fast until the odometry says that it drives.
+    topic = prefix + topic
+    if (topic, type_name) not in publishers:
+        publishers[topic, type_name] = sdk.ROS2Publisher(
+            topic, type_name, **definition(type_name), **router)
+    publisher, begun, top = publishers[topic, type_name], time.monotonic(), 0.0
+    while top < wanted and time.monotonic() < begun + 5:
+        asked = speed if time.monotonic() > begun + 0.15 else 0.0
+        publisher.publish(**fields(type_name, asked, names))
+        time.sleep(0.02)
+        message = last.get(prefix + "/odom")
+        top = message.twist.twist.linear.x if message else 0.0
+    publisher.publish(**fields(type_name, 0.0, names))
+    return top
+
+def call(service, type_name, **request):
+    if service not in callers:
+        blank, answer = SERVICES[type_name]
+        parts = [answer]
+        for used in ("ListParametersResult", "ParameterValue"):
+            if used in answer:
+                text = store.generate_msgdef("rcl_interfaces/msg/" + used, ros_version=2)[0]
+                parts += ["=" * 80, "MSG: rcl_interfaces/" + used, text]
+        callers[service] = sdk.ROS2ServiceClient(
+            service, type_name, request_definition=blank,
+            response_definition="\\n".join(parts), type_hash="RIHS01_" + hashes[type_name],
+            timeout=5.0, **router)
+    return callers[service].call(**request)
+
+def topics():
+    return sdk.get_topic_names_and_types(**router)
+
+def services():
+    return sdk.get_service_names_and_types(**router)
+
+def nodes(topic):
+    info = sdk.get_topic_info(topic, verbose=True, **router)
+    return info and [(p.node_namespace, p.node_name, p.qos) for p in info.publishers]
+
+print("ready", flush=True)
+verbs = {f.__name__: f for f in (follow, late, newest, held, drive, call, topics, services, nodes)}
+for line in sys.stdin:
+    number, verb, args, kwargs = json.loads(line)
+    try:
+        answer = plain(verbs[verb](*args, **kwargs))
+    except Exception as error:
+        answer = {"error": repr(error)}
+    print("answer", number, json.dumps(answer, default=plain), flush=True)
+manager.close()
+"""
+"""Does by zenoh-ros2-sdk what it is told on standard input, one JSON list a line."""
+
+
+def bare_environment() -> dict[str, str]:
+    """The environment of a shell that knows nothing of ROS."""
+    ours = ("ROS_", "ZENOH_", "CYCLONEDDS_")
+    return {key: value for key, value in environment().items() if not key.startswith(ours)}
+
+
+class Sdk(Program):
+    """A process that uses zenoh-ros2-sdk, told what to do by `do`."""
+
+    def __init__(self, endpoint: str, where: Path) -> None:
+        port = endpoint.rpartition(":")[2]
+        program = words(SDK, port, json.dumps(HASHES))
+        super().__init__(program, where, bare_environment(), stdin=subprocess.PIPE)
+        self._number = 0
+
+    def __enter__(self) -> Sdk:
+        super().__enter__()
+        self.says("ready")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        stdin = self.process.stdin
+        assert stdin is not None
+        with stdin:
+            pass
+        try:
+            self.process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            pass
+        super().__exit__(*error)
+
+    def do(self, verb: str, *args: object, **kwargs: object) -> Any:
+        """What the SDK answers, as plain values."""
+        self._number += 1
+        stdin = self.process.stdin
+        assert stdin is not None
+        stdin.write(json.dumps([self._number, verb, args, kwargs]).encode() + b"\n")
+        stdin.flush()
+        line = self.says(f"answer {self._number} ")
+        return json.loads(line.split(" ", 2)[2])
+
+
+# DDS, behind the real bridge
+
+CYCLONE = """\
+<CycloneDDS><Domain Id="any">
+<General><AllowMulticast>false</AllowMulticast>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>
+"""
+"""Cyclone DDS on loopback, without multicast."""
+
+DDS = """\
+import sys, time
+from dataclasses import dataclass
+
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, float64, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+def message(package, name):
+    kind = "srv" if name.startswith("Trigger") else "msg"
+    return {"typename": f"{package}::{kind}::dds_::{name}_"}
+
+@dataclass
+class Time(IdlStruct, **message("builtin_interfaces", "Time")):
+    sec: int32
+    nanosec: uint32
+
+@dataclass
+class Header(IdlStruct, **message("std_msgs", "Header")):
+    stamp: Time
+    frame_id: str
+
+@dataclass
+class Vector3(IdlStruct, **message("geometry_msgs", "Vector3")):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+@dataclass
+class Point(IdlStruct, **message("geometry_msgs", "Point")):
+    x: float64
+    y: float64
+    z: float64
+
+@dataclass
+class Quaternion(IdlStruct, **message("geometry_msgs", "Quaternion")):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+@dataclass
+class Twist(IdlStruct, **message("geometry_msgs", "Twist")):
+    linear: Vector3
+    angular: Vector3
+
+@dataclass
+class Pose(IdlStruct, **message("geometry_msgs", "Pose")):
+    position: Point
+    orientation: Quaternion
+
+@dataclass
+class PoseWithCovariance(IdlStruct, **message("geometry_msgs", "PoseWithCovariance")):
+    pose: Pose
+    covariance: array[float64, 36]
+
+@dataclass
+class TwistWithCovariance(IdlStruct, **message("geometry_msgs", "TwistWithCovariance")):
+    twist: Twist
+    covariance: array[float64, 36]
+
+@dataclass
+class Odometry(IdlStruct, **message("nav_msgs", "Odometry")):
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+@dataclass
+class Transform(IdlStruct, **message("geometry_msgs", "Transform")):
+    translation: Vector3
+    rotation: Quaternion
+
+@dataclass
+class TransformStamped(IdlStruct, **message("geometry_msgs", "TransformStamped")):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+@dataclass
+class TFMessage(IdlStruct, **message("tf2_msgs", "TFMessage")):
+    transforms: sequence[TransformStamped]
+
+@dataclass
+class Request(IdlStruct, **message("std_srvs", "Trigger_Request")):
+    guid: uint64
+    number: int64
+    nothing: uint8
+
+@dataclass
+class Response(IdlStruct, **message("std_srvs", "Trigger_Response")):
+    guid: uint64
+    number: int64
+    success: bool
+    message: str
+
+@dataclass
+class Gid(IdlStruct, **message("rmw_dds_common", "Gid")):
+    data: array[uint8, 16]
+
+@dataclass
+class Node(IdlStruct, **message("rmw_dds_common", "NodeEntitiesInfo")):
+    node_namespace: str
+    node_name: str
+    reader_gid_seq: sequence[Gid]
+    writer_gid_seq: sequence[Gid]
+
+@dataclass
+class Graph(IdlStruct, **message("rmw_dds_common", "ParticipantEntitiesInfo")):
+    gid: Gid
+    node_entities_info_seq: sequence[Node]
+
+participant = DomainParticipant(int(sys.argv[1]))
+reliable = Policy.Reliability.Reliable(duration(seconds=1))
+volatile = Qos(reliable, Policy.History.KeepLast(10))
+latched = Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+readers, writers = [], []
+
+def reader(topic, kind, qos=volatile):
+    readers.append(DataReader(participant, Topic(participant, topic, kind), qos=qos))
+    return readers[-1]
+
+def writer(topic, kind, qos=volatile):
+    writers.append(DataWriter(participant, Topic(participant, topic, kind), qos=qos))
+    return writers[-1]
+
+graph = DataWriter(participant, Topic(participant, "ros_discovery_info", Graph), qos=latched)
+
+def announce():
+    # The bridge makes routes for endpoints of nodes only.
+    gids = [[Gid(list(e.guid.bytes)) for e in ends] for ends in (readers, writers)]
+    node = Node("/", "tester", *gids)
+    graph.write(Graph(Gid(list(participant.guid.bytes)), [node]))
+
+def until(look, what, within=8.0):
+    end = time.monotonic() + within
+    while time.monotonic() < end:
+        got = look()
+        if got:
+            return got
+        time.sleep(0.01)
+    sys.exit("no " + what)
+
+last = []
+
+def newest():
+    last[:] = odometry.take(50)[-1:] or last
+    return last and last[-1]
+
+def drive(speed, wanted):
+    count = [0]
+    def step():
+        asked = speed if count[0] > 20 else 0.0
+        commands.write(Twist(Vector3(asked), Vector3()))
+        count[0] += 1
+        got = newest()
+        return got if got and got.twist.twist.linear.x > wanted else None
+    return until(step, "motion")
+
+def call(name):
+    request = writer("rq/acsard/" + name + "Request", Request)
+    reply = reader("rr/acsard/" + name + "Reply", Response)
+    announce()
+    guid = int.from_bytes(bytes(request.guid.bytes[-8:]), "little")
+    until(lambda: request.get_matched_subscriptions() and reply.get_matched_publications(), name)
+    request.write(Request(guid, 7, 0))
+    got = until(lambda: reply.take(1), "answer of " + name)[0]
+    assert (got.guid, got.number) == (guid, 7), got
+    return got
+
+odometry, commands = reader("rt/odom", Odometry), writer("rt/cmd_vel", Twist)
+announce()
+got = until(newest, "odometry")
+print("odometry", got.header.frame_id, got.child_frame_id, got.pose.pose.orientation.w, flush=True)
+got = drive(0.3, 0.2)
+print("drove", got.twist.twist.linear.x, flush=True)
+static = reader("rt/tf_static", TFMessage, latched)
+announce()
+begun = time.monotonic()
+(got, *_) = until(lambda: static.take(1), "tf_static")
+print("static", time.monotonic() - begun, *[t.child_frame_id for t in got.transforms], flush=True)
+for name in ("stop", "clear"):
+    got = call(name)
+    print("called", name, got.success, got.message, flush=True)
+sys.stdin.read()
+"""
+"""A ROS node on DDS, as far as the bridge can tell: hears odometry, drives, comes late, calls."""
+
+
+class Relay:
+    """Hands on what goes over TCP between a client and `target`, and counts what comes back."""
+
+    def __init__(self, target: str) -> None:
+        self.came = 0
+        self._target = _address(target)
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self._pipes: list[socket.socket] = []
+
+    def __enter__(self) -> Relay:
+        threading.Thread(target=self._accept, daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for end in (self._server, *self._pipes):
+            try:
+                end.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass  # the other end was first
+            end.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near = self._server.accept()[0]
+            except OSError:
+                return
+            far = socket.create_connection(self._target)
+            self._pipes += [near, far]
+            for ends in ((near, far, False), (far, near, True)):
+                threading.Thread(target=self._pump, args=ends, daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket, counts: bool) -> None:
+        try:
+            while data := source.recv(65536):
+                if counts:
+                    self.came += len(data)
+                sink.sendall(data)
+        except OSError:
+            pass  # one of the ends has gone
+
+
+def _address(endpoint: str) -> tuple[str, int]:
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    return host, int(port)
+
+
+class Bridge(Program):
+    """The real zenoh-bridge-ros2dds as a client of `endpoint`, on a DDS domain of its own."""
+
+    def __init__(self, program: str, where: Path, endpoint: str) -> None:
+        # A domain whose ports are below those the kernel gives away.
+        self.domain = 20 + os.getpid() % 80
+        self.cyclone = where / "cyclone.xml"
+        self.cyclone.write_text(CYCLONE)
+        config = where / "bridge.json5"
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": [endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+            "plugins": {"ros2dds": {"domain": self.domain}},
+        }
+        config.write_text(json.dumps(settings))
+        env = self.environment | {"ROS_DISTRO": "jazzy", "RUST_LOG": "zenoh_plugin_ros2dds=debug"}
+        super().__init__([program, "-c", str(config)], where, env)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """For it and for whoever is on its domain."""
+        return bare_environment() | {"CYCLONEDDS_URI": f"file://{self.cyclone}"}
+
+    @property
+    def log(self) -> list[str]:
+        """What it said, without colours."""
+        return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in [*self.out, *self.err]]
+
+    def logs(self, *texts: str, within: float = 10.0) -> str:
+        """The first line that has all of these."""
+        return until(
+            lambda: next((line for line in self.log if all(t in line for t in texts)), None),
+            within,
+            f"{texts} in the bridge's log",
+        )

@@ -1,0 +1,690 @@
+"""ROS 2 by rmw_zenoh: an implementation that is not ours, and its protocol to the letter."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from tests.system.harness import Bus, Daemon, Program, Tables, free_endpoint, until
+from tests.system.ros_clients import (
+    EMPTY_REQUEST,
+    GET,
+    JOINTS,
+    LIST,
+    ODOMETRY,
+    PUBLISHED,
+    QUICK,
+    SERVICES,
+    STAMPED,
+    TF,
+    TRIGGER,
+    TWIST,
+    WHEELS,
+    Attached,
+    BridgeHalf,
+    Client,
+    RmwClient,
+    Samples,
+    Sdk,
+    behind,
+    changes,
+    decode,
+    encode,
+    gid_of,
+    joints,
+    listed,
+    make,
+    refused_without_motion,
+    rmw_key,
+    settled,
+    stamped,
+    twist,
+    unharmed,
+)
+from tests.system.strangers import ROUTER, words
+
+COMMANDS = (
+    ("/cmd_vel", TWIST, 0.3),
+    ("/cmd_vel_teleop", STAMPED, 0.3),
+    ("/joint_commands", JOINTS, 6.0),
+)
+"""Topic, type and how much of what: m/s or rad/s; all make 0.3 m/s."""
+
+WAYS = {
+    "peer of a router": COMMANDS,
+    "client of a router": COMMANDS[:1],
+    "no router": COMMANDS[-1:],
+}
+"""How the robot and ROS reach each other, and what is tried that way: a key is a key in all."""
+
+
+class Fleet(NamedTuple):
+    """Two robots and a process of the SDK on one router: `one` is a peer, `two` a client."""
+
+    daemons: dict[str, Daemon]
+    one: Bus
+    two: Bus
+    sdk: Sdk
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    where = tmp_path_factory.mktemp("fleet")
+    meeting = free_endpoint()
+
+    def robot(name: str, mode: str) -> Daemon:
+        config: Tables = {
+            "robot": {"id": name},
+            "bus": {"connect": [meeting], "mode": mode},
+            "ros": {"namespace": name},
+            **QUICK,
+        }
+        return Daemon(where, config=config, name=name, ready=False)
+
+    with Program(words(ROUTER, meeting), where) as router:
+        router.says("routing")
+        with (
+            robot("one", "peer") as first,
+            robot("two", "client") as second,
+            Sdk(meeting, where) as sdk,
+            Bus(meeting, "one") as one,
+            Bus(meeting, "two") as two,
+        ):
+            for daemon, bus in ((first, one), (second, two)):
+                daemon.says("bus ")
+                _known(bus)
+                bus.linked()
+            yield Fleet({"one": first, "two": second}, one, two, sdk)
+
+
+def _known(bus: Bus) -> None:
+    until(lambda: bus.ask("info"), 5.0, "the robot over the router")
+
+
+class Ground(NamedTuple):
+    """A robot and a process of the SDK, which reach each other in one of the ways."""
+
+    daemon: Daemon
+    bus: Bus
+    sdk: Sdk
+    commands: tuple[tuple[str, str, float], ...]
+    prefix: str
+    """In front of each ROS name."""
+
+
+@pytest.fixture(scope="module", params=WAYS)
+def ground(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Ground]:
+    commands = WAYS[request.param]
+    if request.param != "no router":
+        fleet: Fleet = request.getfixturevalue("fleet")
+        name, bus = ("one", fleet.one) if "peer" in request.param else ("two", fleet.two)
+        yield Ground(fleet.daemons[name], bus, fleet.sdk, commands, f"/{name}")
+        return
+    where = tmp_path_factory.mktemp("ground")
+    with (
+        Daemon(where, config=QUICK) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Sdk(daemon.endpoint, where) as sdk,
+    ):
+        bus.linked()
+        yield Ground(daemon, bus, sdk, commands, "")
+
+
+# an independent implementation
+
+
+def test_an_independent_client_decodes_the_odometry(ground: Ground) -> None:
+    ground.sdk.do("follow", ground.prefix + "/odom", ODOMETRY)
+    got = ground.sdk.do("newest", ground.prefix + "/odom")
+    assert (got["header"]["frame_id"], got["child_frame_id"]) == ("odom", "base_link")
+    assert got["pose"]["pose"]["orientation"]["w"] == pytest.approx(1.0, abs=1e-3)
+    assert len(got["pose"]["covariance"]) == 36
+    stamp = got["header"]["stamp"]
+    assert stamp["sec"] + stamp["nanosec"] / 1e9 == pytest.approx(time.time(), abs=5.0)
+
+
+def test_an_independent_client_drives_the_robot(ground: Ground) -> None:
+    ground.sdk.do("follow", ground.prefix + "/odom", ODOMETRY)
+    for topic, kind, amount in ground.commands:
+        before = ground.bus.state()
+        top = ground.sdk.do("drive", ground.prefix, topic, kind, amount, WHEELS, 0.2)
+        assert 0.2 <= top <= 0.31, (topic, kind)
+        after = until(lambda: _standing(ground.bus.state()), 5.0, "it stands after a zero")
+        assert after["x"] > before["x"] + 0.005, (topic, kind)
+        assert [key for key in after["counters"] if key.startswith("command_")] == []
+
+
+def _standing(state: Any) -> Any:
+    return None if any(state["wheels"]) else state
+
+
+def test_an_independent_client_that_comes_late_gets_the_static_transforms(ground: Ground) -> None:
+    topic = ground.prefix + "/tf_static"
+    ground.sdk.do("late", topic, TF)
+    got = until(lambda: ground.sdk.do("held", topic), 1.5, "tf_static")
+    frames = [(t["header"]["frame_id"], t["child_frame_id"]) for t in got["transforms"]]
+    assert frames == [("base_link", "lidar_link")]
+
+
+def test_an_independent_client_stops_and_clears_the_robot(ground: Ground) -> None:
+    stopped = ground.sdk.do("call", ground.prefix + "/acsard/stop", TRIGGER)
+    assert stopped["success"] is True
+    assert ground.bus.state()["mode"] == "stopped"
+    cleared = ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)
+    assert cleared["success"] is True
+    assert ground.bus.state()["mode"] == "ready"
+
+
+def test_an_independent_client_lists_topics_services_and_the_node(ground: Ground) -> None:
+    prefix = ground.prefix
+    topics = {f"{prefix}/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
+    topics |= {f"{prefix}/{name}": [TWIST, STAMPED] for name in ("cmd_vel", "cmd_vel_teleop")}
+    topics |= {f"{prefix}/joint_commands": [JOINTS]}
+    services = {f"{prefix}/{name}": [kind] for name, kind in SERVICES.items()}
+    for what, expected in (("topics", topics), ("services", services)):
+        until(partial(_lists, ground.sdk, what, expected), 5.0, f"all {what}")
+    who = [[prefix or "/", "acsard", "::,10:,:,:,,"]]
+    until(lambda: ground.sdk.do("nodes", ground.prefix + "/odom") == who, 5.0, "who publishes odom")
+
+
+def _lists(sdk: Sdk, what: str, expected: dict[str, list[str]]) -> bool:
+    found = dict(sdk.do(what))
+    return all(found.get(name) == types for name, types in expected.items())
+
+
+def test_an_independent_client_lists_and_gets_parameters(ground: Ground) -> None:
+    got = ground.sdk.do(
+        "call", ground.prefix + "/acsard/list_parameters", LIST, prefixes=[], depth=0
+    )
+    names = got["result"]["names"]
+    assert {"drive.wheel_radius", "robot.id", "ros.domain"} <= set(names)
+    wanted = ["drive.wheel_radius", "robot.id", "ros.domain", "ros.rmw", "no.such"]
+    got = ground.sdk.do("call", ground.prefix + "/acsard/get_parameters", GET, names=wanted)
+    prefix_id = ground.prefix.removeprefix("/") or "acsar"
+    radius, robot, domain, rmw, nothing = got["values"]
+    assert (radius["type"], radius["double_value"]) == (3, 0.05)
+    assert (robot["type"], robot["string_value"]) == (4, prefix_id)
+    assert (domain["type"], domain["integer_value"]) == (2, 0)
+    assert (rmw["type"], rmw["bool_value"]) == (1, True)
+    assert nothing["type"] == 0
+
+
+def test_nothing_of_that_was_an_exception(ground: Ground) -> None:
+    unharmed(ground.daemon)
+    assert "Traceback" not in ground.sdk.stderr
+
+
+# the protocol to the letter
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """As everywhere, but quick to drive and to stand."""
+    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def ros(bus: Bus) -> RmwClient:
+    return RmwClient(bus.session)
+
+
+def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient) -> None:
+    (zid,) = map(str, bus.session.info.peers_zid())
+    rows = [("MP", name, *row) for name, row in PUBLISHED.items()]
+    rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
+    rows += [("MS", name, kind, 10, False) for name in ("cmd_vel", "cmd_vel_teleop")
+             for kind in (TWIST, STAMPED)]  # fmt: skip
+    rows += [("MS", "joint_commands", JOINTS, 10, False)]
+    head, node = f"@ros2_lv/0/{zid}/0", "%/%/acsard"
+    expected = {f"{head}/NUMBER/NN/{node}"}
+    for role, name, kind, depth, transient in rows:
+        _, *_, dds_type, type_hash = rmw_key(name, kind).split("/")
+        mangled = "%" + name.replace("/", "%")
+        # Reliable, keep last so many; what equals rmw_zenoh's default is blank.
+        qos = f":{'1' if transient else ''}:,{depth}:,:,:,,"
+        token = f"{head}/NUMBER/{role}/{node}/{mangled}/{dds_type}/{type_hash}/{qos}"
+        assert token.count("/") == 12
+        expected.add(token)
+    with ros.tokens() as tokens:
+        until(lambda: len(tokens) >= len(expected), 5.0, "all tokens")
+        parts = [token.split("/") for token in tokens]
+    assert {"/".join([*token[:4], "NUMBER", *token[5:]]) for token in parts} == expected
+    # The node takes the first number of the session, each endpoint another one.
+    assert sorted(int(token[4]) for token in parts) == list(range(len(expected)))
+    assert [token[4] for token in parts if token[5] == "NN"] == ["0"]
+
+
+def test_samples_carry_the_gid_of_their_publisher_s_token_and_count_without_gaps(
+    tmp_path: Path,
+) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        ros = RmwClient(bus.session)
+        with ros.tokens() as tokens:
+            until(lambda: len(tokens) >= 23, 5.0, "all tokens")
+            by_topic = {t.split("/")[9]: t for t in tokens if "/MP/" in t}
+        with ExitStack() as stack:
+            following = {
+                name: stack.enter_context((ros.follow_late if late else ros.follow)(name, kind))
+                for name, (kind, _, late) in PUBLISHED.items()
+            }
+            for name, samples in following.items():
+                samples.has(1 if name == "tf_static" else 2)
+    for name, samples in following.items():
+        attached = [Attached.read(sample.attachment) for sample in samples.seen]
+        assert {one.gid for one in attached} == {gid_of(by_topic[f"%{name}"])}
+        assert [one.sequence for one in attached] == list(range(1, len(attached) + 1)), name
+        assert abs(attached[-1].stamp_ns / 1e9 - time.time()) < 5.0
+
+
+def test_no_message_is_made_while_no_ros_client_listens(tmp_path: Path) -> None:
+    # Each sample made counts up, so what was made unheard would be missing in the count.
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        ros = RmwClient(bus.session)
+        bus.linked()
+        with bus.follow("odom") as native:
+            until(lambda: len(native.seen) >= 25, 5.0, "25 messages in the native tree")
+        with ros.follow("odom", ODOMETRY) as samples:
+            samples.has(5)
+        first, *_, last = [Attached.read(sample.attachment).sequence for sample in samples.seen]
+        assert first == 1
+        sent = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods unheard")
+        with ros.follow("odom", ODOMETRY) as samples:
+            again = Attached.read(samples.first("odometry again").attachment).sequence
+        assert again - last < 10
+        print(f"unheard for 50 periods: {again - last - 1} samples made")
+
+
+def test_a_late_advanced_subscriber_gets_the_static_transforms_at_once(ros: RmwClient) -> None:
+    for _ in range(2):
+        begun = time.monotonic()
+        with ros.follow_late("tf_static", TF) as samples:
+            got = samples.first("tf_static", within=2.0)
+        message = decode(TF, got.payload)
+        assert [t.child_frame_id for t in message.transforms] == ["lidar_link"]
+        assert time.monotonic() - begun < 1.0
+
+
+def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:
+    for sequence in (1, 2, 2**40):
+        asked = Attached(sequence, time.time_ns(), ros.gid)
+        called = ros.call("acsard/reset_odometry", attachment=asked.pack())
+        success, message = called.trigger()
+        assert success, message
+        (reply,) = called.replies
+        answered = Attached.read(reply.attachment)
+        assert (answered.sequence, answered.gid) == (asked.sequence, asked.gid)
+        assert asked.stamp_ns <= answered.stamp_ns <= time.time_ns()
+        assert reply.key == rmw_key("acsard/reset_odometry", TRIGGER)
+        assert called.seconds < 1.0
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_service_is_asked_as_rmw_zenoh_asks_and_answers_once(
+    bus: Bus, ros: RmwClient, name: str
+) -> None:
+    # Zero bytes more than all the requests need: empty sequences, a depth of 0.
+    request = EMPTY_REQUEST + bytes(31)
+    called = ros.call(name, SERVICES[name], request)
+    try:
+        assert (len(called.replies), called.errors) == (1, 0)
+        assert Attached.read(called.replies[0].attachment).gid == ros.gid
+    finally:
+        for verb in ("clear", "activate"):
+            bus.get(f"srv/{verb}")
+
+
+def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: RmwClient) -> None:
+    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
+        states.find(lambda s: s["linear"] > 0.1 and s["source"] == "nav", 3.0, "it drives")
+        assert ros.call("acsard/stop").trigger()[0]
+        states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
+        assert ros.call("acsard/clear").trigger()[0]
+        cleared = time.monotonic()
+        lines = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
+        # It never sent a zero: it does not drive on.
+        assert not any(bus.state()["wheels"]), cleared
+    settled(bus)
+
+
+# what is wrong is refused, counted, and harms nobody
+
+
+class Bad(NamedTuple):
+    """How it is sent, the reason it is counted under, and a word of what is said."""
+
+    send: Callable[[RmwClient], None]
+    reason: str
+    said: str
+
+
+def raw(
+    payload: bytes,
+    attachment: bytes | None = None,
+    *,
+    kind: str = TWIST,
+    topic: str = "cmd_vel",
+    bare: bool = False,
+) -> Callable[[RmwClient], None]:
+    def send(ros: RmwClient) -> None:
+        attached = None if bare else attachment or ros.attachment()
+        ros.session.put(ros.key(topic, kind), payload, attachment=attached)
+
+    return send
+
+
+def delete(topic: str, kind: str) -> Callable[[RmwClient], None]:
+    return lambda ros: ros.session.delete(ros.key(topic, kind), attachment=ros.attachment())
+
+
+def nan_on(index: int) -> bytes:
+    values = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    values[index] = float("nan")
+    return b"\0\1\0\0" + struct.pack("<6d", *values)
+
+
+GO = twist(0.5)
+NOW = Attached(1, time.time_ns(), bytes(16)).pack()
+
+BAD = {
+    "no attachment": Bad(raw(GO, bare=True), "no_attachment", "attachment"),
+    "no attachment, stamped": Bad(
+        raw(stamped(0.5), bare=True, kind=STAMPED), "no_attachment", "attachment"
+    ),
+    "no attachment, joints": Bad(
+        raw(joints(6.0), bare=True, kind=JOINTS, topic="joint_commands"),
+        "no_attachment", "attachment",
+    ),
+    "the bridge's attachment": Bad(raw(GO, b"rqh" + bytes(17)), "bad_attachment", "20 bytes"),
+    "a GID too short": Bad(raw(GO, NOW[:16] + b"\x0f" + bytes(16)), "bad_attachment", "15"),
+    "a GID too long": Bad(raw(GO, NOW[:16] + b"\x11" + bytes(17)), "bad_attachment", "34"),
+    "one byte short": Bad(raw(GO, NOW[:-1]), "bad_attachment", "32"),
+    "an attachment of 60 kB": Bad(raw(GO, bytes(60_000)), "bad_attachment", "instead of 33"),
+    "a twist cut short": Bad(raw(GO[:-1]), "malformed", "ends after 51"),
+    "a header only": Bad(raw(GO[:4]), "malformed", "ends after 4"),
+    "half a header": Bad(raw(GO[:2]), "malformed", "header"),
+    "nothing": Bad(raw(b""), "malformed", "header"),
+    "parameter-list CDR": Bad(raw(b"\0\3" + GO[2:]), "malformed", "header"),
+    "XCDR2": Bad(raw(b"\0\7" + GO[2:]), "malformed", "header"),
+    "JSON": Bad(raw(b'{"linear":{"x":0.5},"angular":{}}'), "malformed", "header"),
+    "a stamped twist cut short": Bad(raw(stamped(0.5)[:-1], kind=STAMPED), "malformed", "ends"),
+    "a frame without end": Bad(
+        raw(stamped(0.5)[:12] + b"\xff\xff\xff\x7f" + stamped(0.5)[16:], kind=STAMPED),
+        "malformed", "length of 2147483647",
+    ),
+    "a frame that is no text": Bad(
+        raw(stamped(0.5).replace(b"base_link", b"\xff" * 9), kind=STAMPED), "malformed", "UTF-8"
+    ),
+    "5 kB": Bad(raw(GO + bytes(5000)), "too_big", "bytes"),
+    "NaN": Bad(raw(nan_on(0)), "not_finite", "NaN"),
+    "NaN on an axis that is ignored": Bad(raw(nan_on(4)), "not_finite", "NaN"),
+    "infinity": Bad(raw(twist(float("inf"))), "not_finite", "infinity"),
+    "a wheel at NaN": Bad(
+        raw(joints(float("nan")), kind=JOINTS, topic="joint_commands"), "not_finite", "NaN"
+    ),
+    "a wheel missing": Bad(
+        raw(joints(6.0, WHEELS[:3]), kind=JOINTS, topic="joint_commands"),
+        "wrong_wheels", "rear_right",
+    ),
+    "joints cut short": Bad(
+        raw(joints(6.0)[:-9], kind=JOINTS, topic="joint_commands"), "malformed", "length of 4"
+    ),
+    "a DELETE": Bad(delete("cmd_vel", TWIST), "not_a_put", "DELETE"),
+    "a DELETE of joints": Bad(delete("joint_commands", JOINTS), "not_a_put", "DELETE"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_command_is_counted_and_said_and_moves_nothing(
+    bus: Bus, ros: RmwClient, name: str
+) -> None:
+    bad = BAD[name]
+    ros.zeros(bus)
+    refused_without_motion(bus, lambda: bad.send(ros), bad.reason, bad.said)
+
+
+@pytest.mark.parametrize("key", ["0/cmd_vel/**", "*/cmd_vel/*/*", "0/**", "**"])
+def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: RmwClient, key: str) -> None:
+    ros.zeros(bus)
+    before = bus.state()
+    bus.session.put(key, GO, attachment=ros.attachment())
+    bus.session.delete(key, attachment=ros.attachment())
+    behind(bus, lambda: raw(GO, bare=True)(ros), "no_attachment")
+    after = bus.state()
+    # Kept out by access rules, or refused in code.
+    assert changes(before, after).keys() <= {"command_no_attachment", "command_wildcard"}
+    assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
+    if after["mode"] == "stopped":  # "**" is `stop` too
+        bus.get("srv/clear")
+
+
+def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: RmwClient) -> None:
+    def late() -> None:
+        attached = ros.attachment(age=1.0)
+        ros.session.put(ros.key("cmd_vel", TWIST), GO, attachment=attached)
+
+    ros.zeros(bus)
+    refused_without_motion(bus, late, "stale", "held up on the way")
+
+
+def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient) -> None:
+    # Only how ages differ counts: clocks need not agree.
+    for off in (3600.0, -3600.0):
+        other = RmwClient(bus.session)
+        before = bus.state()
+        for _ in range(3):
+            taken = partial(bus.count, "commands")
+            heard = taken()
+            attached = other.attachment(off)
+            bus.session.put(other.key("cmd_vel", TWIST), twist(0.0), attachment=attached)
+            until(partial(_over, taken, heard), 3.0, f"a zero {off} s off")
+        assert changes(before, bus.state()) == {"commands": 3}
+
+
+def _over(count: Callable[[], int], before: int) -> bool:
+    return count() > before
+
+
+def test_a_put_with_another_hash_is_silence(bus: Bus, ros: RmwClient) -> None:
+    ros.zeros(bus)
+    before = bus.state()
+    key = ros.key("cmd_vel", TWIST)
+    for wrong in (key[:-1] + "b", key.replace("Twist_", "Accel_"), key.replace("0/", "1/", 1)):
+        assert wrong != key
+        bus.session.put(wrong, GO, attachment=ros.attachment())
+    behind(bus, lambda: ros.session.put(key, GO), "no_attachment")
+    after = bus.state()
+    assert changes(before, after).keys() == {"command_no_attachment"}
+    assert after["wheels"] == before["wheels"]
+
+
+PLAIN = {
+    "big endian": (TWIST, b"\0\0\0\0" + struct.pack(">6d", 0, 0, 0, 0, 0, 0)),
+    "surplus bytes": (TWIST, twist(0.0) + b"\xff\xff\xff"),
+    "padding that says so": (TWIST, b"\0\1\0\3" + twist(0.0)[4:] + bytes(3)),
+    "no frame": (STAMPED, stamped(0.0, age=None).replace(b"base_link", bytes(9))),
+    "surplus bytes, stamped": (STAMPED, stamped(0.0) + bytes(4)),
+    "joints without a stamp": (JOINTS, joints(0.0)),
+    "joints in another order": (JOINTS, joints(0.0, WHEELS[::-1])),
+}
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_what_is_unusual_but_right_is_taken(bus: Bus, ros: RmwClient, name: str) -> None:
+    kind, payload = PLAIN[name]
+    before = bus.state()
+    ros.put("joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
+    until(lambda: bus.count("commands") > before["counters"].get("commands", 0), 3.0, name)
+    assert changes(before, bus.state()) == {"commands": 1}
+
+
+def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> None:
+    payload = b"\0\0\0\0" + struct.pack(">6d", 0.2, 0, 0, 0, 0, 0)
+    ros.heard(bus, "cmd_vel", TWIST, twist(0.0))
+    with bus.follow("cmd_vel_out") as applied:
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            ros.heard(bus, "cmd_vel", TWIST, payload)
+            if applied.seen and applied.seen[-1].value["twist"]["linear"]["x"] > 0.199:
+                break
+        assert max(s.value["twist"]["linear"]["x"] for s in applied.seen) == pytest.approx(
+            0.2, abs=1e-3
+        )
+    settled(bus)
+
+
+@pytest.mark.parametrize(
+    ("attachment", "reason"),
+    [(b"", "no_attachment"), (bytes(20), "bad_attachment"), (NOW[:-1], "bad_attachment")],
+)
+@pytest.mark.parametrize("service", ["acsard/activate", "acsard/get_parameters"])
+def test_a_call_with_a_wrong_attachment_is_counted_and_ends_without_an_answer(
+    bus: Bus, ros: RmwClient, service: str, attachment: bytes, reason: str
+) -> None:
+    before = bus.state()
+    called = ros.call(service, SERVICES[service], attachment=attachment)
+    assert (called.replies, called.errors) == ([], 0)
+    assert called.seconds < 1.0
+    assert changes(before, bus.state()) == {f"command_{reason}": 1}
+
+
+def test_a_stop_without_attachment_stops_all_the_same(bus: Bus, ros: RmwClient) -> None:
+    before = bus.state()
+    try:
+        called = ros.call("acsard/stop", attachment=b"")
+        assert (called.replies, called.errors) == ([], 0)
+        assert bus.state()["mode"] == "stopped"
+        assert changes(before, bus.state()) == {"command_no_attachment": 1}
+    finally:
+        bus.get("srv/clear")
+
+
+@pytest.mark.parametrize(
+    "request_bytes", [b"", b"\0\1", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", b"\0\7\0\0\0\0\0\0"]
+)
+def test_a_parameter_request_that_is_none_is_counted_and_ends_without_an_answer(
+    bus: Bus, ros: RmwClient, request_bytes: bytes
+) -> None:
+    before = bus.state()
+    called = ros.call("acsard/get_parameters", GET, request_bytes)
+    assert (called.replies, called.errors) == ([], 0)
+    assert called.seconds < 1.0
+    assert changes(before, bus.state()) == {"command_malformed": 1}
+
+
+def test_parameters_can_be_asked_for_by_hand(ros: RmwClient) -> None:
+    request = encode(make("rcl_interfaces/msg/GetRequest", names=["commands.sources.nav.priority"]))
+    called = ros.call("acsard/get_parameters", GET, request)
+    reply = decode("rcl_interfaces/msg/GetReply", called.replies[0].payload)
+    assert [(value.type, value.integer_value) for value in reply.values] == [(2, 10)]
+
+
+def test_a_query_on_all_keys_of_ros_stops_nothing(bus: Bus, ros: RmwClient) -> None:
+    before = bus.state()
+    for key in ("0/**", "0/acsard/*/std_srvs::srv::dds_::Trigger_/*", "**"):
+        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=ros.attachment()):
+            pass
+    after = bus.state()
+    assert after["mode"] != "stopped"
+    assert changes(before, after) == {}
+
+
+def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> None:
+    only = {"[commands.sources]": {"name": "teleop", "priority": 9, "timeout": 0.25}}
+    with Daemon(tmp_path, config=only) as daemon, Bus(daemon.endpoint) as bus:
+        ros = RmwClient(bus.session)
+        bus.linked()
+        ros.heard(bus, "cmd_vel_teleop", TWIST, twist(0.0))
+        wheels = raw(joints(6.0), kind=JOINTS, topic="joint_commands")
+        refused_without_motion(bus, lambda: raw(GO)(ros), "unknown_source", "commands.sources")
+        refused_without_motion(bus, lambda: wheels(ros), "unknown_source", "ros2_control")
+
+
+def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+    unharmed(shared)
+    bus.at_rest()
+
+
+# two robots
+
+
+@pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
+def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
+    driven, other = fleet.one, fleet.two
+    before = other.state()
+    with driven.follow("state") as states:
+        client: Client = BridgeHalf(driven.session, "one")
+        if tree == "rmw":
+            client = RmwClient(driven.session, "one")
+        drive = (
+            driven.commanding(0.3)
+            if tree == "native"
+            else client.driving(driven, "cmd_vel", TWIST, 0.3)
+        )
+        with drive:
+            states.find(lambda s: s["linear"] > 0.1, 3.0, "it drives")
+    after = other.state()
+    assert changes(before, after) == {}
+    for key in ("x", "mode", "wheels"):
+        assert after[key] == before[key], key
+
+
+@pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
+def test_a_stop_of_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
+    one, two = fleet.one, fleet.two
+    if tree == "native":
+        assert one.get("srv/stop")["success"]
+    else:
+        client = BridgeHalf(one.session, "one") if tree == "bridge" else RmwClient(
+            one.session, "one"
+        )  # fmt: skip
+        assert client.call("acsard/stop").trigger()[0]
+    assert (one.state()["mode"], two.state()["mode"] != "stopped") == ("stopped", True)
+    assert one.get("srv/clear")["success"]
+
+
+def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
+    samples, heard = Samples(), dict[str, set[str]]()
+    session = fleet.one.session
+    keys = {
+        key
+        for name in ("one", "two")
+        for client in (RmwClient(session, name), BridgeHalf(session, name))
+        for key in [client.key(topic, kind) for topic, (kind, _, _) in PUBLISHED.items()]
+        + [f"acsard/{name}/{topic}" for topic in ("odom", "tf", "state", "cmd_vel_out")]
+    }
+    subscribers = [session.declare_subscriber(key, samples.add) for key in keys]
+
+    def all_topics() -> bool:
+        heard.clear()
+        for sample in samples.seen:
+            heard.setdefault(sample.key, set()).add(sample.origin)
+        # The static transforms come but now and then.
+        return len(heard) >= len(keys) - 4
+
+    until(all_topics, 5.0, "all topics of both")
+    for subscriber in subscribers:
+        subscriber.undeclare()
+    assert {len(origins) for origins in heard.values()} == {1}
+    by_robot = dict[str, set[str]]()
+    for key, origins in heard.items():
+        by_robot.setdefault("one" if "one" in key.split("/") else "two", set()).update(origins)
+    assert {len(origins) for origins in by_robot.values()} == {1}
+    assert by_robot["one"] != by_robot["two"]
+
+
+def test_two_robots_are_two_nodes(fleet: Fleet) -> None:
+    with listed(fleet.one.session, "@ros2_lv/0/*/*/*/NN/*/*/acsard") as nodes:
+        until(lambda: len(nodes) == 2, 5.0, "two nodes")
+        assert {node.split("/")[-2] for node in nodes} == {"%one", "%two"}

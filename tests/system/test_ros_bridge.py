@@ -1,0 +1,396 @@
+"""ROS 2 by zenoh-bridge-ros2dds: its Zenoh half in emulation, the real one where there is one."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.system.harness import Bus, Daemon, Program, until
+from tests.system.ros_clients import (
+    DDS,
+    HASHES,
+    JOINTS,
+    ODOMETRY,
+    PUBLISHED,
+    QUICK,
+    SERVICES,
+    STAMPED,
+    TF,
+    TRIGGER,
+    TRIGGERS,
+    TWIST,
+    WHEELS,
+    Bridge,
+    BridgeHalf,
+    Relay,
+    RmwClient,
+    behind,
+    changes,
+    decode,
+    joints,
+    listed,
+    refused_without_motion,
+    session_at,
+    stamped,
+    twist,
+    unharmed,
+)
+from tests.system.strangers import words
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """As everywhere, but quick to drive and to stand."""
+    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def ros(bus: Bus) -> BridgeHalf:
+    return BridgeHalf(bus.session)
+
+
+@pytest.fixture
+def restored(bus: Bus) -> Iterator[None]:
+    """Leaves the shared robot at rest and at the origin."""
+    yield
+    for verb in ("clear", "activate"):
+        bus.get(f"srv/{verb}")
+    bus.at_rest()
+    bus.get("srv/reset_odometry")
+
+
+# the bridge's Zenoh half
+
+
+def test_the_odometry_comes_as_plain_cdr(ros: BridgeHalf) -> None:
+    with ros.follow("odom", ODOMETRY) as samples:
+        got = samples.first("odometry")
+    message = decode(ODOMETRY, got.payload)
+    assert (len(got.payload), got.attachment) == (724, b"")
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+    stamp = message.header.stamp
+    assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(time.time(), abs=5.0)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_every_topic_reaches_a_bridge(ros: BridgeHalf, name: str) -> None:
+    kind, _, late = PUBLISHED[name]
+    with (ros.follow_late if late else ros.follow)(name, kind) as samples:
+        decode(kind, samples.first(name).payload)
+
+
+def test_a_route_that_is_made_late_gets_the_static_transforms_at_once(ros: BridgeHalf) -> None:
+    for _ in range(2):
+        begun = time.monotonic()
+        with ros.follow_late("tf_static", TF) as samples:
+            got = samples.first("tf_static", within=2.0)
+        assert [t.child_frame_id for t in decode(TF, got.payload).transforms] == ["lidar_link"]
+        assert time.monotonic() - begun < 1.0
+
+
+COMMANDS = {
+    "Twist": ("cmd_vel", TWIST, 0.3, "nav"),
+    "TwistStamped": ("cmd_vel_teleop", STAMPED, 0.3, "teleop"),
+    "JointState": ("joint_commands", JOINTS, 6.0, "ros2_control"),
+}
+
+
+@pytest.mark.usefixtures("restored")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_of_each_type_drives_the_robot(bus: Bus, ros: BridgeHalf, name: str) -> None:
+    topic, kind, amount, source = COMMANDS[name]
+    with ros.follow("odom", ODOMETRY) as odometry, ros.follow("joint_states", JOINTS) as wheels:
+        with ros.driving(bus, topic, kind, amount):
+            odometry.first("motion", lambda s: _speed(s.payload) > 0.2)
+            assert bus.state()["source"] == source
+        turning = decode(JOINTS, wheels.seen[-1].payload)
+    assert sorted(turning.name) == sorted(WHEELS)
+    assert all(speed > 3.0 for speed in turning.velocity)
+
+
+def _speed(payload: bytes) -> float:
+    return float(decode(ODOMETRY, payload).twist.twist.linear.x)
+
+
+def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) -> None:
+    plain = twist(0.0)
+    assert (len(plain), len(stamped(0.0))) == (52, 76)
+    before = bus.state()
+    # Nothing in the envelope tells them apart, and a bridge may pad either by up to 3 bytes.
+    for payload in (plain, plain + bytes(3), stamped(0.0), stamped(0.0) + bytes(3)):
+        ros.heard(bus, "cmd_vel", TWIST, payload)
+    assert changes(before, bus.state()).keys() == {"commands"}
+
+
+@pytest.mark.usefixtures("restored")
+def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: BridgeHalf) -> None:
+    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
+        states.find(lambda s: s["source"] == "nav" and s["linear"] > 0.1, 3.0, "nav drives")
+        with ros.driving(bus, "cmd_vel_teleop", TWIST, -0.2):
+            states.find(
+                lambda s: s["source"] == "teleop" and s["linear"] < -0.1, 3.0, "teleop drives"
+            )
+        let_go = time.monotonic()
+        states.find(
+            lambda s: s["source"] == "nav" and s["linear"] > 0.1, 3.0, "nav again", after=let_go
+        )
+
+
+@pytest.mark.parametrize("request_bytes", [b"\0\1\0\0", b"\0\1\0\0\0", b"\0\1\0\0\0\0\0\0"])
+@pytest.mark.parametrize("verb", TRIGGERS)
+def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
+    bus: Bus, ros: BridgeHalf, verb: str, request_bytes: bytes
+) -> None:
+    if verb == "clear":
+        bus.get("srv/stop")
+    called = ros.call(f"acsard/{verb}", TRIGGER, request_bytes)
+    for undo in ("clear", "activate"):
+        bus.get(f"srv/{undo}")
+    success, message = called.trigger()
+    assert success, message
+    assert called.seconds < 1.0
+    assert called.replies[0].attachment == b""
+
+
+@pytest.mark.usefixtures("restored")
+def test_a_stop_stops_until_clear(bus: Bus, ros: BridgeHalf) -> None:
+    assert ros.call("acsard/stop").trigger()[0]
+    assert bus.state()["mode"] == "stopped"
+    assert ros.call("acsard/clear").trigger()[0]
+    assert bus.state()["mode"] == "ready"
+
+
+# what is wrong
+
+
+class Bad(NamedTuple):
+    """How it is sent, the reason it is counted under, and a word of what is said."""
+
+    send: Callable[[BridgeHalf], None]
+    reason: str
+    said: str
+
+
+def raw(payload: bytes, topic: str = "cmd_vel") -> Callable[[BridgeHalf], None]:
+    return lambda ros: ros.session.put(topic, payload)
+
+
+def delete(topic: str) -> Callable[[BridgeHalf], None]:
+    return lambda ros: ros.session.delete(topic)
+
+
+GO = twist(0.5)
+
+BAD = {
+    "a twist cut short": Bad(raw(GO[:-1]), "malformed", "ends after 51"),
+    "a stamped twist cut short": Bad(raw(stamped(0.5)[:-1]), "malformed", "ends after 75"),
+    "between both": Bad(raw(GO + bytes(8)), "malformed", ""),
+    "nothing": Bad(raw(b""), "malformed", "header"),
+    "JSON": Bad(raw(b'{"linear":{"x":0.5},"angular":{}}'), "malformed", "header"),
+    "5 kB": Bad(raw(GO + bytes(5000)), "too_big", "bytes"),
+    "NaN": Bad(raw(twist(float("nan"))), "not_finite", "NaN"),
+    "NaN, big endian": Bad(
+        raw(b"\0\0\0\0" + struct.pack(">6d", 0.5, 0, 0, 0, 0, float("nan"))), "not_finite", "NaN"
+    ),
+    "a wheel missing": Bad(
+        raw(joints(6.0, WHEELS[:3]), "joint_commands"), "wrong_wheels", "rear_right"
+    ),
+    "a wheel of another robot": Bad(
+        raw(joints(6.0, [*WHEELS[:3], "wheel_4"]), "joint_commands"), "wrong_wheels", "rear_right"
+    ),
+    "a twist for joints": Bad(raw(GO, "joint_commands"), "malformed", ""),
+    "a DELETE": Bad(delete("cmd_vel"), "not_a_put", "DELETE"),
+    "a DELETE of teleop's": Bad(delete("cmd_vel_teleop"), "not_a_put", "DELETE"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_command_is_counted_and_said_and_moves_nothing(
+    bus: Bus, ros: BridgeHalf, name: str
+) -> None:
+    bad = BAD[name]
+    ros.zeros(bus)
+    refused_without_motion(bus, lambda: bad.send(ros), bad.reason, bad.said)
+
+
+@pytest.mark.parametrize("key", ["cmd_vel$*", "*", "**"])
+def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: BridgeHalf, key: str) -> None:
+    ros.zeros(bus)
+    before = bus.state()
+    bus.session.put(key, GO)
+    bus.session.delete(key)
+    behind(bus, lambda: bus.session.put("cmd_vel", b""), "malformed")
+    after = bus.state()
+    # Kept out by access rules, or refused in code.
+    mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
+    assert changes(before, after).keys() <= mine
+    assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
+    if after["mode"] == "stopped":  # "**" is `stop` too
+        bus.get("srv/clear")
+
+
+def test_an_attachment_means_nothing_here(bus: Bus, ros: BridgeHalf) -> None:
+    before = bus.state()
+    for attachment in (b"rqh" + bytes(17), bytes(33), b"\xff" * 60_000):
+        heard = bus.count("commands")
+        bus.session.put("cmd_vel", twist(0.0), attachment=attachment)
+        _more(bus, heard)
+    assert changes(before, bus.state()) == {"commands": 3}
+
+
+def _more(bus: Bus, before: int) -> None:
+    until(lambda: bus.count("commands") > before, 3.0, "one more command")
+
+
+def test_a_query_on_every_key_stops_nothing(bus: Bus) -> None:
+    before = bus.state()
+    for key in ("acsard/*", "**", "acsard/stop/**", "*/stop"):
+        for _ in bus.session.get(key, payload=b"\0\1\0\0"):
+            pass
+    after = bus.state()
+    assert after["mode"] != "stopped"
+    assert changes(before, after) == {}
+
+
+def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+    unharmed(shared)
+    bus.at_rest()
+
+
+# announcements
+
+
+ALIVE = "acsard/acsar/alive"
+"""Declared when all else is: with it, all tokens have come."""
+
+
+def announced(zid: str, namespace: str, twists: bool) -> set[str]:
+    """The tokens of a bridge for all that can be announced."""
+    head = f"@/{zid}/@ros2_lv"
+    prefix = f"{namespace}§" if namespace else ""
+    found = {head}
+    for name, (kind, depth, late) in PUBLISHED.items():
+        qos = f":1:{int(late)}:0,{depth}:typehash=RIHS01_{HASHES[kind]};"
+        found.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
+    taken = {"joint_commands": JOINTS}
+    if twists:
+        taken |= {"cmd_vel": TWIST, "cmd_vel_teleop": TWIST}
+    for name, kind in taken.items():
+        qos = f":1:0:0,10:typehash=RIHS01_{HASHES[kind]};"
+        found.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
+    for name, kind in SERVICES.items():
+        found.add(f"{head}/SS/{prefix}{name.replace('/', '§')}/{kind.replace('/', '§')}")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("namespace", "kind"), [("", "auto"), ("robot1", "twist")], ids=["plain", "named"]
+)
+def test_what_is_announced_is_announced_as_a_bridge_does(
+    tmp_path: Path, namespace: str, kind: str
+) -> None:
+    ros = {"announce": True, "namespace": namespace, "cmd_vel_type": kind}
+    with Daemon(tmp_path, config={"ros": ros}) as daemon, session_at(daemon.endpoint) as session:
+        (zid,) = map(str, session.info.peers_zid())
+        expected = announced(zid, namespace, twists=kind == "twist")
+        with listed(session, "@/*/@ros2_lv/**") as tokens:
+            until(lambda: len(tokens) >= len(expected), 5.0, "all tokens")
+            assert set(tokens) == expected
+            assert len(tokens) == len(expected)
+
+
+def test_nothing_is_announced_unless_asked_for(tmp_path: Path) -> None:
+    config = {"ros": {"announce": False}}
+    with Daemon(tmp_path, config=config) as daemon, session_at(daemon.endpoint) as session:
+        with listed(session, "@/*/@ros2_lv/**") as tokens, listed(session, ALIVE) as alive:
+            until(lambda: alive, 5.0, "the alive token")
+            assert tokens == []
+        BridgeHalf(session).call("acsard/clear").trigger()
+
+
+def test_a_tree_that_is_switched_off_does_not_exist(tmp_path: Path) -> None:
+    config = {"ros": {"bridge": False, "rmw": False}}
+    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        before = bus.state()
+        for client in (BridgeHalf(bus.session), RmwClient(bus.session)):
+            client.put("cmd_vel", TWIST, b"")
+            called = client.call("acsard/stop")
+            assert (called.replies, called.errors) == ([], 0)
+        with (
+            listed(bus.session, "@ros2_lv/**") as rmw,
+            listed(bus.session, "@/*/@ros2_lv/**") as bridge,
+        ):
+            with listed(bus.session, ALIVE) as alive:
+                until(lambda: alive, 5.0, "the alive token")
+            assert (rmw, bridge) == ([], [])
+        after = bus.state()
+        assert (after["mode"], changes(before, after)) == ("ready", {})
+
+
+# the real bridge
+
+
+@pytest.fixture(scope="module")
+def bridge_program() -> str:
+    found = shutil.which("zenoh-bridge-ros2dds")
+    if found is None:
+        pytest.skip("zenoh-bridge-ros2dds is not on PATH")
+    return found
+
+
+ANNOUNCED = {"ros": {"announce": True, "cmd_vel_type": "twist"}}
+
+
+def test_the_real_bridge_carries_odometry_commands_transforms_and_services(
+    tmp_path: Path, bridge_program: str
+) -> None:
+    pytest.importorskip("cyclonedds", reason="no Cyclone DDS for Python")
+    with (
+        Daemon(tmp_path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Bridge(bridge_program, tmp_path, daemon.endpoint) as bridge,
+    ):
+        program = words(DDS, bridge.domain)
+        with Program(program, tmp_path, bridge.environment, stdin=-1) as dds:
+            assert dds.says("odometry").split()[1:3] == ["odom", "base_link"]
+            assert float(dds.says("drove").split()[1]) > 0.2
+            static = dds.says("static").split()
+            assert static[2:] == ["lidar_link"]
+            assert float(static[1]) < 4.0
+            assert dds.says("called stop").split()[2] == "True"
+            assert dds.says("called clear").split()[2] == "True"
+        assert bus.state()["mode"] == "ready"
+        assert [key for key in bus.state()["counters"] if key.startswith("command_")] == []
+
+
+def test_the_real_bridge_makes_routes_of_what_is_announced_and_takes_nothing_unasked(
+    tmp_path: Path, bridge_program: str
+) -> None:
+    with (
+        Daemon(tmp_path, config=ANNOUNCED) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Relay(daemon.endpoint) as relay,
+        Bridge(bridge_program, tmp_path, relay.endpoint) as bridge,
+    ):
+        for name in PUBLISHED:
+            bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
+        for name in ("cmd_vel", "cmd_vel_teleop", "joint_commands"):
+            bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
+        for name in SERVICES:
+            bridge.logs("Route Service Client", f"Zenoh:{name}) created")
+        bus.linked()
+        quiet = relay.came
+        sent = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods")
+        came = relay.came - quiet
+        print(f"announced and unheard: {came} bytes in 50 periods")
+        assert came < 2000
+        assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]
