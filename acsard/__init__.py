@@ -15,7 +15,8 @@ mode, limit, invert the kinematics, report. Nothing else decides anything.
 Where to look, in the order the modules may import each other:
 
     values.py         the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
-    settings.py       the keys of acsard.toml; validation.py, config.py: file -> Config, or why not
+    settings.py       the keys of acsard.toml; validation.py, rules.py, config.py: file -> Config,
+                      or why not
     mcu/              wire time, lines, frames (the protocol), session (is the MCU there?)
     drive/            kinematics, odometry, sanity (can this feedback be true?), arbiter (who
                       commands?), limits, modes (the table), lifecycle (what latched it)
@@ -23,10 +24,11 @@ Where to look, in the order the modules may import each other:
                       incoming (sample -> command), report (outputs -> messages), queries
     ros/              the two ROS trees: names and hashes, tokens, attachments, what stands for
                       which native key, the configuration as parameters
+    access.py         who may do what: the topic table -> Zenoh's access rules
     robot.py          the order; guard.py: the last look at every outgoing line
     sim/              the vehicle and the fake microcontroller
     runtime/          clock, ticker, serial device and port, Zenoh bus (inbox, outlets, replies),
-                      logs, control loop, daemon
+                      systemd and its journal, logs, control loop, daemon
     client.py         drive and follow a robot from Python
     cli/              one verb per file
 
