@@ -55,20 +55,21 @@ class Authority:
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
         """A certificate for both ends of a link, with its key and ours, written to `directory`.
 
-        `addresses` are the names and IP addresses it is reached by.
+        `addresses` are the host names and IP addresses it is reached by.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
-        names = [_general_name(address) for address in dict.fromkeys([name, *addresses])]
+        names = [_general_name(address) for address in dict.fromkeys(addresses)]
         signer = self._certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+        builder = _builder(subject, self._certificate.subject, key.public_key(), days)
+        if names:
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         certificate = (
-            _builder(subject, self._certificate.subject, key.public_key(), days)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(signs=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(both), critical=False)
-            .add_extension(x509.SubjectAlternativeName(names), critical=False)
             .add_extension(
                 x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(signer.value),
                 critical=False,

@@ -73,8 +73,11 @@ def find(path: str | None) -> tuple[str, bytes]:
 def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
     """Where the configuration is and the configuration; raises `ExitError` with every problem."""
     where, text = find(path)
+    given = dict(overrides or {})
+    if "ACSARD_TLS" in os.environ:  # where systemd puts the credentials of a service, say
+        given["bus"] = {"tls": os.environ["ACSARD_TLS"], **given.get("bus", {})}
     try:
-        return where, configuration.parse(text, overrides)
+        return where, configuration.parse(text, given)
     except ConfigError as error:
         for problem in error.problems:
             print(f"{where}: {problem}", file=sys.stderr)
@@ -100,8 +103,8 @@ def robot_address(args: argparse.Namespace) -> Address:
     # The daemon listens only as a peer; plain endpoints need no certificate.
     known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
     endpoint = args.connect or known[0]
-    tls = args.tls or os.environ.get("ACSARD_TLS") or bus.tls
-    return Address(endpoint, args.id or config.robot.id, tls if _is_tls(endpoint) else "")
+    tls = (args.tls or bus.tls) if _is_tls(endpoint) else ""
+    return Address(endpoint, args.id or config.robot.id, tls)
 
 
 def _is_tls(endpoint: str) -> bool:

@@ -202,7 +202,7 @@ def certificates(config: Config) -> Iterator[Finding]:
         yield Finding("certificates", "warning", "cannot tell when it ends", mend)
         return
     days = (ends - now().wall_ns) / NS_PER_S / 86400
-    mend = "`acsard lan init --force` makes new ones, for everybody"
+    mend = "a new one from the authority: `acsard lan add`, where ca-key.pem is"
     if days < 0:
         yield Finding("certificates", "failure", f"ended {-days:.0f} days ago", mend)
     elif days < EXPIRY_DAYS:
@@ -217,6 +217,8 @@ def bus(config: Config) -> Iterator[Finding]:
     from acsard.runtime.exits import ExitError
 
     for endpoint in config.bus.connect:
+        if endpoint.startswith("tls/"):
+            continue
         text = f"connects to {endpoint}: everyone behind that router has the rights of this machine"
         yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
     endpoint = (config.bus.listen if config.bus.mode == "peer" else config.bus.connect)[0]

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.runtime.exits import Exit, ExitError
 from acsard.runtime.zenoh_session import CA, CERTIFICATE, KEY
+from acsard.validation import write
 
 if TYPE_CHECKING:
     from acsard.cli.certificates import Authority
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 DIRECTORY = "/etc/acsard/tls"
 PORT = 7449
 ROLES = ("viewer", "operator", "maintainer")
+MOST_DAYS = 3650
+ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,13 +42,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         description="Make an authority, the robot's certificate, and one certificate for each of "
         "viewer, operator and maintainer, and print the lines of acsard.toml for them.",
     )
-    init.add_argument(
-        "--address",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a name or address the robot is reached by, beside its host name; repeat it",
-    )
     init.add_argument("--force", action="store_true", help="replace what is there")
     init.set_defaults(main=main_init)
     more = actions.add_parser(
@@ -52,15 +49,25 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="one more certificate",
         description="Make a certificate for one more person or program.",
     )
-    more.add_argument("name", metavar="NAME", help="its common name, e.g. laptop-anna")
-    more.add_argument("--role", choices=ROLES, required=True, help="what it may do")
+    more.add_argument("name", type=_name, metavar="NAME", help="its common name, e.g. laptop-anna")
+    more.add_argument(
+        "--role", choices=ROLES, help="what it may do; leave it out for a robot or a router"
+    )
     more.set_defaults(main=main_add)
     for action in (init, more):
         action.add_argument(
             "--directory", default=DIRECTORY, metavar="DIR", help=f"default {DIRECTORY}"
         )
         action.add_argument(
-            "--days", type=int, default=730, metavar="N", help="validity, default 730 days"
+            "--days", type=_days, default=730, metavar="N", help="validity, default 730 days"
+        )
+        action.add_argument(
+            "--address",
+            action="append",
+            type=_address,
+            default=[],
+            metavar="NAME",
+            help="a name or IP address it is reached by, beside its own name; repeat it",
         )
 
 
@@ -80,7 +87,7 @@ def main_init(args: argparse.Namespace) -> int:
     authority = maker.make(directory, f"acsard at {host}", args.days)
     authority.issue(directory, "robot", names, args.days)
     for role in ROLES:
-        _client(authority, directory, role, args.days)
+        authority.issue(directory / "clients" / role, role, [], args.days)
     print(
         _NEXT.format(
             directory=directory.resolve(),
@@ -108,18 +115,37 @@ def main_add(args: argparse.Namespace) -> int:
     except (OSError, ValueError) as error:
         raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
     place = directory / "clients" / args.name
-    if not args.name.isprintable() or "/" in args.name or args.name in ("", ".", ".."):
-        raise ExitError(Exit.USAGE, f"{args.name!r} is not a name for a certificate")
     if place.exists():
         raise ExitError(Exit.FAILURE, f"{place} exists; remove it, or choose another name")
-    _client(authority, directory, args.name, args.days)
+    named = [args.name] if ADDRESS.match(args.name) else []
+    authority.issue(place, args.name, [*named, *args.address], args.days)
+    if not args.role:
+        print(f"{place} is for {args.name}")
+        return 0
     print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do:\n")
-    print(f'[access]\n{args.role}s = ["{args.role}", "{args.name}"]')
+    print(f"[access]\n{args.role}s = {write([args.role, args.name])}")
     return 0
 
 
-def _client(authority: Authority, directory: Path, name: str, days: int) -> None:
-    authority.issue(directory / "clients" / name, name, [], days)
+def _name(text: str) -> str:
+    good = text.isascii() and text.isprintable() and 0 < len(text) <= 64
+    if not good or "/" in text or text in (".", ".."):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a name for a certificate: 1 to 64 letters, digits and signs but /"
+        )
+    return text
+
+
+def _address(text: str) -> str:
+    if not ADDRESS.match(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no host name and no IP address")
+    return text
+
+
+def _days(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) <= MOST_DAYS:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to {MOST_DAYS}")
+    return int(text)
 
 
 def _writable(directory: Path) -> None:

@@ -45,7 +45,6 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("mcu", "baud_rate", args.baud_rate),
         ("robot", "id", args.id),
         ("bus", "listen", [args.listen] if args.listen else None),
-        ("bus", "tls", os.environ.get("ACSARD_TLS")),  # systemd's credentials, say
     ):
         if value is not None:
             given.setdefault(section, {})[key] = value
@@ -76,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
             port=device,
             simulated=simulated,
             rate=config.rate_hz,
-            listen=",".join(config.bus.listen),
+            bus=_bus(config),
             config=where,
         )
         for text in warnings(config):
@@ -94,6 +93,14 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
+def _bus(config: Config) -> str:
+    """Where the bus is: what the daemon listens at, or as a client connects to."""
+    bus = config.bus
+    if bus.mode == "client":
+        return f"client of {', '.join(bus.connect)}"
+    return ", ".join(bus.listen)
+
+
 def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
     """What a person sees first."""
     from acsard import __version__
@@ -109,7 +116,7 @@ def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
         version=__version__,
         robot=config.robot.id,
         port=port,
-        listen=", ".join(config.bus.listen),
+        listen=_bus(config),
         root=ROOT,
         where=where,
     )

@@ -211,6 +211,6 @@ def _info(config: Config, path: str) -> Info:
         port=path,
         simulated=config.mcu.port == SIMULATOR,
         rate=config.rate_hz,
-        listen=list(config.bus.listen),
+        listen=list(config.bus.listen) if config.bus.mode == "peer" else [],
         connect=list(config.bus.connect),
     )

@@ -6,6 +6,7 @@ encoded once per encoding, and not at all for a tree without listeners.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -25,6 +26,11 @@ OPTIONS: dict[str, Any] = {
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """As rmw_zenoh has it for what is kept for late comers."""
+
+
+def direct(callback: Callable[[Any], None]) -> Any:
+    """Called on the thread that received; by default each callback gets a thread of its own."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 class _Outlet:
@@ -100,5 +106,5 @@ class Outlets:
         def matching(status: zenoh.MatchingStatus) -> None:
             outlet.wanted = status.matching
 
-        self._kept.append(publisher.declare_matching_listener(matching))
+        self._kept.append(publisher.declare_matching_listener(direct(matching)))
         outlet.wanted = outlet.wanted or publisher.matching_status.matching

@@ -22,6 +22,8 @@ class Replies:
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
+        self.session: zenoh.Session | None = None
+        """Stamps replies: where a storage answers too, clients keep the newest."""
         self._open: dict[int, tuple[zenoh.Query, str]] = {}
         self._numbers = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
@@ -78,4 +80,5 @@ class Replies:
             reply.payload,
             encoding=reply.encoding,
             attachment=reply.attachment or None,
+            timestamp=self.session.new_timestamp() if self.session is not None else None,
         )

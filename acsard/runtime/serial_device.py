@@ -96,7 +96,8 @@ def in_use(path: str) -> str:
 def no_permission(path: str) -> str:
     return (
         f"no permission to open {path}; add the user to the device's group "
-        "(`sudo usermod -aG dialout $USER`, then log in again)"
+        "(`sudo usermod -aG dialout $USER`, then log in again; a service has dialout already: "
+        "is the device in another group, or of a kind its unit does not allow?)"
     )
 
 

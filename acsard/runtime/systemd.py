@@ -74,9 +74,8 @@ class Systemd:
         if outputs.status_changed or now_ns - self._status_ns >= STATUS_PERIOD_NS:
             self._status_ns = now_ns
             status = status_of(outputs)
-            if status != self._status:
+            if status != self._status and self._send(f"STATUS={status}"):
                 self._status = status
-                self._send(f"STATUS={status}")
 
     def close(self) -> None:
         """Nothing more to say."""
@@ -84,13 +83,14 @@ class Systemd:
             self._socket.close()
             self._socket = None
 
-    def _send(self, text: str) -> None:
+    def _send(self, text: str) -> bool:
         if self._socket is None:
-            return
+            return False
         try:
             self._socket.send(text.encode())
         except OSError:
-            pass  # its queue is full or it is gone: the robot drives on
+            return False  # its queue is full or it is gone: the robot drives on
+        return True
 
 
 def status_of(outputs: Outputs) -> str:

@@ -21,7 +21,7 @@ from acsard.runtime import clock
 from acsard.runtime.control_loop import BusInput
 from acsard.runtime.exits import Exit, ExitError
 from acsard.runtime.inbox import Inbox
-from acsard.runtime.outlets import Outlets
+from acsard.runtime.outlets import Outlets, direct
 from acsard.runtime.replies import Replies
 from acsard.runtime.threads import in_thread
 from acsard.runtime.zenoh_session import daemon_session
@@ -89,7 +89,7 @@ class ZenohBus:
     def _open(self) -> None:
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
-        self._session = session
+        self._session = self._replies.session = session
         self._inbox.own_id = session.new_timestamp().get_id()
         if settings.connect and self._twin(session):
             session.close()
@@ -121,9 +121,9 @@ class ZenohBus:
         for topic in TOPICS:
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
-                self._kept.append(session.declare_subscriber(key, inbox.on_sample))
+                self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
             elif topic.key != "alive":
-                on_query = partial(inbox.on_query, topic.key)
+                on_query = direct(partial(inbox.on_query, topic.key))
                 self._kept.append(session.declare_queryable(key, on_query))
         for topic in PUBLISHED:
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
@@ -132,10 +132,10 @@ class ZenohBus:
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key
         if endpoint.direction == "in":
-            on_sample = partial(self._inbox.on_ros_sample, endpoint)
+            on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
             self._kept.append(session.declare_subscriber(key, on_sample))
         elif endpoint.direction == "query":
-            on_query = partial(self._inbox.on_ros_query, endpoint)
+            on_query = direct(partial(self._inbox.on_ros_query, endpoint))
             # rmw_zenoh's clients ask complete queryables only.
             self._kept.append(session.declare_queryable(key, on_query, complete=True))
         else:

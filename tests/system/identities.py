@@ -1,0 +1,77 @@
+"""Who comes to the bus, and with what: plain clients, certificates of each role, and bad ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import zenoh
+
+from acsard.cli.certificates import Authority
+from tests.system.harness import acsard, client_config, finish, free_endpoint
+
+Identity = Literal[
+    "local", "viewer", "operator", "maintainer", "unlisted", "nobody", "foreign", "expired"
+]
+
+ADMITTED: tuple[Identity, ...] = ("local", "viewer", "operator", "maintainer")
+"""Plain TCP on this machine, and the certificates `acsard lan init` makes."""
+
+STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
+"""A good certificate nobody listed; none at all; the operator's of another CA; one of yesterday."""
+
+
+class Certificates:
+    """Those of one robot, and what strangers would hold, below a directory."""
+
+    def __init__(self, where: Path, *addresses: str) -> None:
+        self.robot = where / "tls"
+        reached = [word for address in addresses for word in ("--address", address)]
+        self._made("init", "--directory", str(self.robot), *reached)
+        self._made(
+            "add", "unlisted", "--role", "operator", "--directory", str(self.robot)
+        )  # the lines it prints are not written to the configuration
+        self._made("init", "--directory", str(where / "another"))
+        self._client: dict[Identity, Path] = {
+            role: self.robot / "clients" / role
+            for role in ("viewer", "operator", "maintainer", "unlisted")
+        }
+        self._client["foreign"] = where / "another" / "clients" / "operator"
+        self._client["expired"] = where / "expired"
+        self.issue(self._client["expired"], "operator", -1.0)
+
+    @staticmethod
+    def _made(*words: str) -> None:
+        done = finish(acsard("lan", *words), "/")
+        assert done.code == 0, done
+
+    def issue(self, directory: Path, name: str, days: float) -> None:
+        """One more, by this robot's authority."""
+        Authority.load(self.robot).issue(directory, name, [], days)
+
+    def config(self, who: Identity, plain: str, tls: str) -> zenoh.Config:
+        """The settings of a client that comes as `who`; all of them know the robot's CA."""
+        if who == "local":
+            return client_config(plain)
+        return self.shown(tls, self._client.get(who))
+
+    def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
+        """The settings of a client that shows the certificate in `own`, or none."""
+        config = client_config(endpoint)
+        config.insert_json5("transport/link/tls", json.dumps(self.settings(own)))
+        return config
+
+    def settings(self, own: Path | None) -> dict[str, object]:
+        """Zenoh's `transport/link/tls` for it."""
+        tls: dict[str, object] = {"root_ca_certificate": str(self.robot / "ca.pem")}
+        if own is not None:
+            tls["enable_mtls"] = True
+            tls["connect_certificate"] = str(own / "certificate.pem")
+            tls["connect_private_key"] = str(own / "key.pem")
+        return tls
+
+
+def free_tls_endpoint() -> str:
+    """A loopback address nobody listens on, for TLS."""
+    return free_endpoint().replace("tcp/", "tls/")

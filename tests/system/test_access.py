@@ -1,0 +1,443 @@
+"""Who may do what on the bus: every identity, verb and key against the table of SAFETY section 3.
+
+What counts is the effect. A put or delete counts when the robot obeys it or others take it for the
+robot's; a query when an answer comes; a subscription when a sample comes. What must not happen is
+never waited for: behind each attempt goes something that is answered.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import pytest
+import zenoh
+import zenoh.ext
+
+from tests.system import ros_clients as ros
+from tests.system.harness import ZERO, Bus, Daemon, free_endpoint, until
+from tests.system.identities import ADMITTED, Certificates, Identity, free_tls_endpoint
+
+Verb = Literal["put", "delete", "query", "subscribe"]
+IDENTITIES: tuple[Identity, ...] = get_args(Identity)
+VERBS: tuple[Verb, ...] = get_args(Verb)
+
+# the table, as SAFETY section 3 has it
+
+Who = frozenset[str]
+NOBODY: Who = frozenset()
+HERE: Who = frozenset({"local"})
+KEEPERS: Who = HERE | {"maintainer"}
+DRIVERS: Who = KEEPERS | {"operator"}
+ANYBODY: Who = DRIVERS | {"viewer"}
+
+ME, OTHER = "acsard/acsar", "acsard/other"
+SOURCES = ("teleop", "app", "ros2_control", "nav")
+VALUES = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics")
+
+TWIST_JSON = json.dumps(ZERO).encode()
+WHEELS_JSON = json.dumps({"name": ros.WHEELS, "velocity": [0.0] * 4}).encode()
+POSE_JSON = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
+FORGED = b"forged"
+NO_NAMES = b"\x00\x01\x00\x00" + bytes(4)
+NO_PREFIXES = b"\x00\x01\x00\x00" + bytes(16)
+
+RMW_ODOM = ros.rmw_key("odom", ros.ODOMETRY)
+RMW_CMD = ros.rmw_key("cmd_vel", ros.TWIST)
+RMW_STATIC = ros.rmw_key("tf_static", ros.TF)
+CDR_TWIST, CDR_STAMPED = ros.twist(0.0), ros.stamped(0.0, age=None)
+
+
+def _cdr_wheels() -> bytes:
+    """Stamped, so made anew for each."""
+    return ros.joints(0.0)
+
+
+class Try(NamedTuple):
+    """One row of the matrix: a key (expression), and who may."""
+
+    key: str
+    who: Who
+    payload: bytes | Callable[[], bytes] = b""
+    how: Literal["plain", "late", "token"] = "plain"
+    """How to subscribe: as anybody, as one who wants what was before, or to liveliness tokens."""
+    stirred: bool = False
+    """Somebody has to send for there to be a sample."""
+
+    @property
+    def data(self) -> bytes:
+        """What to put or to ask with."""
+        return self.payload if isinstance(self.payload, bytes) else self.payload()
+
+    @property
+    def label(self) -> str:
+        """What tells it from the other rows of its verb."""
+        return self.key + ("" if self.how == "plain" else f" ({self.how})")
+
+
+def _commands() -> Iterator[Try]:
+    yield from (Try(f"{ME}/cmd/{source}", DRIVERS, TWIST_JSON) for source in SOURCES)
+    yield from (Try(f"{ME}/wheel_cmd/{source}", DRIVERS, WHEELS_JSON) for source in SOURCES)
+    yield Try(f"{ME}/stop", ANYBODY)
+    unlisted = ("cmd/ghost", "cmd/app/more", "cmd", "cmd/*", "cmd/**", "cmd/ap$*", "cmd/app/**")
+    yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in unlisted)
+    yield from (Try(f"{ME}/wheel_cmd/{key}", NOBODY, WHEELS_JSON) for key in ("ghost", "*", "**"))
+    wild = ("*", "**", "*/app", "sto$*", "stop/**")
+    yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in wild)
+    wilder = ("acsard/*/cmd/app", "acsard/*/stop", "acsard/**", "**/stop", "**")
+    yield from (Try(key, NOBODY, TWIST_JSON) for key in wilder)
+    others = (f"{OTHER}/cmd/app", f"{OTHER}/stop", f"{OTHER}/**")
+    yield from (Try(key, NOBODY, TWIST_JSON) for key in others)
+    unwritten = (*VALUES, "alive", "config", "info", "srv/stop", "odo$*")
+    yield from (Try(f"{ME}/{key}", NOBODY, FORGED) for key in unwritten)
+
+
+def _ros_commands() -> Iterator[Try]:
+    twists = ("cmd_vel", "cmd_vel_teleop")
+    for name in twists:
+        yield Try(name, DRIVERS, CDR_TWIST)
+        yield Try(ros.rmw_key(name, ros.TWIST), DRIVERS, CDR_TWIST)
+        yield Try(ros.rmw_key(name, ros.STAMPED), DRIVERS, CDR_STAMPED)
+    yield Try("joint_commands", DRIVERS, _cdr_wheels)
+    yield Try(ros.rmw_key("joint_commands", ros.JOINTS), DRIVERS, _cdr_wheels)
+    rmw_type = RMW_CMD.removeprefix("0/cmd_vel/")
+    wild = (
+        "cmd_vel/**",
+        "cmd_v$*",
+        "*",
+        "0/cmd_vel/**",
+        f"0/*/{rmw_type}",
+        f"*/cmd_vel/{rmw_type}",
+    )
+    others = ("other/cmd_vel", f"0/other/cmd_vel/{rmw_type}", f"1/cmd_vel/{rmw_type}", "0/**")
+    yield from (Try(key, NOBODY, CDR_TWIST) for key in (*wild, *others))
+    yield from (Try(key, NOBODY, FORGED) for key in ("odom", RMW_ODOM, "tf_static", RMW_STATIC))
+
+
+def _questions() -> Iterator[Try]:
+    asked = (*VALUES, "info", "topics", "interfaces", "schema/Twist", "schema/*")
+    yield from (Try(f"{ME}/{key}", ANYBODY) for key in asked)
+    yield from (
+        Try(f"{key}/@adv/**", ANYBODY) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC)
+    )
+    yield from (Try(f"{ME}/{key}", KEEPERS) for key in ("config", "*", "**"))
+    services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
+    yield from (Try(f"{ME}/{key}", NOBODY) for key in services)
+    wilder = ("acsard/*/state", "acsard/*/srv/stop", "acsard/**", "**")
+    yield from (Try(key, NOBODY) for key in wilder)
+    yield from (Try(f"{OTHER}/{key}", NOBODY) for key in ("state", "srv/stop", "config", "**"))
+    rmw_type = ros.rmw_key("", ros.TRIGGER).removeprefix("0//")
+    wild = ("acsard/*", "acsard/sto$*", "0/acsard/**", f"0/acsard/*/{rmw_type}", "0/**")
+    others = ("other/acsard/stop", f"0/other/acsard/stop/{rmw_type}", f"1/acsard/stop/{rmw_type}")
+    yield from (Try(key, NOBODY) for key in (*wild, *others))
+
+
+def _services() -> Iterator[Try]:
+    least = dict.fromkeys(ros.TRIGGERS, DRIVERS) | {"stop": ANYBODY}
+    for verb, who in least.items():
+        yield Try(f"{ME}/srv/{verb}", who)
+        yield Try(f"acsard/{verb}", who, ros.EMPTY_REQUEST)
+        yield Try(ros.rmw_key(f"acsard/{verb}", ros.TRIGGER), who, ros.EMPTY_REQUEST)
+    yield Try(f"{ME}/srv/set_pose", KEEPERS, POSE_JSON)
+    for name, kind in ros.PARAMETER_SERVICES.items():
+        payload = NO_PREFIXES if name == "list_parameters" else NO_NAMES
+        yield Try(f"acsard/{name}", KEEPERS, payload)
+        yield Try(ros.rmw_key(f"acsard/{name}", kind), KEEPERS, payload)
+
+
+def _subscriptions() -> Iterator[Try]:
+    often = [value for value in VALUES if value != "tf_static"]
+    yield from (Try(f"{ME}/{key}", ANYBODY) for key in (*often, "*", "**"))
+    for name, (kind, _, late) in ros.PUBLISHED.items():
+        how: Literal["plain", "late"] = "late" if late else "plain"
+        yield Try(name, ANYBODY, how=how)
+        yield Try(ros.rmw_key(name, kind), ANYBODY, how=how)
+    yield Try(f"{ME}/tf_static", ANYBODY, how="late")
+    tokens = (f"{ME}/alive", "acsard/*/alive", "@ros2_lv/**", "@ros2_lv/0/**", "@/*/@ros2_lv/**")
+    yield from (Try(key, ANYBODY, how="token") for key in tokens)
+    yield from (Try(key, NOBODY, how="token") for key in ("**", f"{OTHER}/alive"))
+    # Who watches a fleet writes this, and gets what each robot publishes.
+    yield from (Try(key, ANYBODY) for key in ("acsard/*/odom", "acsard/**"))
+    # At the machine any wildcard will do: what is published there is no secret there.
+    yield from (Try(key, HERE) for key in ("**", "*", "0/**", "0/odom/**"))
+    others = (f"{OTHER}/odom", f"{OTHER}/**", "other/odom", "0/other/odom/**", "1/odom/**")
+    yield from (Try(key, NOBODY) for key in others)
+    commands = (f"{ME}/cmd/app", f"{ME}/cmd/*", f"{ME}/cmd/**", "cmd_vel", RMW_CMD)
+    yield from (Try(key, HERE, stirred=True) for key in commands)
+
+
+PUTS = (*_commands(), *_ros_commands())
+ROWS: dict[Verb, tuple[Try, ...]] = {
+    "put": PUTS,
+    "delete": tuple(row._replace(who=NOBODY) for row in PUTS),
+    "query": (*_questions(), *_services()),
+    "subscribe": tuple(_subscriptions()),
+}
+
+Outcome = dict[str, bool]
+
+
+# the robot and those who try
+
+
+class Robot:
+    """A daemon with a plain and a TLS endpoint, somebody at the machine, and a witness."""
+
+    def __init__(self, where: Path) -> None:
+        self.certificates = Certificates(where)
+        self.plain, self.tls = free_endpoint(), free_tls_endpoint()
+        bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
+        rates = {"state": 100.0, "diagnostics": 100.0}
+        tables: dict[str, dict[str, object]] = {"bus": dict(bus), "rates": dict(rates)}
+        self.daemon = Daemon(where, config=tables, endpoint=self.plain)
+        self._fooled = threading.Event()
+        self._outcomes: dict[tuple[str, str], Outcome] = {}
+
+    @contextmanager
+    def running(self) -> Iterator[Robot]:
+        with self.daemon, Bus(self.plain) as self.here, Bus(self.plain) as self.witness:
+            self.here.linked()
+            keys = (f"{ME}/**", "odom", RMW_ODOM, "tf_static", RMW_STATIC)
+            watched = [self.witness.session.declare_subscriber(k, self._judge) for k in keys]
+            self.witness.ask("info")
+            yield self
+            del watched
+
+    def _judge(self, sample: zenoh.Sample) -> None:
+        put = sample.kind == zenoh.SampleKind.PUT
+        key = str(sample.key_expr).removeprefix(f"{ME}/")
+        commands = ("cmd", "wheel_cmd", "stop")
+        if sample.payload.to_bytes() == FORGED or not (put or key.partition("/")[0] in commands):
+            self._fooled.set()
+
+    def fooled(self) -> bool:
+        """Whether the witness has since heard something that the robot did not say."""
+        self.witness.ask("info")
+        was = self._fooled.is_set()
+        self._fooled.clear()
+        return was
+
+    def config(self, who: Identity) -> zenoh.Config:
+        return self.certificates.config(who, self.plain, self.tls)
+
+    def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
+        """Whether it becomes true within so many control periods, which is long on one machine."""
+        begun = self.here.count("lines_sent")
+        while not (found := look()):
+            if self.here.count("lines_sent") >= begun + steps:
+                return look()
+        return found
+
+    def settled(self) -> None:
+        """Some control periods later: whatever was sent before is long there."""
+        self.comes(lambda: False)
+
+    def restored(self) -> None:
+        """Released and switched on."""
+        if self.here.state()["mode"] == "stopped":
+            assert self.here.get("srv/clear")["success"]
+        assert self.here.get("srv/activate")["success"]
+
+    def outcome(self, who: Identity, verb: Verb) -> Outcome:
+        """What became of every attempt."""
+        if (who, verb) not in self._outcomes:
+            self._outcomes[who, verb] = self._tried(who, verb)
+        return self._outcomes[who, verb]
+
+    def _tried(self, who: Identity, verb: Verb) -> Outcome:
+        rows = ROWS[verb]
+        try:
+            one = Visitor(self, who)
+        except zenoh.ZError:
+            assert who not in ADMITTED
+            return dict.fromkeys((row.label for row in rows), False)
+        with one:
+            if verb == "query":
+                found = one.asked([r for r in rows if not r.payload and "/srv/" not in r.key])
+                assert self.here.state()["mode"] != "stopped"
+                found |= one.asked([row for row in rows if row.label not in found])
+                self.restored()
+                return found
+            attempt = one.followed if verb == "subscribe" else partial(one.sent, verb)
+            # All that should do nothing at once, and one by one only when something happened.
+            idle = [row for row in rows if who not in row.who]
+            quiet = idle if idle and not attempt(idle) else []
+            return {row.label: row not in quiet and attempt([row]) for row in rows}
+
+
+class Visitor:
+    """One session at the robot, by whomever."""
+
+    def __init__(self, robot: Robot, who: Identity) -> None:
+        self._robot, self._who, self._sequence = robot, who, 0
+        self._session = zenoh.open(robot.config(who))
+
+    def __enter__(self) -> Visitor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._session.close()
+
+    def _attachment(self, key: str) -> bytes | None:
+        self._sequence += 1
+        if not key.startswith(("0/", "1/")):
+            return None
+        return ros.Attached(self._sequence, time.time_ns(), bytes(range(16))).pack()
+
+    def _behind(self) -> None:
+        """All that this session has sent is there. On one link all is in order."""
+        if self._who in ADMITTED:
+            assert list(self._session.get(f"{ME}/info", timeout=5.0))
+        else:
+            self._robot.settled()
+
+    def _patience(self, rows: Sequence[Try]) -> int:
+        """Control periods to wait for: what should come is given the time a busy machine takes."""
+        return 200 if all(self._who in row.who for row in rows) else 5
+
+    def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
+        """Whether any of these puts or deletes had an effect."""
+        here = self._robot.here
+        before = here.count("commands")
+        for row in rows:
+            attachment = self._attachment(row.key)
+            if verb == "put":
+                self._session.put(row.key, row.data, attachment=attachment)
+            else:
+                self._session.delete(row.key, attachment=attachment)
+        self._behind()
+
+        def effect() -> bool:
+            state = here.state()
+            return bool(
+                state["mode"] == "stopped" or state["counters"].get("commands", 0) != before
+            )
+
+        done = self._robot.comes(effect, self._patience(rows)) or self._robot.fooled()
+        if here.state()["mode"] == "stopped":
+            self._robot.restored()
+        return done
+
+    def asked(self, rows: Sequence[Try]) -> Outcome:
+        """Which questions got an answer."""
+        waiting = {}
+        for row in rows:
+            answers: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
+            waiting[row.label] = self._session.get(
+                row.key,
+                handler=answers,
+                payload=row.data or None,
+                attachment=self._attachment(row.key),
+                timeout=5.0,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+        self._behind()
+        self._robot.settled()
+        found: Outcome = {}
+
+        def look(label: str) -> bool:
+            try:
+                reply = waiting[label].try_recv()
+            except zenoh.ZError:
+                return True  # all answers are in
+            found[label] = found[label] or (reply is not None and reply.ok is not None)
+            return found[label]
+
+        for row in rows:
+            found[row.label] = False
+            if look(row.label) or self._who not in row.who:
+                continue
+            self._robot.comes(partial(look, row.label), 100)
+        return found
+
+    def followed(self, rows: Sequence[Try]) -> bool:
+        """Whether any of these subscriptions brought anything."""
+        came = threading.Event()
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            came.set()
+
+        # On a session of its own: within one, every subscription gets what any of them asked for.
+        with zenoh.open(self._robot.config(self._who)) as session:
+            subscribers = [_subscribed(session, row, on_sample) for row in rows]
+            if self._who in ADMITTED:
+                assert list(session.get(f"{ME}/info", timeout=5.0))
+            if any(row.stirred for row in rows):
+                here = self._robot.here
+                here.put("cmd/app", ZERO)
+                here.session.put("cmd_vel", CDR_TWIST)
+                here.session.put(RMW_CMD, CDR_TWIST, attachment=self._attachment(RMW_CMD))
+            done = self._robot.comes(came.is_set, self._patience(rows))
+            for subscriber in subscribers:
+                subscriber.undeclare()
+        return done
+
+
+def _subscribed(session: zenoh.Session, row: Try, on_sample: Callable[[zenoh.Sample], None]) -> Any:
+    if row.how == "token":
+        return session.liveliness().declare_subscriber(row.key, on_sample, history=True)
+    if row.how == "late":
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        return zenoh.ext.declare_advanced_subscriber(session, row.key, on_sample, history=history)
+    return session.declare_subscriber(row.key, on_sample)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    with Robot(tmp_path_factory.mktemp("access")).running() as robot:
+        yield robot
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("who", IDENTITIES)
+def test_each_may_do_what_the_table_says_and_nothing_else(
+    robot: Robot, who: Identity, verb: Verb
+) -> None:
+    wrong = [
+        f"{row.label}: {'let through' if done else 'kept out'}"
+        for row, done in zip(ROWS[verb], robot.outcome(who, verb).values(), strict=True)
+        if done != (who in row.who)
+    ]
+    assert not wrong
+
+
+def test_what_a_certificate_may_not_put_never_gets_as_far_as_being_refused(robot: Robot) -> None:
+    before = robot.here.state()["counters"]
+    with Visitor(robot, "maintainer") as one:
+        assert not one.sent("put", [row for row in ROWS["put"] if not row.who])
+        assert not one.sent("delete", ROWS["delete"])
+    after = robot.here.state()["counters"]
+    refused = {name for name in after if name.startswith("command_")}
+    assert {name: after[name] for name in refused} == {name: before.get(name) for name in refused}
+
+
+def test_a_link_ends_with_its_certificate(robot: Robot, tmp_path: Path) -> None:
+    days = 2.0 / 86400.0
+    robot.certificates.issue(tmp_path, "operator", days)
+    end = time.monotonic() + 2.0
+    with zenoh.open(robot.certificates.shown(robot.tls, tmp_path)) as session:
+        assert list(session.get(f"{ME}/info", timeout=1.0))
+        until(lambda: not list(session.info.peers_zid()), 6.0, "the link ends")
+        assert time.monotonic() > end - 1.1  # certificates count whole seconds
+
+
+def test_the_matrix_is_as_written(robot: Robot) -> None:
+    cells = right = 0
+    print(f"\n{'':10}{' '.join(f'{who:>10}' for who in IDENTITIES)}  (! is not as written)")
+    for verb in VERBS:
+        for row in ROWS[verb]:
+            marks = []
+            for who in IDENTITIES:
+                done = robot.outcome(who, verb)[row.label]
+                good = done == (who in row.who)
+                cells, right = cells + 1, right + good
+                marks.append(f"{'yes' if done else '-'}{'' if good else ' !'}")
+            print(f"{verb:10}{' '.join(f'{mark:>10}' for mark in marks)}  {row.label}")
+    print(f"{right} of {cells} cells as written")
+    assert right == cells

@@ -1,0 +1,539 @@
+"""deploy/zenoh is true: its router between two robots and each who may come, by certificates.
+
+The router is Zenoh itself in router mode with router.json5; only addresses and files differ, and
+what the storage plugin does is done by a few lines in the router's process. What counts is the
+effect; what must not happen is never waited for: behind each attempt goes something answered.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import pytest
+import zenoh
+import zenoh.ext
+from msgspec.structs import astuple
+
+from acsard.cli.certificates import Authority
+from acsard.config import parse
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
+from acsard.rules import warnings
+from acsard.runtime.exits import Exit
+from acsard.settings import Config
+from tests.system.harness import (
+    ROOT,
+    ZERO,
+    Answered,
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    client_config,
+    finish,
+    until,
+)
+from tests.system.identities import free_tls_endpoint
+from tests.system.strangers import words
+
+FILES = ROOT / "deploy" / "zenoh"
+ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
+
+ROUTER = """\
+import json, sys, time
+import zenoh
+
+config = zenoh.Config.from_file(sys.argv[1])
+for key, value in json.loads(sys.argv[2]).items():
+    config.insert_json5(key, json.dumps(value))
+storages = json.loads(config.get_json("plugins/storage_manager/storages"))
+last = {}
+
+def keep(sample):
+    last[str(sample.key_expr)] = sample
+
+def answer(query):
+    for key, sample in list(last.items()):
+        if query.key_expr.intersects(zenoh.KeyExpr(key)):
+            query.reply(
+                key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp
+            )
+
+session = zenoh.open(config)
+kept = [
+    declare(storage["key_expr"], act)
+    for storage in storages.values()
+    for declare, act in ((session.declare_subscriber, keep), (session.declare_queryable, answer))
+]
+print("routing", flush=True)
+time.sleep(600)
+"""
+"""A router with a configuration and changes to it; has no plugins, and acts like the storages."""
+
+# who may, as SAFETY section 3 has it; robot2 is whoever has the certificate of that robot
+
+Who = frozenset[str]
+Verb = Literal["put", "delete", "query", "subscribe"]
+
+NAMES = ("viewer", "operator", "maintainer", "robot2", "unlisted", "router.local")
+NOBODY: Who = frozenset()
+KEEPERS: Who = frozenset({"maintainer"})
+DRIVERS: Who = KEEPERS | {"operator"}
+ANYBODY: Who = DRIVERS | {"viewer"}
+ITSELF: Who = frozenset({"robot2"})
+
+ONE, TWO = "acsard/robot1", "acsard/robot2"
+TWIST = json.dumps(ZERO).encode()
+WHEELS = json.dumps({"name": astuple(Config().joints), "velocity": [0.0] * 4}).encode()
+POSE = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
+FORGED = b"forged"
+SOURCES = tuple(source.name for source in Config().commands.sources)
+VALUES = tuple(topic.key for topic in PUBLISHED)
+OFTEN = tuple(topic.key for topic in PUBLISHED if not topic.latched)
+EVERY_REPLY = zenoh.ConsolidationMode.NONE
+
+
+class Try(NamedTuple):
+    """A key (expression), and who may."""
+
+    key: str
+    who: Who
+    payload: bytes = b""
+    how: Literal["plain", "late", "token"] = "plain"
+    """How to subscribe: as anybody, as one who wants what was before, or to liveliness tokens."""
+
+    @property
+    def label(self) -> str:
+        """What tells it from the other rows of its verb."""
+        return self.key + ("" if self.how == "plain" else f" ({self.how})")
+
+
+def _puts() -> Iterator[Try]:
+    for source in SOURCES:
+        yield Try(f"{ONE}/cmd/{source}", DRIVERS, TWIST)
+    yield Try(f"{ONE}/wheel_cmd/ros2_control", DRIVERS, WHEELS)
+    yield Try(f"{TWO}/cmd/app", DRIVERS | ITSELF, TWIST)
+    yield Try(f"{ONE}/stop", ANYBODY)
+    yield Try(f"{TWO}/stop", ANYBODY | ITSELF)
+    for key in ("cmd/ghost", "cmd/*", "cmd/**", "wheel_cmd/*", "*/app", "sto$*", "*", "**"):
+        yield Try(f"{ONE}/{key}", NOBODY, TWIST)
+    for key in ("acsard/*/cmd/app", "acsard/*/stop", "acsard/**", "**/stop", "**"):
+        yield Try(key, NOBODY, TWIST)
+    for key in (*OFTEN, "tf_static", "alive", "info", "config", "srv/stop", "tf_static/@adv/x"):
+        yield Try(f"{ONE}/{key}", NOBODY, FORGED)
+    for key in ("robot1/cmd_vel", "cmd_vel", "acsard/robot3/state", "@/*/router/config/mode"):
+        yield Try(key, NOBODY, FORGED)
+
+
+def _queries() -> Iterator[Try]:
+    described = ("info", "topics", "interfaces", "schema/Twist", "schema/*")
+    for key in (*OFTEN, "tf_static", "tf_static/@adv/**?_anyke", *described):
+        yield Try(f"{ONE}/{key}", ANYBODY)
+    yield Try(f"{TWO}/info", ANYBODY | ITSELF)
+    for key in ("state", "odom", "tf_static"):
+        yield Try(f"acsard/*/{key}", ANYBODY)
+    yield Try(f"{ONE}/config", KEEPERS)
+    yield Try(f"{TWO}/config", KEEPERS | ITSELF)
+    for key in ("*", "**", "srv/*", "srv/**", "srv/ghost", "cmd/app"):
+        yield Try(f"{ONE}/{key}", NOBODY)
+    for key in ("acsard/*/srv/stop", "acsard/*/config", "acsard/**", "**", "@/*/router/**"):
+        yield Try(key, NOBODY)
+    least = dict.fromkeys(SERVICES, DRIVERS) | {"stop": ANYBODY, "set_pose": KEEPERS}
+    for verb, who in least.items():
+        yield Try(f"{ONE}/srv/{verb}", who, POSE if verb == "set_pose" else b"")
+    yield Try(f"{TWO}/srv/stop", ANYBODY | ITSELF)
+
+
+def _subscriptions() -> Iterator[Try]:
+    for key in (*OFTEN, "*", "**"):
+        yield Try(f"{ONE}/{key}", ANYBODY)
+    yield Try(f"{TWO}/**", ANYBODY | ITSELF)
+    yield Try(f"{ONE}/tf_static", ANYBODY, how="late")
+    for key in ("acsard/*/state", "acsard/*/wheel_states", "acsard/**"):
+        yield Try(key, ANYBODY)
+    yield Try(f"{ONE}/alive", ANYBODY, how="token")
+    yield Try("acsard/*/alive", ANYBODY, how="token")
+    yield Try(f"{TWO}/alive", ANYBODY | ITSELF, how="token")
+    yield Try("**", NOBODY, how="token")
+    for key in ("**", "*/robot1/**", "robot1/**", "acsard/robot3/**", "@/**"):
+        yield Try(key, NOBODY)
+
+
+PUTS = tuple(_puts())
+ROWS: dict[Verb, tuple[Try, ...]] = {
+    "put": PUTS,
+    "delete": tuple(row._replace(who=NOBODY) for row in PUTS),
+    "query": tuple(_queries()),
+    "subscribe": tuple(_subscriptions()),
+}
+
+
+# the fleet
+
+
+class Member(Bus):
+    """A plain Zenoh client of the router that shows a certificate."""
+
+    def __init__(self, config: zenoh.Config, robot_id: str) -> None:
+        self.session = zenoh.open(config)
+        self.root = f"acsard/{robot_id}"
+
+    def ask(self, key: str, payload: object = None) -> list[Answered]:
+        """What the robot itself answers, in JSON; a storage has what it published."""
+        data = None if payload is None else json.dumps(payload)
+        found = []
+        for reply in self.session.get(
+            f"{self.root}/{key}", payload=data, consolidation=EVERY_REPLY, timeout=5.0
+        ):
+            if reply.ok is not None and str(reply.ok.encoding).startswith("application/json"):
+                sample, where = reply.ok, str(reply.ok.key_expr).removeprefix(self.root + "/")
+                found.append(Answered(where, True, str(sample.encoding), sample.payload.to_bytes()))
+        return found
+
+
+class Fleet:
+    """The router, two robots, and somebody who may look at everything."""
+
+    def __init__(self, where: Path) -> None:
+        self.where, self.endpoint = where, free_tls_endpoint()
+        authority = Authority.make(where, "fleet", 1)
+        for name in ("robot1", *NAMES):
+            authority.issue(where / name, name, ["127.0.0.1"], 1.0)
+        self._stack = ExitStack()
+        self._fooled = threading.Event()
+
+    def __enter__(self) -> Fleet:
+        enter = self._stack.enter_context
+        try:
+            enter(self._router()).says("routing")
+            self.daemons = [enter(self.robot(name, ready=False)) for name in ("robot1", "robot2")]
+            for daemon in self.daemons:
+                daemon.says("bus ")
+            self.robots = [enter(self.member("maintainer", n)) for n in ("robot1", "robot2")]
+            for robot in self.robots:
+                robot.linked()
+            witness = self.robots[0].session
+            keys = ("acsard/**", f"{ONE}/cmd/**", f"{TWO}/cmd/**")
+            self._watched = [witness.declare_subscriber(key, self._judge) for key in keys]
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def _router(self) -> Program:
+        config = zenoh.Config.from_file(str(ROUTER_FILE))
+        tls = json.loads(config.get_json("transport/link/tls"))
+        for key, value in tls.items():
+            if isinstance(value, str):
+                tls[key] = str(self.where / "router.local" / Path(value).name)
+        changes = {
+            "listen/endpoints": [self.endpoint],
+            "transport/link/tls": {key: value for key, value in tls.items() if value is not None},
+            "plugins_loading/enabled": False,
+        }
+        return Program(words(ROUTER, ROUTER_FILE, json.dumps(changes)), self.where)
+
+    def robot(self, robot_id: str, name: str = "", *, ready: bool = True) -> Daemon:
+        """A daemon with robot.toml and the certificate of its id, quick to drive and to tell.
+
+        robot2 is a peer instead, as README.md has it for one with programs of its own.
+        """
+        tables = tomllib.loads(ROBOT_FILE.read_text())
+        if robot_id == "robot2":
+            tables["bus"]["mode"] = "peer"
+        tables["robot"]["id"] = robot_id
+        tables["bus"] |= {"connect": [self.endpoint], "tls": str(self.where / robot_id)}
+        tables["rates"] = {"state": 100.0, "diagnostics": 100.0}
+        tables["limits"] = {"linear_acceleration": 5.0, "linear_stop_deceleration": 5.0}
+        return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
+
+    def member(self, name: str, robot_id: str = "robot1") -> Member:
+        """A client with this certificate, set up as README.md has it for any language."""
+        own = self.where / name
+        config = client_config(self.endpoint)
+        tls = {
+            "root_ca_certificate": str(own / "ca.pem"),
+            "connect_certificate": str(own / "certificate.pem"),
+            "connect_private_key": str(own / "key.pem"),
+            "enable_mtls": True,
+        }
+        config.insert_json5("transport/link/tls", json.dumps(tls))
+        return Member(config, robot_id)
+
+    def _judge(self, sample: zenoh.Sample) -> None:
+        _, _, key = str(sample.key_expr).split("/", 2)
+        if sample.payload.to_bytes() == FORGED or key not in VALUES:
+            self._fooled.set()
+
+    def fooled(self) -> bool:
+        """Whether the witness has since heard what no robot said, or somebody's command."""
+        self.robots[0].ask("info")
+        was = self._fooled.is_set()
+        self._fooled.clear()
+        return was
+
+    def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
+        """Whether it becomes true within so many control periods, which is long on one machine."""
+        here = self.robots[0]
+        begun = here.count("lines_sent")
+        while not (found := look()):
+            if here.count("lines_sent") >= begun + steps:
+                return look()
+        return found
+
+    def restored(self) -> None:
+        """Both released and switched on."""
+        for robot in self.robots:
+            if robot.state()["mode"] == "stopped":
+                assert robot.get("srv/clear")["success"]
+            assert robot.get("srv/activate")["success"]
+
+    def tried(self, name: str, verb: Verb) -> dict[str, bool]:
+        """What became of every attempt of one with this certificate."""
+        with self.member(name) as member:
+            visitor = Visitor(self, member.session, name)
+            rows = ROWS[verb]
+            if verb == "query":
+                calls = [row for row in rows if "/srv/" in row.key]
+                found = visitor.asked([row for row in rows if row not in calls])
+                assert not any(robot.state()["mode"] == "stopped" for robot in self.robots)
+                found |= visitor.asked(calls)
+                self.restored()
+                return {row.label: found[row.label] for row in rows}
+            attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
+            # All that should do nothing at once, and one by one only when something happened.
+            idle = [row for row in rows if name not in row.who]
+            quiet = idle if idle and not attempt(idle) else []
+            return {row.label: row not in quiet and attempt([row]) for row in rows}
+
+
+class Visitor:
+    """One session at the router that tries."""
+
+    def __init__(self, fleet: Fleet, session: zenoh.Session, name: str) -> None:
+        self._fleet, self._session, self._name = fleet, session, name
+        self._answering = [ONE, TWO] if name in ANYBODY else [TWO] if name in ITSELF else []
+
+    def _behind(self) -> None:
+        """All that this session has sent is there. On one way all is in order."""
+        for root in self._answering:
+            assert list(self._session.get(f"{root}/info", timeout=5.0))
+        if len(self._answering) < 2:
+            self._fleet.comes(lambda: False)
+
+    def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
+        """Whether a robot obeyed any of these puts or deletes, or others took it for a robot's."""
+        fleet = self._fleet
+
+        def commands() -> list[int]:
+            return [robot.count("commands") for robot in fleet.robots]
+
+        def obeyed() -> bool:
+            stopped = any(robot.state()["mode"] == "stopped" for robot in fleet.robots)
+            return stopped or commands() != before
+
+        before = commands()
+        for row in rows:
+            if verb == "put":
+                self._session.put(row.key, row.payload)
+            else:
+                self._session.delete(row.key)
+        self._behind()
+        done = fleet.comes(obeyed)
+        fooled = fleet.fooled()
+        if done:
+            fleet.restored()
+            assert not fooled, f"heard by others: {rows}"
+        return done or fooled
+
+    def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
+        """Which questions got an answer."""
+        waiting = {}
+        for row in rows:
+            replies: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
+            waiting[row.label] = self._session.get(
+                row.key, handler=replies, payload=row.payload or None, timeout=5.0
+            )
+        self._behind()
+        mine = [row.label for row in rows if self._name in row.who]
+        found: dict[str, bool] = {}
+
+        def all_mine() -> bool:
+            for label in mine:
+                found[label] = found.get(label) or _answered(waiting[label])
+            return all(found.values())
+
+        self._fleet.comes(all_mine, 50)
+        return {label: found.get(label) or _answered(waiting[label]) for label in waiting}
+
+    def followed(self, rows: Sequence[Try]) -> bool:
+        """Whether any of these subscriptions brought anything."""
+        came = threading.Event()
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            came.set()
+
+        subscribers = [self._subscribed(row, on_sample) for row in rows]
+        self._behind()
+        done = self._fleet.comes(came.is_set)
+        for subscriber in subscribers:
+            subscriber.undeclare()
+        return done
+
+    def _subscribed(self, row: Try, on_sample: Callable[[zenoh.Sample], None]) -> Any:
+        session, key = self._session, row.key
+        if row.how == "token":
+            return session.liveliness().declare_subscriber(key, on_sample, history=True)
+        if row.how == "late":
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            return zenoh.ext.declare_advanced_subscriber(session, key, on_sample, history=history)
+        return session.declare_subscriber(key, on_sample)
+
+
+def _answered(replies: Any) -> bool:
+    try:
+        reply = replies.try_recv()
+    except zenoh.ZError:
+        return False
+    return reply is not None and reply.ok is not None
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    with Fleet(tmp_path_factory.mktemp("fleet")) as fleet:
+        yield fleet
+
+
+@pytest.mark.parametrize("verb", get_args(Verb))
+@pytest.mark.parametrize("name", NAMES)
+def test_each_may_do_what_the_table_says_and_nothing_else(
+    fleet: Fleet, name: str, verb: Verb
+) -> None:
+    found = fleet.tried(name, verb)
+    wrong = [
+        f"{row.label}: {'let through' if found[row.label] else 'kept out'}"
+        for row in ROWS[verb]
+        if found[row.label] != (name in row.who)
+    ]
+    assert not wrong
+
+
+def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> None:
+    one, two = fleet.robots
+    with (
+        fleet.member("operator") as operator,
+        fleet.member("viewer") as viewer,
+        viewer.follow("state") as states,
+        operator.commanding(0.3),
+    ):
+        states.find(lambda state: state["linear"] > 0.1, 3.0, "robot1 drives")
+        assert not any(two.state()["wheels"])
+        viewer.put("stop", True)
+        states.find(lambda state: state["mode"] == "stopped", 1.0, "the viewer stopped it")
+        assert not viewer.ask("srv/clear")
+        assert operator.get("srv/clear")["success"]
+    one.at_rest()
+
+
+def test_all_robots_are_seen_at_once(fleet: Fleet) -> None:
+    with fleet.member("viewer") as viewer:
+        found = {str(r.ok.key_expr) for r in viewer.session.get("acsard/*/state") if r.ok}
+        assert found == {f"{ONE}/state", f"{TWO}/state"}
+        tokens = viewer.session.liveliness().get("acsard/*/alive", timeout=5.0)
+        assert {str(r.ok.key_expr) for r in tokens if r.ok} == {f"{ONE}/alive", f"{TWO}/alive"}
+
+
+def test_a_robots_certificate_serves_its_own_tree_only(fleet: Fleet) -> None:
+    with fleet.member("robot2") as forger, fleet.member("viewer") as viewer:
+        seen: list[str] = []
+        session = forger.session
+        watch = viewer.session.liveliness().declare_subscriber(
+            "acsard/*/alive", lambda sample: seen.append(str(sample.key_expr))
+        )
+        kept: list[object] = [session.liveliness().declare_token("acsard/robot3/alive")]
+        for root in (ONE, TWO):
+            key = f"{root}/info"
+
+            def answer(query: zenoh.Query, key: str = key) -> None:
+                query.reply(key, FORGED)
+
+            kept.append(session.declare_queryable(key, answer))
+        forger.root = TWO
+        forger.ask("info")  # the router has all of the above
+        forged = {root: _forged(viewer.session, f"{root}/info") for root in (ONE, TWO)}
+        assert forged == {ONE: False, TWO: True}
+        assert seen == []
+        watch.undeclare()
+        del kept
+
+
+def _forged(session: zenoh.Session, key: str) -> bool:
+    everybody = zenoh.QueryTarget.ALL
+    replies = session.get(key, target=everybody, consolidation=EVERY_REPLY, timeout=5.0)
+    return any(reply.ok is not None and reply.ok.payload.to_bytes() == FORGED for reply in replies)
+
+
+def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_robot(
+    fleet: Fleet,
+) -> None:
+    one, two = fleet.robots
+    with Bus(fleet.daemons[1].endpoint, "robot2") as here, here.commanding(0.1):
+        until(lambda: here.state()["linear"] > 0.05, 3.0, "robot2 drives")
+        before = one.count("commands")
+        for key in ("cmd/app", "stop"):
+            here.session.put(f"{ONE}/{key}", TWIST)
+        assert not list(here.session.get(f"{ONE}/srv/stop", timeout=0.3))
+        two.ask("info")
+        fleet.comes(lambda: False)
+        assert (one.state()["mode"], one.count("commands")) == ("ready", before)
+    two.at_rest()
+
+
+def test_a_second_robot_with_the_same_id_ends_at_once(fleet: Fleet) -> None:
+    with fleet.robot("robot1", "twin", ready=False) as twin:
+        assert twin.ended(10.0) == Exit.IN_USE
+    assert "already is robot1" in twin.stderr
+    assert fleet.robots[0].state()["link"] == "up"
+
+
+def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
+    where = ["--id", "robot1", "--connect", fleet.endpoint, "--tls", str(fleet.where / "viewer")]
+    echo = finish(acsard("echo", "state", "-n", "1", *where), fleet.where)
+    assert echo.code == 0, echo
+    assert json.loads(echo.out)["mode"] == "ready"
+
+
+# the files
+
+
+def test_the_lines_for_a_robot_are_a_configuration_without_surprises() -> None:
+    config = parse(ROBOT_FILE.read_bytes())
+    assert not warnings(config)
+    assert config.bus.mode == "client"
+    router = config.bus.connect[0].removeprefix("tls/").partition(":")[0]
+    assert config.access.maintainers == (router,)  # `lan add NAME` makes it valid for that name
+
+
+def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() -> None:
+    access = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("access_control"))
+    keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
+    everyone = "acsard/*/"
+    published = {everyone + topic.key for topic in PUBLISHED}
+    late = {everyone + "tf_static/@adv/**"}
+    assert keys["hear"] == published | late
+    services = {f"{everyone}srv/{verb}" for verb in SERVICES}
+    asked = {everyone + topic.pattern for topic in TOPICS if topic.direction == "query"}
+    allowed = keys["ask"] | keys["stop"] | keys["operate"] | keys["maintain"]
+    assert allowed == published | late | asked | services | {everyone + "stop"}
+    assert keys["command"] == {
+        f"{everyone}{kind}/{source}" for kind in ("cmd", "wheel_cmd") for source in SOURCES
+    }

@@ -1,0 +1,72 @@
+"""One booted systemd for all tests here, and in it a board, a commander and the unit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.systemd.container import (
+    PORT,
+    Board,
+    Container,
+    Driver,
+    UnavailableError,
+    build,
+    needs,
+)
+
+
+@pytest.fixture(scope="session")
+def rootfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A small Debian: kept where $ACSARD_TEST_ROOTFS says, else made and removed again."""
+    missing = needs()
+    if missing:
+        pytest.skip(f"cannot boot a systemd: {missing}")
+    kept = os.environ.get("ACSARD_TEST_ROOTFS")
+    where = Path(kept) if kept else tmp_path_factory.mktemp("debian") / "rootfs"
+    try:
+        yield build(where)
+    except UnavailableError as why:
+        pytest.skip(f"cannot make a root file system: {why}")
+    finally:
+        if not kept:
+            shutil.rmtree(where, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def booted(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+    """A systemd with the program and the unit installed."""
+    try:
+        container = Container(rootfs, tmp_path_factory.mktemp("container"))
+        with container:
+            container.install()
+            yield container
+    except UnavailableError as why:
+        pytest.skip(f"cannot boot a systemd: {why}")
+
+
+@pytest.fixture
+def container(booted: Container) -> Iterator[Container]:
+    """The same, with the unit stopped, its usual configuration and no record of failures."""
+    booted.reset()
+    yield booted
+    booted.reset()
+
+
+@pytest.fixture
+def board(container: Container) -> Iterator[Board]:
+    """A serial board at the configured port, whose times can be trusted."""
+    with Board(container) as board:
+        yield board
+    container.path(PORT).unlink(missing_ok=True)
+
+
+@pytest.fixture
+def driver(container: Container) -> Iterator[Driver]:
+    """A client of the bus inside the container; sends zeros until told otherwise."""
+    with Driver(container) as driver:
+        yield driver

@@ -1,0 +1,380 @@
+"""A real systemd in a container: how it is made, booted, looked into and ended.
+
+The container has its own processes, network, mounts and cgroup, so nothing of the host's services
+is touched. Clocks are shared: a monotonic time read on either side means the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tests.system.harness import ROOT, Heard, Program, until
+
+SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
+"""The Debian whose Python is ours, so that our installed packages run in there."""
+
+PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
+
+UNIT = "acsard.service"
+
+HOME = "/opt/acsard"
+
+PORT = "/dev/acsar"
+
+CONFIG = "/etc/acsard/acsard.toml"
+
+USUAL = f'[mcu]\nport = "{PORT}"\n'
+
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
+
+DROP_INS = f"/etc/systemd/system/{UNIT}.d"
+
+
+class UnavailableError(Exception):
+    """This machine cannot do it; why."""
+
+
+def needs() -> str:
+    """What is missing to boot a systemd here; "" when nothing is."""
+    if os.geteuid() != 0:
+        return "not root"
+    missing = [tool for tool in ("mmdebstrap", "systemd-nspawn") if shutil.which(tool) is None]
+    if missing:
+        return f"no {' and no '.join(missing)} (Debian: mmdebstrap, systemd-container)"
+    if sys.version_info[:2] not in SUITES:
+        return f"no Debian has Python {sys.version_info[0]}.{sys.version_info[1]}"
+    return "" if _cgroups() else "no cgroup v2 hierarchy"
+
+
+def _cgroups() -> Path | None:
+    for place in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified")):
+        if (place / "cgroup.procs").exists() and (place / "cgroup.controllers").exists():
+            return place
+    return None
+
+
+def build(where: Path) -> Path:
+    """A root file system at `where`, unless there is one already."""
+    if (where / "usr/lib/systemd/systemd").exists():
+        return where
+    where.parent.mkdir(parents=True, exist_ok=True)
+    leave_out = ("doc", "locale", "man", "info")
+    words = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}"]
+    words += ["--dpkgopt=force-unsafe-io"]
+    words += [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in leave_out]
+    words += [SUITES[sys.version_info[:2]], str(where)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        shutil.rmtree(where, ignore_errors=True)
+        raise UnavailableError(f"mmdebstrap: {done.stderr.strip()[-300:]}")
+    return where
+
+
+class Ran(NamedTuple):
+    """What became of a command in the container."""
+
+    code: int
+    out: str
+    err: str
+
+
+class Container:
+    """A booted systemd; leaving ends it and everything in it."""
+
+    def __init__(self, rootfs: Path, scratch: Path) -> None:
+        self._rootfs, self._log = rootfs, scratch / "console"
+        root = _cgroups()
+        assert root is not None
+        self._cgroup = root / f"acsard-test-{os.getpid()}"
+        self.leader = 0
+        """systemd's process as the host sees it."""
+
+    def __enter__(self) -> Container:
+        try:
+            self._cgroup.mkdir()
+        except OSError as error:
+            raise UnavailableError(f"no cgroup of our own: {error}") from error
+        procs = self._cgroup / "cgroup.procs"
+        words = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(procs), "systemd-nspawn"]
+        words += ["--quiet", "--boot", "--register=no", "--keep-unit", "--private-network"]
+        words += ["--volatile=overlay", "--machine=acsard-test", "--console=pipe"]
+        # Without these systemd cannot enforce IPAddressDeny= and DevicePolicy=.
+        words += ["--capability=CAP_BPF", "--system-call-filter=@memlock bpf"]
+        words += [f"--directory={self._rootfs}"]
+        words += [f"--bind-ro={ROOT / 'acsard'}:{HOME}/src/acsard"]
+        words += [f"--bind-ro={sysconfig.get_path('purelib')}:{HOME}/packages"]
+        settings = {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
+        settings |= {"SYSTEMD_NSPAWN_API_VFS_WRITABLE": "yes"}
+        with self._log.open("wb") as log:
+            self._nspawn = subprocess.Popen(
+                words, env=os.environ | settings, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+        try:
+            self.leader = until(self._find_leader, 10.0, "a systemd")
+            until(self._is_up, 30.0, "systemd has started everything")
+        except AssertionError as error:
+            self.__exit__()
+            console = self._log.read_text(errors="replace")[-500:]
+            raise UnavailableError(f"{error}: {console}") from error
+        # Before this it takes the container's cgroup for the host's.
+        self.run("systemctl", "daemon-reexec")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._nspawn.poll() is None:
+            self._nspawn.send_signal(signal.SIGTERM)
+            try:
+                self._nspawn.wait(10.0)
+            except subprocess.TimeoutExpired:
+                (self._cgroup / "cgroup.kill").write_text("1")
+                self._nspawn.wait(10.0)
+        for directory, _, _ in os.walk(self._cgroup, topdown=False):
+            try:
+                os.rmdir(directory)
+            except OSError:
+                pass  # a process of it is still being taken apart
+
+    def _find_leader(self) -> int:
+        if self._nspawn.poll() is not None:
+            raise AssertionError(f"systemd-nspawn ended with {self._nspawn.returncode}")
+        pids = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text()
+        for pid in map(int, pids.split()):
+            if Path(f"/proc/{pid}/comm").read_text().strip() == "systemd":
+                return pid
+        return 0
+
+    def _is_up(self) -> bool:
+        return self.run("systemctl", "is-system-running").out.strip() in ("running", "degraded")
+
+    def inside(self, *words: str, only: str = "muinpC") -> list[str]:
+        """The words that run a program in there; `only` some of its namespaces."""
+        return ["nsenter", "-t", str(self.leader), *(f"-{kind}" for kind in only), "--", *words]
+
+    def run(self, *words: str) -> Ran:
+        """Run a program in there to its end."""
+        done = subprocess.run(self.inside(*words), capture_output=True, text=True, timeout=60)
+        return Ran(done.returncode, done.stdout, done.stderr)
+
+    def path(self, name: str) -> Path:
+        """A file of the container as the host finds it."""
+        return Path(f"/proc/{self.leader}/root{name}")
+
+    def write(self, name: str, text: str, mode: int = 0o644) -> None:
+        """A file in there."""
+        path = self.path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        path.chmod(mode)
+
+    # the program and its unit
+
+    def install(self) -> None:
+        """What an administrator puts in place; the packages are ours, by a path file."""
+        version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+        packages = f"{HOME}/venv/lib/{version}/site-packages"
+        python = f"{HOME}/venv/bin/python"
+        self.write(f"{HOME}/venv/pyvenv.cfg", "home = /usr/bin\n")
+        self.write(f"{packages}/acsard.pth", f"{HOME}/src\n{HOME}/packages\n")
+        self.write(
+            f"{HOME}/venv/bin/acsard",
+            f"#!{python}\nfrom acsard.cli import entry\n\nentry()\n",
+            0o755,
+        )
+        self.path(python).symlink_to("/usr/bin/python3")
+        deploy = ROOT / "deploy" / "systemd"
+        self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
+        self.write(f"/etc/systemd/system/{UNIT}", (deploy / UNIT).read_text())
+        self.run("systemctl", "daemon-reload")
+
+    def reset(self) -> None:
+        """As after the installation."""
+        self.run("systemctl", "stop", UNIT)
+        if self.path(DROP_INS).exists():
+            shutil.rmtree(self.path(DROP_INS))
+            self.run("systemctl", "daemon-reload")
+        self.run("systemctl", "reset-failed", UNIT)
+        self.write(CONFIG, USUAL)
+
+    def drop_in(self, name: str, text: str) -> None:
+        """A file in the unit's drop-in directory."""
+        self.write(f"{DROP_INS}/{name}", text)
+        self.run("systemctl", "daemon-reload")
+
+    def start(self) -> Ran:
+        """Start the unit; back when it is ready or has failed."""
+        return self.run("systemctl", "start", UNIT)
+
+    def show(self, name: str) -> str:
+        """A property of the unit."""
+        return self.run("systemctl", "show", "--value", "-p", name, UNIT).out.strip()
+
+    def main_pid(self) -> int:
+        """The daemon's process as the host sees it."""
+        procs = self._cgroup / "payload" / "system.slice" / UNIT / "cgroup.procs"
+        return int(procs.read_text().split()[0])
+
+    def waited(self) -> float:
+        """For how long, in all, something in there had work but no processor, s.
+
+        systemd is an ordinary process: what else this machine does comes in between.
+        """
+        try:
+            some = (self._cgroup / "cpu.pressure").read_text().splitlines()[0]
+        except OSError:
+            return 0.0  # a kernel that does not count it
+        return int(some.rpartition("total=")[2]) / 1e6
+
+    def journal(self) -> list[dict[str, Any]]:
+        """What the current or last run of the unit wrote."""
+        self.run("journalctl", "--sync")
+        words = ["journalctl", "-o", "json", f"_SYSTEMD_INVOCATION_ID={self.show('InvocationID')}"]
+        return [json.loads(line) for line in self.run(*words).out.splitlines()]
+
+    def messages(self) -> str:
+        """All that was ever written about the unit."""
+        self.run("journalctl", "--sync")
+        return self.run("journalctl", "-o", "cat", "-u", UNIT).out
+
+    def is_active_again(self, restarts: int) -> None:
+        """Wait for the daemon's return after its `restarts`-th end."""
+        until(
+            lambda: self.show("ActiveState") == "active" and int(self.show("NRestarts")) > restarts,
+            10.0,
+            "the unit runs again",
+        )
+
+
+# Forgets the exclusive lock when nobody has the port open any more, as a real port does; the
+# terminal of a pty lives on with its other end.
+_BOARD = """\
+import fcntl, grp, os, pty, select, sys, termios, time, tty
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+master, slave = pty.openpty()
+name = os.ttyname(slave)
+tty.setraw(slave)
+os.chown(slave, 0, grp.getgrnam("dialout").gr_gid)
+os.chmod(slave, 0o660)
+os.close(slave)
+os.symlink(name, sys.argv[1])
+print("plugged", flush=True)
+held = b""
+while True:
+    try:
+        data = os.read(master, 4096)
+    except OSError:
+        slave = os.open(name, os.O_RDWR | os.O_NOCTTY)
+        fcntl.ioctl(slave, termios.TIOCNXCL)
+        os.close(slave)
+        time.sleep(0.001)
+        continue
+    now = time.monotonic()
+    *lines, held = (held + data).split(b"\\n")
+    for line in lines:
+        if line.startswith(b"a"):
+            os.write(master, line + b"\\n")
+        print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
+"""
+
+
+class Board(Program):
+    """A serial board in the container, in a process ahead of all others: its times can be trusted.
+
+    It answers each command with the speeds asked for.
+    """
+
+    def __init__(self, container: Container) -> None:
+        self._heard: list[Heard] = []
+        container.path(PORT).unlink(missing_ok=True)
+        super().__init__(container.inside("python3", "-c", _BOARD, PORT, only="mnC"), "/")
+
+    def __enter__(self) -> Board:
+        super().__enter__()
+        self.says("plugged")
+        return self
+
+    def since(self, at: float) -> list[Heard]:
+        """The lines after then, without their ends; "-" for an empty one."""
+        for text in self.out[1 + len(self._heard) :]:
+            came, _, line = text.partition(" ")
+            self._heard.append(Heard(float(came), line.encode()))
+        return [heard for heard in self._heard if heard.at > at]
+
+    def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> Heard:
+        """The first line that starts so after then."""
+        return until(
+            lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
+            within,
+            f"{line!r} on the wire",
+        )
+
+
+_DRIVER = """\
+import json, sys, threading, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect", json.dumps({
+    "endpoints": ["tcp/127.0.0.1:7448"], "timeout_ms": -1, "exit_on_failure": False,
+    "retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1},
+}))
+speed = 0.0
+
+def listen():
+    global speed
+    for line in sys.stdin:
+        speed = float(line)
+
+def show(sample):
+    state = json.loads(sample.payload.to_bytes()) if "json" in str(sample.encoding) else None
+    if state is None:
+        import msgspec
+        state = msgspec.msgpack.decode(sample.payload.to_bytes())
+    print(repr(time.monotonic()), state["mode"], flush=True)
+
+threading.Thread(target=listen, daemon=True).start()
+session = zenoh.open(config)
+keep = session.declare_subscriber("acsard/acsar/state", show)
+while True:
+    session.put("acsard/acsar/cmd/app", json.dumps({"linear": {"x": speed}, "angular": {"z": 0.0}}))
+    time.sleep(0.05)
+"""
+
+
+class Driver(Program):
+    """A plain client of the bus in the container's network, sending a speed at 20 Hz."""
+
+    def __init__(self, container: Container) -> None:
+        words = container.inside(sys.executable, "-c", _DRIVER, only="n")
+        super().__init__(words, "/", stdin=subprocess.PIPE)
+
+    def sends(self, speed: float) -> None:
+        """From now on this speed."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{speed}\n".encode())
+        self.process.stdin.flush()
+
+    def states(self, after: float) -> list[tuple[float, str]]:
+        """When each state came after then, and its mode."""
+        told = [line.split(" ", 1) for line in list(self.out)]
+        return [(float(at), mode) for at, mode in told if float(at) > after]
+
+    def drives(self, board: Board, speed: float = 0.5) -> None:
+        """Zeros until they are obeyed, then the speed until the wheels have it."""
+        self.sends(0.0)
+        began = time.monotonic()
+        obeyed = until(
+            lambda: next((at for at, mode in self.states(began) if mode == "driving"), None),
+            10.0,
+            "zeros are obeyed",
+        )
+        self.sends(speed)
+        board.awaits(f"ap{speed / 0.05:05.2f}".encode(), after=obeyed)

@@ -1,0 +1,119 @@
+"""What systemd itself says of the unit, and the drop-ins where they can be tried."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.system.harness import ROOT
+from tests.systemd.container import CONFIG, PORT, UNIT, USUAL, ZERO, Board, Container
+
+pytestmark = pytest.mark.systemd
+
+DEPLOY = ROOT / "deploy" / "systemd"
+
+EXPOSURE = 1.5
+
+ACSARD = "/opt/acsard/venv/bin/acsard"
+
+TLS = "/etc/acsard/tls"
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(container: Container) -> None:
+    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{UNIT}")
+    assert (checked.code, checked.out, checked.err) == (0, "", "")
+
+
+def test_its_exposure_is_small(container: Container) -> None:
+    words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{UNIT}"]
+    text = container.run("systemd-analyze", *words).out.splitlines()[-1]
+    print(text.strip(" →"))
+    assert float(text.partition(f"{UNIT}:")[2].split()[0]) <= EXPOSURE
+
+
+@pytest.mark.parametrize("name", ["lan.conf", "bind-to-device.conf"])
+def test_systemd_finds_nothing_wrong_with_a_drop_in(container: Container, name: str) -> None:
+    container.drop_in(name, (DEPLOY / name).read_text())
+    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{UNIT}")
+    assert (checked.code, checked.out, checked.err) == (0, "", "")
+
+
+def test_with_lan_conf_it_reads_root_s_keys_and_listens_beyond_this_computer(
+    container: Container, board: Board
+) -> None:
+    made = container.run(ACSARD, "lan", "init", "--address", "127.0.0.1")
+    assert made.code == 0, made.err
+    listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
+    container.write(
+        CONFIG, f'mcu.port = "{PORT}"\nbus.listen = {json.dumps(listen)}\nbus.tls = "{TLS}"\n'
+    )
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())
+    started = container.start()
+    assert started.code == 0, started.err + container.messages()
+    viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
+    shown = container.run(ACSARD, "echo", "state", "-n", "1", *viewer)
+    assert shown.code == 0, shown.err
+    assert json.loads(shown.out)["mode"] == "ready"
+
+
+def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
+    container: Container, board: Board
+) -> None:
+    container.path(TLS).mkdir(parents=True, exist_ok=True)
+    container.path(f"{TLS}/key.pem").unlink(missing_ok=True)
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())
+    assert container.start().code != 0
+    # Those of the stop script, which runs after any end.
+    assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
+
+
+# the walls around it
+
+
+def reaches(container: Container, address: str) -> bool:
+    """Somebody with that address of their own gets a connection to the daemon at it."""
+    code = (
+        "import socket, sys; "
+        "socket.create_connection((sys.argv[1], 7448), 1.0, (sys.argv[1], 0)).close()"
+    )
+    return container.run("python3", "-c", code, address).code == 0
+
+
+def test_even_a_bus_that_is_open_by_mistake_is_closed_to_other_computers(
+    container: Container, board: Board
+) -> None:
+    container.run("ip", "address", "replace", "10.9.8.7/32", "dev", "lo")
+    container.write(CONFIG, f'{USUAL}[bus]\nlisten = ["tcp/0.0.0.0:7448"]\ninsecure = true\n')
+    assert container.start().code == 0
+    assert reaches(container, "127.0.0.1")
+    assert not reaches(container, "10.9.8.7")
+    container.run("systemctl", "stop", UNIT)
+    allowed = "[Service]\nIPAddressAllow=10.0.0.0/8\n"
+    container.drop_in("open.conf", allowed)
+    assert container.start().code == 0
+    assert reaches(container, "10.9.8.7"), "it was the unit that closed it"
+
+
+@pytest.mark.parametrize(
+    ("kind", "major", "minor", "code"),
+    [
+        ("ttyUSB", 188, 200, "0"),
+        ("ttyACM", 166, 200, "0"),
+        ("ttyS", 4, 127, "0"),
+        ("fuse", 10, 229, "77"),
+    ],
+)
+def test_serial_ports_may_be_opened_and_no_other_device(
+    container: Container, kind: str, major: int, minor: int, code: str
+) -> None:
+    # None of these has anything behind it, and no driver for the first two need be loaded: one
+    # that may be opened is waited for.
+    container.run("mknod", PORT, "c", str(major), str(minor))
+    try:
+        container.run("chgrp", "dialout", PORT)
+        container.run("chmod", "0660", PORT)
+        container.start()
+        assert container.show("ExecMainStatus") == code, kind
+    finally:
+        container.path(PORT).unlink()

@@ -1,0 +1,186 @@
+"""The stop script by itself: zeros on the configured port at once, and it never hangs."""
+
+from __future__ import annotations
+
+import os
+import pty
+import shutil
+import statistics
+import subprocess
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.system.harness import ROOT, ZERO_LINE
+
+SCRIPT = ROOT / "deploy" / "systemd" / "acsard-stop"
+
+STOP = b"\r\n" + 3 * ZERO_LINE
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("stty") is None or shutil.which("awk") is None, reason="needs stty and awk"
+)
+
+
+class Wire:
+    """A pty: what its slave end is set to, and what came out of its master end."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = pty.openpty()
+        os.set_blocking(self.master, False)
+        self.name = os.ttyname(self.slave)
+
+    def heard(self) -> bytes:
+        try:
+            return os.read(self.master, 65536)
+        except BlockingIOError:
+            return b""
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self.slave)
+
+
+class Ended(NamedTuple):
+    code: int
+    err: str
+    seconds: float
+
+
+@pytest.fixture
+def wire() -> Iterator[Wire]:
+    wire = Wire()
+    yield wire
+    wire.close()
+
+
+def stop(config: Path | str, **env: str) -> Ended:
+    """Run it as systemd would."""
+    words = [str(SCRIPT), *([str(config)] if config else [])]
+    began = time.monotonic()
+    done = subprocess.run(words, capture_output=True, text=True, timeout=5, env=os.environ | env)
+    return Ended(done.returncode, done.stderr, time.monotonic() - began)
+
+
+def config(where: Path, text: str) -> Path:
+    path = where / "acsard.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[mcu]\nport = "PORT"\n',
+        "[mcu]\nport = 'PORT'\n",
+        '[mcu]\nport="PORT"# the left socket\n',
+        '  [ mcu ] # the board\n\t"port"\t=\t"PORT"\n',
+        'mcu.port = "PORT"\n',
+        'mcu . port = "PORT"\n[sim]\nport = "/dev/null"\n',
+        '[sim]\nport = "/dev/null"\n[mcu]\n# port = "/dev/null"\nport = "PORT"\n',
+        '[mcu]\nport = "PORT"\n[mcu.wheels]\nport = "/dev/null"\n',
+        '[mcu]\r\nport = "PORT"\r\nbaud_rate = 115200\r\n',
+        '[mcu]\nport = "PORT"',
+    ],
+)
+def test_it_finds_the_port_however_it_is_written(tmp_path: Path, wire: Wire, text: str) -> None:
+    ended = stop(config(tmp_path, text.replace("PORT", wire.name)))
+    assert (ended.code, ended.err) == (0, "")
+    assert wire.heard() == STOP
+
+
+def test_it_finds_the_port_in_the_reference_configuration(tmp_path: Path, wire: Wire) -> None:
+    text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
+    stop(config(tmp_path, text))
+    assert wire.heard() == STOP
+
+
+def test_it_takes_the_configuration_the_daemon_takes(tmp_path: Path, wire: Wire) -> None:
+    path = config(tmp_path, f'[mcu]\nport = "{wire.name}"\n')
+    assert stop("", ACSARD_CONFIG=str(path)).code == 0
+    assert wire.heard() == STOP
+
+
+def test_it_adds_the_comma_where_the_firmware_wants_one(tmp_path: Path, wire: Wire) -> None:
+    stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = true\n'))
+    assert wire.heard() == b"\r\n" + 3 * ZERO_LINE.replace(b"\r\n", b",\r\n")
+    stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = false # true\n'))
+    assert wire.heard() == STOP
+
+
+@pytest.mark.parametrize(
+    ("text", "speed"),
+    [("", termios.B115200), ("baud_rate = 9600", termios.B9600), ("baud_rate = 57_600", 4097)],
+)
+def test_the_port_is_set_raw_at_its_baud_rate_and_keeps_dtr(
+    tmp_path: Path, wire: Wire, text: str, speed: int
+) -> None:
+    cooked = termios.tcgetattr(wire.slave)
+    cooked[2] |= termios.HUPCL
+    cooked[0] |= termios.IXON
+    termios.tcsetattr(wire.slave, termios.TCSANOW, cooked)
+    stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\n{text}\n'))
+    inputs, outputs, control, local, ispeed, ospeed, _ = termios.tcgetattr(wire.slave)
+    assert (ispeed, ospeed) == (speed, speed)
+    assert not outputs & termios.OPOST
+    assert not local & (termios.ECHO | termios.ICANON | termios.ISIG)
+    assert not inputs & (termios.IXON | termios.IXOFF | termios.ICRNL)
+    assert not control & termios.HUPCL, "closing would reset the board"
+    assert control & termios.CLOCAL
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[mcu]\n",
+        '[mcu]\nport = "sim"\n',
+        '[mcu]\nport = "/dev/no-such-port"\n',
+        '[mcu]\nport = "/etc/passwd"\n',
+        '[mcu]\nport = "/tmp"\n',
+        '[mcu]\nport = "$(touch /tmp/never) -x"\n',
+        "this is no TOML",
+    ],
+)
+def test_without_a_port_it_does_nothing(tmp_path: Path, text: str) -> None:
+    ended = stop(config(tmp_path, text))
+    assert (ended.code, ended.err) == (0, "")
+
+
+def test_without_a_configuration_it_does_nothing(tmp_path: Path) -> None:
+    assert stop(tmp_path / "nothing")[:2] == (0, "")
+
+
+def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wire) -> None:
+    tty.setraw(wire.slave)
+    os.set_blocking(wire.slave, False)
+    try:
+        while True:
+            os.write(wire.slave, b"\r\n" * 100)
+    except BlockingIOError:
+        pass  # it is full
+    ended = stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\n'))
+    print(f"full port: given up after {ended.seconds:.3f} s")
+    assert ended.code == 1
+    assert wire.name in ended.err
+    assert ended.seconds < 1.0
+
+
+def test_a_device_that_is_no_port_is_said(tmp_path: Path) -> None:
+    ended = stop(config(tmp_path, '[mcu]\nport = "/dev/null"\n'))
+    assert ended.code == 1
+    assert "/dev/null" in ended.err
+
+
+def test_it_is_done_within_20_ms(tmp_path: Path, wire: Wire) -> None:
+    text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
+    path = config(tmp_path, text)
+    took = [1000 * stop(path).seconds for _ in range(20)]
+    median = statistics.median(took)
+    print(f"stop script: {min(took):.1f} / {median:.1f} / {max(took):.1f} ms (min/median/max)")
+    assert median < 20.0

@@ -1,0 +1,245 @@
+"""The unit's life in a real systemd: ready, drives, and zeros on the wire after every end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import statistics
+import time
+from typing import NamedTuple
+
+import pytest
+
+from tests.system.harness import until
+from tests.systemd.container import CONFIG, PORT, UNIT, ZERO, Board, Container, Driver
+
+pytestmark = pytest.mark.systemd
+
+TIMES = pytest.mark.parametrize("times", [2, pytest.param(20, marks=pytest.mark.soak)])
+
+WATCHDOG_S = 0.2
+
+STALL_BOUND_S = WATCHDOG_S + 0.32
+
+KILL_BOUND_S = 0.1
+
+DISTURBED_S = 0.03
+"""systemd is an ordinary process: one that waited this long for a processor says nothing of us."""
+
+
+def report(what: str, seconds: list[float]) -> None:
+    """The figures, in ms."""
+    ms = sorted(1000 * second for second in seconds)
+    median = statistics.median(ms)
+    print(f"{what}: {ms[0]:.0f} / {median:.0f} / {ms[-1]:.0f} ms (min/median/max, n={len(ms)})")
+
+
+class Fault(NamedTuple):
+    """What came of one, in seconds."""
+
+    zero: float
+    """Until the first zero line on the wire."""
+    waited: float
+    """How much of that other work of this machine took."""
+    again: float
+    """Until the unit was ready again."""
+
+
+def fault(container: Container, board: Board, driver: Driver, number: signal.Signals) -> Fault:
+    """Drive, send the daemon a signal, and see it come back."""
+    container.run("systemctl", "reset-failed", UNIT)  # the start limit has a test of its own
+    driver.drives(board)
+    restarts = int(container.show("NRestarts"))
+    pid = container.main_pid()
+    waited = container.waited()
+    began = time.monotonic()
+    os.kill(pid, number)
+    zero = board.awaits(ZERO, after=began).at
+    waited = container.waited() - waited
+    container.is_active_again(restarts)
+    again = time.monotonic()
+    # The driver never stopped: neither the stop script nor the next daemon lets it drive on.
+    until(lambda: driver.states(again), 5.0, "the next daemon publishes")
+    moving = [heard for heard in board.since(zero) if heard.line not in (ZERO, b"-")]
+    assert not moving, moving[:3]
+    return Fault(zero - began, waited, again - began)
+
+
+def faults(
+    container: Container, board: Board, driver: Driver, number: signal.Signals, times: int
+) -> list[Fault]:
+    """Many of them, and their figures."""
+    took = [fault(container, board, driver, number) for _ in range(times)]
+    report(f"{number.name} -> first zero", [one.zero for one in took])
+    report("  of it, waiting for a processor", [one.waited for one in took])
+    report(f"{number.name} -> ready again", [one.again for one in took])
+    calm = undisturbed(took)
+    if calm:
+        report(f"{number.name} -> first zero, undisturbed", calm)
+    return took
+
+
+def undisturbed(took: list[Fault]) -> list[float]:
+    """The times to a zero that other work of this machine had no part in."""
+    return [one.zero for one in took if one.waited <= DISTURBED_S]
+
+
+def within(took: list[Fault], bound: float) -> bool:
+    """The bound holds whenever the machine is calm, and mostly when it is not."""
+    mostly = statistics.median_low(one.zero for one in took) <= bound
+    return mostly and max(undisturbed(took), default=0.0) <= bound
+
+
+def test_it_starts_says_it_is_ready_publishes_and_drives(
+    container: Container, board: Board, driver: Driver
+) -> None:
+    began = time.monotonic()
+    started = container.start()
+    ready = time.monotonic() - began
+    first = board.awaits(ZERO).at - began
+    print(f"start: ready after {ready:.3f} s, first line after {first:.3f} s")
+    assert started.code == 0, started.err
+    assert container.show("SubState") == "running"
+    # Without AF_NETLINK it gets this far and then publishes nothing.
+    until(lambda: driver.states(began), 5.0, "it publishes")
+    driver.drives(board)
+    status = "driving 0.5 m/s by app"
+    until(lambda: container.show("StatusText") == status, 3.0, "its status says so")
+    driver.sends(0.0)
+    until(lambda: "0.0 m/s" in container.show("StatusText"), 3.0, "its status follows")
+
+
+def test_only_the_control_loop_is_real_time(container: Container, board: Board) -> None:
+    container.start()
+    pid = container.main_pid()
+    threads = [int(name) for name in os.listdir(f"/proc/{pid}/task")]
+    policies = {tid: os.sched_getscheduler(tid) & ~os.SCHED_RESET_ON_FORK for tid in threads}
+    assert policies.pop(pid) == os.SCHED_FIFO
+    assert policies, "it has other threads"
+    assert set(policies.values()) == {os.SCHED_OTHER}
+
+
+def test_it_has_no_user_no_capabilities_and_no_way_to_gain_any(
+    container: Container, board: Board
+) -> None:
+    container.start()
+    pid = container.main_pid()
+    with open(f"/proc/{pid}/status") as lines:
+        status = dict(line.rstrip("\n").split(":\t", 1) for line in lines if ":\t" in line)
+    assert int(status["Uid"].split()[0]) >= 61184, "a user of its own, which exists only now"
+    assert {status[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
+    assert status["NoNewPrivs"] == "1"
+    assert status["Seccomp"] == "2"
+
+
+@TIMES
+def test_sigkill_is_followed_by_zeros_within_100_ms_and_a_restart(
+    container: Container, board: Board, driver: Driver, times: int
+) -> None:
+    container.start()
+    took = faults(container, board, driver, signal.SIGKILL, times)
+    assert within(took, KILL_BOUND_S)
+
+
+@TIMES
+def test_a_stall_is_ended_by_the_watchdog_with_stacks_and_followed_by_zeros(
+    container: Container, board: Board, driver: Driver, times: int
+) -> None:
+    container.start()
+    first = container.journal()[0]["_SYSTEMD_INVOCATION_ID"]
+    took = faults(container, board, driver, signal.SIGSTOP, times)
+    text = container.run("journalctl", "-o", "cat", f"_SYSTEMD_INVOCATION_ID={first}").out
+    assert "Fatal Python error: Aborted" in text
+    assert 'File "/opt/acsard/src/acsard/runtime/' in text, "where it hung"
+    assert "Watchdog timeout" in container.messages()
+    assert within(took, STALL_BOUND_S)
+
+
+@TIMES
+def test_stop_ramps_down_ends_with_stop_and_exits_0(
+    container: Container, board: Board, driver: Driver, times: int
+) -> None:
+    zeros, ends = [], []
+    for _ in range(times):
+        container.start()
+        driver.drives(board)
+        began = time.monotonic()
+        stopped = container.run("systemctl", "stop", UNIT)
+        ends.append(time.monotonic() - began)
+        assert stopped.code == 0, stopped.err
+        assert container.show("Result") == "success"
+        assert container.show("ExecMainStatus") == "0"
+        assert container.show("ActiveState") == "inactive"
+        lines = [heard for heard in board.since(began) if heard.line != b"-"]
+        ramp = [float(heard.line[2:7]) for heard in lines]
+        assert lines[-1].line == ZERO
+        assert ramp == sorted(ramp, reverse=True), "a monotone fall"
+        assert len({speed for speed in ramp if 0 < speed < 10}) > 5, "a ramp, not a cut"
+        zeros.append(next(heard.at for heard in lines if heard.line == ZERO) - began)
+        container.run("systemctl", "reset-failed", UNIT)
+    report("systemctl stop at 0.5 m/s -> first zero (end of the ramp)", zeros)
+    report("systemctl stop at 0.5 m/s -> stopped", ends)
+    assert max(ends) < 1.5
+
+
+def test_a_bad_configuration_ends_it_with_78_and_it_stays_down(
+    container: Container, board: Board
+) -> None:
+    container.write(CONFIG, f'[mcu]\nport = "{PORT}"\nbaud = 9600\n[control]\nrate = -1\n')
+    began = time.monotonic()
+    started = container.start()
+    print(f"bad configuration: given up after {time.monotonic() - began:.3f} s")
+    assert started.code != 0
+    assert container.show("ExecMainStatus") == "78"
+    assert (container.show("ActiveState"), container.show("SubState")) == ("failed", "failed")
+    assert container.show("NRestarts") == "0"
+    told = "\n".join(str(entry["MESSAGE"]) for entry in container.journal())
+    assert "baud" in told
+    assert "rate" in told
+
+
+def test_a_forbidden_port_ends_it_with_77_and_it_stays_down(
+    container: Container, board: Board
+) -> None:
+    # Followed in there: the link is the container's.
+    container.run("chmod", "0600", PORT)
+    container.start()
+    assert container.show("ExecMainStatus") == "77"
+    assert (container.show("ActiveState"), container.show("SubState")) == ("failed", "failed")
+    assert container.show("NRestarts") == "0"
+
+
+def test_a_missing_port_is_waited_for(container: Container, driver: Driver) -> None:
+    assert container.start().code == 0
+    status = until(lambda: container.show("StatusText"), 3.0, "a status")
+    print(f"status without a board: {status!r}")
+    assert container.show("SubState") == "running"
+    with Board(container) as board:
+        driver.drives(board)
+    container.path(PORT).unlink()
+
+
+def test_the_journal_can_be_asked_for_an_event(container: Container, board: Board) -> None:
+    container.start()
+    until(
+        lambda: any(entry.get("ACSARD_EVENT") == "link_up" for entry in container.journal()),
+        5.0,
+        "link_up",
+    )
+    (started,) = [e for e in container.journal() if e.get("ACSARD_EVENT") == "started"]
+    assert started["ACSARD_PORT"] == PORT
+    assert started["PRIORITY"] == "6"
+    assert started["SYSLOG_IDENTIFIER"] == "acsard"
+    assert started["_SYSTEMD_UNIT"] == UNIT
+
+
+@pytest.mark.soak
+def test_a_daemon_that_cannot_stay_up_is_left_alone_after_ten_starts(
+    container: Container, board: Board
+) -> None:
+    container.start()
+    for restarts in range(9):
+        os.kill(container.main_pid(), signal.SIGKILL)
+        container.is_active_again(restarts)
+    os.kill(container.main_pid(), signal.SIGKILL)
+    until(lambda: container.show("ActiveState") == "failed", 5.0, "it is left alone")

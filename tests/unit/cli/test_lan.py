@@ -1,0 +1,389 @@
+"""`acsard lan`: the certificates it makes, who may read them, and what it says."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from acsard.cli import main
+from acsard.config import parse
+from acsard.runtime.exits import Exit
+
+ROLES = ("viewer", "operator", "maintainer")
+
+
+def lan(*words: str) -> int:
+    """Run `acsard lan`; how it ended."""
+    try:
+        return main(["lan", *words])
+    except SystemExit as end:  # the parser's way out
+        return int(end.code or 0)
+
+
+def certificate(directory: Path, name: str = "certificate.pem") -> x509.Certificate:
+    return x509.load_pem_x509_certificate((directory / name).read_bytes())
+
+
+def common_name(name: x509.Name) -> str:
+    (attribute,) = name.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(attribute.value)
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    """All files below, by name."""
+    found = (path for path in directory.rglob("*") if path.is_file())
+    return {str(path.relative_to(directory)): path.read_bytes() for path in found}
+
+
+def tables(printed: str) -> bytes:
+    """The lines of acsard.toml among those printed."""
+    lines = printed.splitlines()
+    keep, inside = [], False
+    for line in lines:
+        inside = line.startswith("[") or (inside and " = " in line)
+        keep += [line] if inside else []
+    return "\n".join(keep).encode()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `lan init` makes; only to be looked at."""
+    directory = tmp_path_factory.mktemp("lan") / "tls"
+    address = ("--address", "192.0.2.7", "--address", "robot.example", "--address", "2001:db8::7")
+    assert lan("init", "--directory", str(directory), *address, "--days", "30") == 0
+    return directory
+
+
+@pytest.fixture(name="own")
+def _own(made: Path, tmp_path: Path) -> Path:
+    """The same again, to be changed."""
+    return Path(shutil.copytree(made, tmp_path / "tls"))
+
+
+PLACES = (".", *(f"clients/{role}" for role in ROLES))
+
+
+# what is made
+
+
+def test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role(made: Path) -> None:
+    each = ("ca.pem", "certificate.pem", "key.pem")
+    expected = {f"clients/{role}/{name}" for role in ROLES for name in each}
+    assert set(files(made)) == {*expected, *each, "ca-key.pem"}
+
+
+def test_only_the_owner_may_read_a_key_and_everybody_a_certificate(made: Path) -> None:
+    for name in files(made):
+        mode = stat.S_IMODE((made / name).stat().st_mode)
+        assert mode == (0o600 if "key" in name else 0o644), name
+
+
+def test_each_place_has_the_certificate_of_the_one_authority(made: Path) -> None:
+    authority = (made / "ca.pem").read_bytes()
+    for place in PLACES:
+        assert (made / place / "ca.pem").read_bytes() == authority
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_key_belongs_to_its_certificate(made: Path, place: str) -> None:
+    key = load_pem_private_key((made / place / "key.pem").read_bytes(), None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    assert key.curve.name == "secp256r1"
+    assert key.public_key() == certificate(made / place).public_key()
+
+
+@pytest.mark.parametrize(
+    ("place", "name"), [(".", "robot"), *((f"clients/{role}", role) for role in ROLES)]
+)
+def test_the_common_name_is_whose_it_is(made: Path, place: str, name: str) -> None:
+    assert common_name(certificate(made / place).subject) == name
+
+
+def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) -> None:
+    authority = certificate(made, "ca.pem")
+    authority.verify_directly_issued_by(authority)
+    basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
+    assert basic.critical
+    assert (basic.value.ca, basic.value.path_length) == (True, 0)
+    usage = authority.extensions.get_extension_for_class(x509.KeyUsage).value
+    assert (usage.key_cert_sign, usage.digital_signature) == (True, False)
+    for place in PLACES:
+        issued = certificate(made / place)
+        issued.verify_directly_issued_by(authority)
+        assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        usage = issued.extensions.get_extension_for_class(x509.KeyUsage).value
+        assert (usage.key_cert_sign, usage.digital_signature) == (False, True)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_certificate_serves_at_both_ends_of_a_link(made: Path, place: str) -> None:
+    usage = certificate(made / place).extensions.get_extension_for_class(x509.ExtendedKeyUsage)
+    assert set(usage.value) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+
+
+def test_the_robot_is_known_by_its_names_and_the_addresses_given(made: Path) -> None:
+    found = certificate(made).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    host = os.uname().nodename
+    assert {host, f"{host}.local", "localhost", "robot.example"} <= set(
+        found.get_values_for_type(x509.DNSName)
+    )
+    given = {ipaddress.ip_address(text) for text in ("127.0.0.1", "192.0.2.7", "2001:db8::7")}
+    assert given <= set(found.get_values_for_type(x509.IPAddress))
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_certificate_holds_from_a_little_before_now_for_the_days_asked(
+    made: Path, place: str
+) -> None:
+    now, issued = datetime.now(UTC), certificate(made / place)
+    assert now - timedelta(hours=2) < issued.not_valid_before_utc < now
+    assert abs(issued.not_valid_after_utc - now - timedelta(days=30)) < timedelta(minutes=10)
+    assert certificate(made, "ca.pem").not_valid_after_utc > issued.not_valid_after_utc
+
+
+def test_no_two_certificates_have_the_same_serial_number(made: Path) -> None:
+    numbers = [certificate(made / place).serial_number for place in PLACES]
+    assert len({*numbers, certificate(made, "ca.pem").serial_number}) == len(PLACES) + 1
+
+
+# keys are nobody's business, at no time
+
+
+WATCHED = """\
+import os, sys
+from acsard.cli import main
+def hook(event, arguments):
+    if event in ("os.chmod", "os.rename", "os.link"):
+        print(event, arguments[0], file=sys.stderr)
+sys.addaudithook(hook)
+os.umask(0)
+sys.exit(main(["lan", *sys.argv[1:]]))
+"""
+"""Takes nothing away from the modes files are made with, and tells when one is changed later."""
+
+
+def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Path) -> None:
+    key = own / "key.pem"
+    key.chmod(0o666)
+    words = ["init", "--force", "--directory", str(own)]
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, *words], capture_output=True, text=True, timeout=30.0
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in files(own):
+        if "key" in name:
+            assert stat.S_IMODE((own / name).stat().st_mode) == 0o600, name
+
+
+def test_a_key_is_not_written_through_a_link_that_lies_in_its_place(
+    own: Path, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("untouched")
+    (own / "key.pem").unlink()
+    (own / "key.pem").symlink_to(elsewhere)
+    assert lan("init", "--force", "--directory", str(own)) == 0
+    assert elsewhere.read_text() == "untouched"
+    assert not (own / "key.pem").is_symlink()
+
+
+# what is there already
+
+
+def test_init_overwrites_nothing_without_force(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files(own)
+    assert lan("init", "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "--force" in said.err
+    assert "acsard lan add" in said.err
+
+
+def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of(own: Path) -> None:
+    old = certificate(own / "clients/operator")
+    assert lan("init", "--force", "--directory", str(own)) == 0
+    with pytest.raises(InvalidSignature):
+        old.verify_directly_issued_by(certificate(own, "ca.pem"))
+    certificate(own / "clients/operator").verify_directly_issued_by(certificate(own, "ca.pem"))
+
+
+def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: Path) -> None:
+    before = files(own)
+    assert lan("add", "anna", "--role", "operator", "--directory", str(own), "--days", "7") == 0
+    after = files(own)
+    assert {name: after[name] for name in before} == before
+    new = own / "clients/anna"
+    assert {path.name for path in new.iterdir()} == {"ca.pem", "certificate.pem", "key.pem"}
+    assert stat.S_IMODE((new / "key.pem").stat().st_mode) == 0o600
+    issued = certificate(new)
+    assert common_name(issued.subject) == "anna"
+    issued.verify_directly_issued_by(certificate(own, "ca.pem"))
+    left = issued.not_valid_after_utc - datetime.now(UTC)
+    assert abs(left - timedelta(days=7)) < timedelta(minutes=10)
+
+
+def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(own)
+    assert lan("add", "viewer", "--role", "operator", "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    assert "exists" in capsys.readouterr().err
+
+
+# what it says
+
+
+def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lan("init", "--force", "--directory", str(own)) == 0
+    config = parse(tables(capsys.readouterr().out))
+    assert config.bus.tls == str(own)
+    assert not config.bus.insecure
+    assert [endpoint.partition("/")[0] for endpoint in config.bus.listen] == ["tcp", "tls"]
+    assert (config.access.viewers, config.access.operators) == (("viewer",), ("operator",))
+    assert config.access.maintainers == ("maintainer",)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        *(("anna", role) for role in ROLES),
+        ("laptop anna", "viewer"),
+        ('the "old" one', "viewer"),
+        ("back\\slash", "viewer"),
+    ],
+)
+def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
+    own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
+) -> None:
+    assert lan("add", name, "--role", role, "--directory", str(own)) == 0
+    printed = tables(capsys.readouterr().out)
+    assert set(tomllib.loads(printed.decode())) == {"access"}
+    access = parse(printed).access
+    listed = {"viewer": access.viewers, "operator": access.operators}
+    listed |= {"maintainer": access.maintainers}
+    assert listed == {r: (r, name) if r == role else (r,) for r in ROLES}
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", ".", "..", "a/b", "../viewer", "/tmp/x", "two\nlines", "nul\0", "x" * 65, "J\u00f6rg"],
+    ids=ascii,
+)
+def test_what_cannot_name_a_certificate_is_refused_in_words_and_leaves_nothing(
+    own: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    before = sorted(own.parent.rglob("*"))
+    assert lan("add", "--role", "viewer", "--directory", str(own), "--", name) == Exit.USAGE
+    assert "not a name for a certificate" in capsys.readouterr().err
+    assert sorted(own.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("days", ["0", "-1", "99999999", "soon"])
+def test_days_that_no_certificate_can_hold_are_refused_in_words_and_leave_nothing(
+    own: Path, capsys: pytest.CaptureFixture[str], days: str
+) -> None:
+    before = sorted(own.parent.rglob("*"))
+    words = ("--directory", str(own), f"--days={days}")
+    assert lan("add", "anna", "--role", "viewer", *words) == Exit.USAGE
+    assert lan("init", "--force", *words) == Exit.USAGE
+    assert "days" in capsys.readouterr().err
+    assert sorted(own.parent.rglob("*")) == before
+
+
+def test_an_address_that_is_none_is_refused_in_words_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--directory", str(tmp_path / "tls"), "--address", "r\u00f6bot")
+    assert lan("init", *words) == Exit.USAGE
+    assert "address" in capsys.readouterr().err
+    assert files(tmp_path) == {}
+
+
+def test_a_role_that_is_none_is_refused(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lan("add", "anna", "--role", "king", "--directory", str(own)) == Exit.USAGE
+    assert "viewer" in capsys.readouterr().err
+
+
+def test_add_without_an_authority_says_what_makes_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--role", "viewer", "--directory", str(tmp_path / "none"))
+    assert lan("add", "anna", *words) == Exit.FAILURE
+    assert "acsard lan init" in capsys.readouterr().err
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize("name", ["ca.pem", "ca-key.pem"])
+def test_add_with_a_broken_authority_says_so(
+    own: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (own / name).write_text("not what it should be")
+    before = sorted(own.rglob("*"))
+    assert lan("add", "anna", "--role", "viewer", "--directory", str(own)) == Exit.FAILURE
+    assert "cannot use the authority" in capsys.readouterr().err
+    assert sorted(own.rglob("*")) == before
+
+
+AS_NOBODY = """\
+import os, sys
+import acsard.cli.certificates
+from acsard.cli import main
+try:
+    main(["lan", "init", "--help"])  # nobody may not be let read what is imported late
+except SystemExit:
+    pass
+if os.geteuid() == 0:
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+sys.exit(main(["lan", *sys.argv[1:]]))
+"""
+
+
+@pytest.fixture
+def locked() -> Iterator[Path]:
+    """A directory all may enter and nobody may write to; not in one that only root may enter."""
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        directory.chmod(0o555)
+        yield directory
+        directory.chmod(0o755)
+
+
+@pytest.mark.parametrize("below", [".", "tls"])
+@pytest.mark.parametrize("words", [["init"], ["add", "anna", "--role", "viewer"]], ids=str)
+def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
+    locked: Path, below: str, words: list[str]
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", AS_NOBODY, *words, "--directory", str(locked / below)],
+        capture_output=True,
+        text=True,
+        timeout=30.0,
+    )
+    assert done.returncode == Exit.NO_PERMISSION, done
+    assert "--directory" in done.stderr
+    assert list(locked.iterdir()) == []
