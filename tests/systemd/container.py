@@ -110,7 +110,8 @@ class Container:
         # Without these systemd cannot enforce IPAddressDeny= and DevicePolicy=.
         words += ["--capability=CAP_BPF", "--system-call-filter=@memlock bpf"]
         words += [f"--directory={self._rootfs}"]
-        words += [f"--bind-ro={ROOT / 'acsard'}:{HOME}/src/acsard"]
+        ours = ("acsard", "deploy", "acsard.toml")
+        words += [f"--bind-ro={ROOT / name}:{HOME}/src/{name}" for name in ours]
         words += [f"--bind-ro={sysconfig.get_path('purelib')}:{HOME}/packages"]
         settings = {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
         settings |= {"SYSTEMD_NSPAWN_API_VFS_WRITABLE": "yes"}
@@ -190,6 +191,10 @@ class Container:
             0o755,
         )
         self.path(python).symlink_to("/usr/bin/python3")
+        self.install_unit()
+
+    def install_unit(self) -> None:
+        """What `acsard service install` would write, without starting it."""
         deploy = ROOT / "deploy" / "systemd"
         self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
         self.write(f"/etc/systemd/system/{UNIT}", (deploy / UNIT).read_text())

@@ -1,0 +1,104 @@
+"""`acsard service` in a real systemd: what it installs runs, what it removes leaves nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.systemd.container import UNIT, Container
+
+pytestmark = pytest.mark.systemd
+
+ACSARD = "/opt/acsard/venv/bin/acsard"
+PLACES = ("/etc", "/opt/acsard/bin")
+CONFIGURATION = "/etc/acsard/acsard.toml"
+
+
+@pytest.fixture
+def bare(container: Container) -> Iterator[Container]:
+    """A container with the program alone, as after pip."""
+    for path in (f"/etc/systemd/system/{UNIT}", "/opt/acsard/bin/acsard-stop", CONFIGURATION):
+        container.path(path).unlink()
+    for directory in ("/opt/acsard/bin", "/etc/acsard"):
+        container.path(directory).rmdir()
+    container.run("systemctl", "daemon-reload")
+    yield container
+    container.run(ACSARD, "service", "uninstall", "--force")
+    container.install_unit()
+
+
+def listing(container: Container) -> set[str]:
+    """Every file of ours and of the administrator, with its size."""
+    found = set()
+    for place in PLACES:
+        for path in container.path(place).rglob("*"):
+            size = path.lstat().st_size if path.is_file() else 0
+            found.add(f"{path.relative_to(container.path('/'))} {size}")
+    return found
+
+
+def written(out: str) -> list[str]:
+    return [line.split()[1] for line in out.splitlines() if line.startswith("write")]
+
+
+def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Container) -> None:
+    before = listing(bare)
+    done = bare.run(ACSARD, "service", "install", "--dry-run")
+    assert done.code == 0, done.err
+    assert listing(bare) == before
+    assert written(done.out) == [
+        f"/etc/systemd/system/{UNIT}",
+        "/opt/acsard/bin/acsard-stop",
+        "/etc/udev/rules.d/70-acsar.rules",
+        CONFIGURATION,
+    ]
+    assert f"run     systemctl enable --now {UNIT}" in done.out
+
+
+def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> None:
+    before = listing(bare)
+    done = bare.run(ACSARD, "service", "install")
+    assert done.code == 0, done.out + done.err
+    assert bare.show("ActiveState") == "active"
+    assert "/dev/acsar" in bare.show("StatusText")  # waits for the board
+    assert bare.show("UnitFileState") == "enabled"
+    status = bare.run(ACSARD, "service", "status")
+    assert (status.code, status.out.count("as installed")) == (0, 4)
+    gone = bare.run(ACSARD, "service", "uninstall")
+    assert gone.code == 0, gone.out + gone.err
+    assert listing(bare) == before
+    assert bare.show("LoadState") == "not-found"
+    assert bare.run(ACSARD, "service", "status").code == 1
+
+
+def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:
+    unit = f"/etc/systemd/system/{UNIT}"
+    bare.write(unit, "[Service]\nExecStart=/bin/true\n")
+    refused = bare.run(ACSARD, "service", "install")
+    assert refused.code == 1
+    assert unit in refused.err
+    assert not bare.path(CONFIGURATION).exists()
+    kept = bare.run(ACSARD, "service", "uninstall")
+    assert f"keep    {unit}" in kept.out
+    assert bare.path(unit).read_text().endswith("/bin/true\n")
+    assert bare.run(ACSARD, "service", "install", "--force").code == 0
+    assert bare.show("ActiveState") == "active"
+
+
+def test_a_configuration_that_was_written_is_kept(bare: Container) -> None:
+    own = '[robot]\nid = "mine"\n'
+    bare.write(CONFIGURATION, own)
+    assert bare.run(ACSARD, "service", "install").code == 0
+    assert bare.path(CONFIGURATION).read_text() == own
+    assert f"keep    {CONFIGURATION}" in bare.run(ACSARD, "service", "uninstall").out
+    assert bare.path(CONFIGURATION).read_text() == own
+
+
+def test_only_root_installs(bare: Container) -> None:
+    asked = f"setpriv --reuid=65534 {ACSARD} service install"
+    done = bare.run("sh", "-c", asked)
+    assert done.code == 77
+    assert "sudo" in done.err
+    assert not Path(bare.path(CONFIGURATION)).exists()
