@@ -35,7 +35,6 @@ TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 """The liveliness tokens of the ROS trees."""
 
 SPOKEN = (
-    "put",
     "declare_subscriber",
     "declare_queryable",
     "reply",
@@ -46,25 +45,39 @@ SPOKEN = (
 """The messages a daemon sends by itself: data, answers, and what it has and listens to."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {
-    "viewer": ("speak", "watch", "appear", "ask", "halt"),
-    "operator": ("speak", "watch", "appear", "ask", "halt", "command", "operate"),
-    "maintainer": ("speak", "watch", "appear", "ask", "halt", "command", "operate", "maintain"),
+    "viewer": ("speak", "tell", "watch", "ask", "halt"),
+    "operator": ("speak", "tell", "watch", "ask", "halt", "command", "operate"),
+    "maintainer": (
+        "speak",
+        "tell",
+        "watch",
+        "appear",
+        "ask",
+        "halt",
+        "command",
+        "operate",
+        "maintain",
+    ),
 }
-"""The rules each role has."""
+"""The rules each role has. A router is a maintainer, and tells of other robots that are alive."""
 
-LOCAL = (*GRANTS["maintainer"], "look", "err")
-"""Who is at the machine may also look with any wildcard, and be wrong: what is put on other keys
-is refused in code, which says why and counts it."""
+LOCAL = (*GRANTS["maintainer"], "look", "overhear", "err", "forge")
+"""Who is at the machine may also look with any wildcard, hear commands, and be wrong: what is put
+on other keys is refused in code, which says why and counts it; but nobody speaks in the robot's
+place."""
 
 
 Flow = Literal["ingress", "egress"]
+
+Permission = Literal["allow", "deny"]
+"""Where both hold, Zenoh denies."""
 
 
 class Rule(TypedDict):
     """One rule of Zenoh's `access_control`."""
 
     id: str
-    permission: Literal["allow"]
+    permission: Permission
     flows: list[Flow]
     messages: list[str]
     key_exprs: list[str]
@@ -149,6 +162,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     maintained = [*services("maintainer"), keys.config, *keys.parameters, keys.all]
     rules = (
         _rule("speak", "egress", SPOKEN, [*answered, *keys.heard, *tokens]),
+        _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
+        _rule("overhear", "egress", ["put"], keys.heard),
         _rule("watch", "ingress", watching, seen),
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.kept]),
         _rule(
@@ -163,14 +178,21 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("maintain", "ingress", ["query"], maintained),
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
+        _rule("forge", "ingress", ["put", "delete"], [*answered, *tokens], "deny"),
     )
     return {rule["id"]: rule for rule in rules}
 
 
-def _rule(name: str, flow: Flow, messages: Sequence[str], keys: Sequence[str]) -> Rule:
+def _rule(
+    name: str,
+    flow: Flow,
+    messages: Sequence[str],
+    keys: Sequence[str],
+    permission: Permission = "allow",
+) -> Rule:
     return {
         "id": name,
-        "permission": "allow",
+        "permission": permission,
         "flows": [flow],
         "messages": list(messages),
         "key_exprs": list(dict.fromkeys(keys)),

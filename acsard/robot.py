@@ -149,20 +149,23 @@ class Robot:
         else:
             self._linked_once = True
             self._life.link(up=True)
-        return tuple([sample for line in feedback if (sample := self._believe(line, events))])
+        now_ns = inputs.now.mono_ns
+        return tuple(
+            [sample for line in feedback if (sample := self._believe(line, now_ns, events))]
+        )
 
-    def _believe(self, line: Feedback, events: list[Event]) -> Sample | None:
+    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Sample | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
         if why:
             self.counters["line_impossible"] += 1
             self._lost_dt += line.dt
             if self._sanity.doubtful:
-                self._fault(f"impossible feedback: {why}", events)
+                self._fault(f"impossible feedback: {why}", now_ns, events)
             return None
         fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
         if fault:
-            self._fault(fault, events)
+            self._fault(fault, now_ns, events)
         lost, self._lost_dt = self._lost_dt, 0.0
         if lost > MAX_DT:
             line = replace(line, gap=line.gap + lost)  # too long to guess how it moved
@@ -175,7 +178,8 @@ class Robot:
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
             self._limiter.cut()  # STOP went out in the line's place
-            self._fault(f"the guard replaced a line: {inputs.guard_trip}", events)
+            trip = f"the guard replaced a line: {inputs.guard_trip}"
+            self._fault(trip, inputs.now.mono_ns, events)
         if inputs.leaving and self._life.mode is not Mode.LEAVING:
             self._life.fire(Trigger.LEAVE)
             events.append(Event("leaving", "ramping to zero, then STOP"))
@@ -219,8 +223,8 @@ class Robot:
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
-    def _fault(self, why: str, events: list[Event]) -> None:
-        if self._life.fault(why):
+    def _fault(self, why: str, now_ns: int, events: list[Event]) -> None:
+        if self._life.fault(why, now_ns):
             self._arbiter.require_neutral(self._limited_ns)
             events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
@@ -229,6 +233,8 @@ class Robot:
     def _hear(self, inputs: Inputs) -> None:
         for refusal in inputs.refusals:
             self._refuse(refusal)
+            if refusal.source:
+                self._arbiter.notice(refusal.source, refusal.voice, refusal.arrived_ns)
         for command in inputs.commands:
             reason = self._arbiter.accept(command)
             if reason:

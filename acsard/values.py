@@ -84,7 +84,8 @@ class Command(Struct, frozen=True):
     """A velocity wish of one commander.
 
     `arrived_ns` is the monotonic time of arrival and alone decides the age. `stamp_ns` is the
-    sender's own wall clock, if it gave one; `sender` tells whose clock that is.
+    sender's own wall clock, if it gave one; `sender` tells whose clock that is. `voice` is who
+    sent it, as far as the envelope says.
     """
 
     source: str
@@ -92,6 +93,9 @@ class Command(Struct, frozen=True):
     arrived_ns: int
     stamp_ns: int | None = None
     sender: str = ""
+    voice: str = ""
+    cancelled: bool = False
+    """The twist is zero only because what was asked for cancels out: nobody let go."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose"]
@@ -120,6 +124,10 @@ class Refusal(Struct, frozen=True):
 
     reason: str
     text: str
+    source: str = ""
+    voice: str = ""
+    arrived_ns: int = 0
+    """Whose command it would have been, as far as that is known."""
 
 
 class Event(Struct, frozen=True):

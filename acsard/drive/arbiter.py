@@ -1,9 +1,10 @@
 """Many commanders -> one command: priority, age, neutral first.
 
 The rules (SAFETY): the live source of the highest priority is heard; among equals the one who
-came first keeps the robot until it falls silent; a source that may not drive yet holds its place
-with zero, so that nobody below it drives past it. Every refusal has a name to be counted under
-and every waiting source has a sentence.
+came first keeps the robot until it falls silent, and so among the senders of one source; a source
+that may not drive yet holds its place with zero, so that nobody below it drives past it. Each
+sender must be neutral for itself. Every refusal has a name to be counted under and every waiting
+source has a sentence.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ DRIFT = 2e-4
 MAX_SENDERS = 1024
 """Clocks remembered at once; the one heard longest ago goes first."""
 
+MAX_VOICES = 16
+"""Senders remembered of one source; those that may not drive go first."""
 
 REASONS = {
     "unknown_source": "not one of commands.sources",
@@ -93,30 +96,72 @@ class Freshness:
         return delay - least
 
 
+class _Voice:
+    """One sender of a source: two programs, or two people, on one key are two voices."""
+
+    def __init__(self, arrived_ns: int, armed: bool) -> None:
+        self.twist = REST
+        self.arrived_ns: int | None = None
+        self.came_ns = arrived_ns
+        """First command since it was last silent: who came first."""
+        self.armed = armed
+        self.heard = False
+        """A command of it has counted since neutral was last required."""
+        self.noticed_ns = 0
+        """Last sign of it, whether that counted or not."""
+        self.stamp_ns: int | None = None
+        """When it says that it sent the last command that counted."""
+
+
 class _Commander:
     """What is known of one configured source."""
 
-    def __init__(self, settings: Source) -> None:
+    def __init__(self, settings: Source, neutral_first: bool) -> None:
         self.settings = settings
         self.timeout_ns = int(settings.timeout * NS_PER_S)
-        self.twist = REST
-        self.arrived_ns: int | None = None
-        self.came_ns = 0
-        """First command since it was last silent: who came first among equals."""
-        self.armed = False
-        self.heard_ns: int | None = None
-        """Last command since neutral was last required."""
+        self._neutral_first = neutral_first
+        self.voices: dict[str, _Voice] = {}
 
-    def live(self, now_ns: int) -> bool:
-        return self.arrived_ns is not None and now_ns - self.arrived_ns <= self.timeout_ns
+    def voice(self, name: str, now_ns: int) -> _Voice:
+        """The sender of this name; the one of least account makes room for a new one."""
+        known = self.voices.get(name)
+        if known is None:
+            known = self.voices[name] = _Voice(now_ns, armed=not self._neutral_first)
+            if len(self.voices) > MAX_VOICES:
+                others = [other for other in self.voices if other != name]
+                del self.voices[min(others, key=lambda other: self._account(other))]
+        return known
+
+    def _account(self, name: str) -> tuple[bool, int]:
+        voice = self.voices[name]
+        return voice.armed, voice.noticed_ns
+
+    def live(self, voice: _Voice, now_ns: int) -> bool:
+        return voice.arrived_ns is not None and now_ns - voice.arrived_ns <= self.timeout_ns
+
+    def speaking(self, now_ns: int) -> _Voice | None:
+        """Who of the live ones is followed: who may drive, and of those who came first."""
+        live = [voice for voice in self.voices.values() if self.live(voice, now_ns)]
+        return min(live, key=lambda voice: (not voice.armed, voice.came_ns), default=None)
+
+    def latest_ns(self) -> int | None:
+        """When a command last counted, of whichever voice."""
+        times = [v.arrived_ns for v in self.voices.values() if v.arrived_ns is not None]
+        return max(times, default=None)
+
+    def forget(self) -> None:
+        """Every voice must be neutral once before it drives again."""
+        for voice in self.voices.values():
+            voice.arrived_ns = voice.stamp_ns = None
+            voice.heard = False
+            voice.armed = not self._neutral_first
 
 
 class Arbiter:
     """Holds the latest command of each source and chooses whose is followed."""
 
     def __init__(self, commands: CommandsConfig) -> None:
-        self._neutral_first = commands.neutral_first
-        self._commanders = {s.name: _Commander(s) for s in commands.sources}
+        self._commanders = {s.name: _Commander(s, commands.neutral_first) for s in commands.sources}
         self._ranking = sorted(self._commanders.values(), key=lambda c: -c.settings.priority)
         self._holder: _Commander | None = None
         self._since_ns = 0
@@ -130,8 +175,7 @@ class Arbiter:
         """
         self._since_ns = since_ns
         for commander in self._ranking:
-            commander.arrived_ns = commander.heard_ns = None
-            commander.armed = not self._neutral_first
+            commander.forget()
         self._holder = None
 
     def accept(self, command: Command) -> str:
@@ -139,6 +183,29 @@ class Arbiter:
         commander = self._commanders.get(command.source)
         if commander is None:
             return "unknown_source"
+        now_ns, twist = command.arrived_ns, command.twist
+        voice = commander.voice(command.voice, now_ns)
+        reason = self._objection(command, commander)
+        if reason:
+            voice.noticed_ns = now_ns
+            return reason
+        if not voice.armed and now_ns >= self._since_ns:
+            still = twist == REST and not command.cancelled
+            voice.armed = still or self._paused(command, voice, commander.timeout_ns)
+            voice.heard = True
+        voice.noticed_ns = now_ns
+        if not commander.live(voice, now_ns):
+            voice.came_ns = now_ns
+        voice.twist, voice.arrived_ns, voice.stamp_ns = twist, now_ns, command.stamp_ns
+        return ""
+
+    def notice(self, source: str, voice: str, arrived_ns: int) -> None:
+        """A command that could not even be read: no sender who does that is silent."""
+        commander = self._commanders.get(source)
+        if commander is not None and voice in commander.voices:
+            commander.voices[voice].noticed_ns = arrived_ns
+
+    def _objection(self, command: Command, commander: _Commander) -> str:
         twist = command.twist
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             return "not_finite"
@@ -148,51 +215,64 @@ class Arbiter:
             )
             if late > commander.timeout_ns:
                 return "stale"
-        if not commander.armed and command.arrived_ns >= self._since_ns:
-            heard, now_ns = commander.heard_ns, command.arrived_ns
-            paused = heard is not None and now_ns - heard > commander.timeout_ns
-            commander.armed = paused or twist == REST
-            commander.heard_ns = now_ns
-        if not commander.live(command.arrived_ns):
-            commander.came_ns = command.arrived_ns
-        commander.twist, commander.arrived_ns = twist, command.arrived_ns
         return ""
+
+    @staticmethod
+    def _paused(command: Command, voice: _Voice, timeout_ns: int) -> bool:
+        """It was heard, and then was silent by its own doing and not the network's."""
+        if not voice.heard or command.arrived_ns - voice.noticed_ns <= timeout_ns:
+            return False
+        sent, before = command.stamp_ns, voice.stamp_ns
+        return sent is None or before is None or sent - before > timeout_ns
 
     def choose(self, now_ns: int) -> Choice:
         """Whose command counts now, and which."""
-        live = [commander for commander in self._ranking if commander.live(now_ns)]
-        chosen = min(live, key=lambda c: (-c.settings.priority, c.came_ns), default=None)
-        self._holder = chosen
-        if chosen is None:
+        live = [(c, v) for c in self._ranking if (v := c.speaking(now_ns)) is not None]
+        if not live:
+            self._holder = None
             return Choice("", None, "no commands: no source has sent one within its timeout")
+        chosen, voice = min(live, key=lambda one: (-one[0].settings.priority, one[1].came_ns))
+        self._holder = chosen
         name = chosen.settings.name
-        if not chosen.armed:
+        if not voice.armed:
             return Choice(name, None, self._wait(chosen))
-        return Choice(name, chosen.twist, f"commanded by {name}", chosen.arrived_ns)
+        return Choice(name, voice.twist, f"commanded by {name}", voice.arrived_ns)
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
         """What each source is doing and waiting for, highest priority first."""
-        return tuple(
-            SourceStatus(
-                c.settings.name,
-                c.settings.priority,
-                None if c.arrived_ns is None else max(0, now_ns - c.arrived_ns) / NS_PER_S,
-                self._waits_for(c, now_ns),
-            )
-            for c in self._ranking
+        return tuple(self._status(commander, now_ns) for commander in self._ranking)
+
+    def _status(self, commander: _Commander, now_ns: int) -> SourceStatus:
+        latest = commander.latest_ns()
+        return SourceStatus(
+            commander.settings.name,
+            commander.settings.priority,
+            None if latest is None else max(0, now_ns - latest) / NS_PER_S,
+            self._waits_for(commander, now_ns),
         )
 
     def _waits_for(self, commander: _Commander, now_ns: int) -> str:
-        holder = self._holder
-        if not commander.live(now_ns):
+        holder, voice = self._holder, commander.speaking(now_ns)
+        if voice is None:
             return "a command"
-        if not commander.armed:
+        if not voice.armed:
             return self._wait(commander)
         if holder is None or commander is holder:
-            return ""
+            return self._others(commander, voice, now_ns)
         if holder.settings.priority == commander.settings.priority:
             return f"{holder.settings.name}, of the same priority, came first: until it is silent"
         return f"{holder.settings.name} has the higher priority: until it is silent"
+
+    def _others(self, commander: _Commander, voice: _Voice, now_ns: int) -> str:
+        """What the other senders of a source that is followed wait for; "" without any."""
+        others = [
+            other
+            for other in commander.voices.values()
+            if other is not voice and commander.live(other, now_ns)
+        ]
+        if not others:
+            return ""
+        return f"{len(others)} more of its senders: the first until it is silent"
 
     @staticmethod
     def _wait(commander: _Commander) -> str:

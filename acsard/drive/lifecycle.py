@@ -28,10 +28,11 @@ class Lifecycle:
         """The link is up, or is not."""
         self.fire(Trigger.LINK_UP if up else Trigger.LINK_LOST)
 
-    def fault(self, why: str) -> bool:
+    def fault(self, why: str, now_ns: int) -> bool:
         """Latch a fault; False when one is latched already, whose reason is kept."""
         if self.mode in (Mode.FAULT, Mode.LEAVING):
             return False
+        self._stopped_ns = now_ns
         self.fire(Trigger.FAULT)
         self.latched = why
         return True
@@ -48,9 +49,9 @@ class Lifecycle:
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, asked_ns: int, now_ns: int, linked: bool) -> str:
-        """Release the latch, unless it was asked before the last stop was obeyed."""
+        """Release the latch, unless it was asked before the last stop or fault came about."""
         if asked_ns <= self._stopped_ns or now_ns == self._stopped_ns:
-            raise RefusedError("a stop came at the same time or after; call it again")
+            raise RefusedError("a stop or fault came at the same time or after; call it again")
         self.fire(Trigger.CLEAR)
         self.latched = ""
         self._resume(linked)

@@ -186,12 +186,14 @@ class _Text:
 
 
 class _List:
-    """Many of one kind: a sequence, or an array of `fixed` length."""
+    """Many of one kind: a sequence of at most `most`, or an array of just as many."""
 
-    def __init__(self, get: Get, kind: inspect.Type, fixed: int | None) -> None:
-        self._get, self._fixed = get, fixed
+    def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
+        self._get, self._most = get, most
+        self._fixed = most if fixed else None
         self._code = number_code(kind)
-        self._packs = _packs(self._code * fixed) if self._code and fixed else None
+        array = self._code * (self._fixed or 0)
+        self._packs = _packs(array) if array else None
         self._text = isinstance(plain(kind), inspect.StrType)
         self._parts: tuple[_Part, ...] = ()
         item = plain(kind)
@@ -224,6 +226,8 @@ class _List:
     def read(self, source: _Source, found: list[object]) -> None:
         least = SIZES[self._code] if self._code else 1
         count = source.count(least) if self._fixed is None else self._fixed
+        if self._most is not None and count > self._most:
+            raise CdrError(f"{count} items where {self._most} may be")
         if self._code:
             found.append(source.take_many(self._code, count) if count else [])
         elif self._text:
@@ -262,7 +266,7 @@ def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
             case inspect.StrType():
                 parts.append(_Text(attrgetter(path)))
             case inspect.ListType(item_type=item, min_length=least, max_length=most):
-                parts.append(_List(attrgetter(path), item, most if most == least else None))
+                parts.append(_List(attrgetter(path), item, most, fixed=most == least))
             case _:
                 raise TypeError(f"CDR cannot tell {cls.__name__}.{path}")
     end_run()

@@ -14,9 +14,9 @@ from msgspec import UNSET, Struct, UnsetType
 from acsard.drive.kinematics import Kinematics
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
-from acsard.ros.attachments import unpack
+from acsard.ros.attachments import GID_BYTES, unpack
 from acsard.settings import JointsConfig
-from acsard.values import Command, Pose, Request, Verb, WheelSpeeds
+from acsard.values import REST, Command, Pose, Request, Verb, WheelSpeeds
 from acsard.values import Twist as BodyTwist
 
 MAX_COMMAND_BYTES = 4096
@@ -54,8 +54,12 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
     twist: Twist | UnsetType = UNSET
 
 
-TWIST_CDR_BYTES = 52
-"""A Twist in CDR has so many bytes, a TwistStamped at least 68: nothing else tells them apart."""
+TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
+"""A Twist in CDR, and a TwistStamped at the least: often nothing else tells them apart."""
+
+TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
+STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
+"""What an Encoding may call them."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -80,16 +84,18 @@ class Receiver:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
         stamp_ns, sender = _stamp(arrival)
         if kind == "cmd":
-            twist, header = self._twist(arrival)
+            twist, header, cancelled = self._twist(arrival)
         else:
-            twist, header = self._wheel_speeds(arrival)
+            twist, header, cancelled = self._wheel_speeds(arrival)
         if header is not None and header.stamp.to_ns() > 0:
             # Another clock than the envelope's, which may be a router's for many: its own name.
             stamp_ns = header.stamp.to_ns()
             sender = f"{sender}, header on {arrival.via}/{arrival.key}"
-        return Command(source, twist, arrival.arrived_ns, stamp_ns, sender)
+        return Command(
+            source, twist, arrival.arrived_ns, stamp_ns, sender, voice(arrival), cancelled
+        )
 
-    def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:
+    def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
         got = _twist_payload(arrival)
         header = None
         linear, angular = got.linear, got.angular
@@ -105,9 +111,10 @@ class Receiver:
         axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         if not all(map(math.isfinite, axes)):
             raise DecodeError("not_finite", "NaN or infinity in the twist")
-        return BodyTwist(linear.x, angular.z), header
+        twist = BodyTwist(linear.x, angular.z)
+        return twist, header, twist == REST and any(axes)
 
-    def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None]:
+    def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
         got = _wheels.decode(arrival.encoding, arrival.payload)
         if sorted(got.name) != sorted(self._joints) or len(got.velocity) != 4:
             raise DecodeError(
@@ -119,7 +126,7 @@ class Receiver:
         twist = self._kinematics.twist(WheelSpeeds(*(speed[joint] for joint in self._joints)))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "wheel speeds beyond all numbers")
-        return twist, got.header
+        return twist, got.header, twist == REST and any(got.velocity)
 
     @staticmethod
     def request(
@@ -142,18 +149,30 @@ class Receiver:
 def _stamp(arrival: Arrival) -> tuple[int | None, str]:
     """When it was sent by whose clock, as far as its envelope says; raises `DecodeError`."""
     if arrival.via == "rmw":
-        attached = unpack(arrival.attachment)
-        return attached.stamp_ns, attached.gid.hex()
-    # A bridge says nothing of the ROS node behind it: all those on a key share a clock's name.
-    name = arrival.key if arrival.via == "native" else f"{arrival.via}/{arrival.key}"
-    return arrival.stamp_ns, arrival.sender or name
+        return unpack(arrival.attachment).stamp_ns, voice(arrival)
+    return arrival.stamp_ns, arrival.sender or f"{arrival.via}/{arrival.key}"
+
+
+def voice(arrival: Arrival) -> str:
+    """Who sent it: the rmw publisher, the session that stamped it, or else just the source.
+
+    A bridge says nothing of the ROS node behind it: all those of a source are one.
+    """
+    if arrival.via == "rmw":
+        return arrival.attachment[-GID_BYTES:].hex()
+    return arrival.sender or f"{arrival.via}/{arrival.key.partition('/')[2]}"
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:
     if detect(arrival.encoding, arrival.payload) != "cdr":
         return _twists.decode(arrival.encoding, arrival.payload)
-    if len(arrival.payload) < TWIST_CDR_BYTES + 8:
+    named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
+    # Without a name by the length; DDS pads to a multiple of four.
+    plain, told = named in TWISTS, named in TWISTS + STAMPED_TWISTS
+    if plain or (not told and size < TWIST_CDR_BYTES + 4):
         twist = decode_cdr(Twist, arrival.payload)
         return _TwistPayload(linear=twist.linear, angular=twist.angular)
+    if not told and size < STAMPED_CDR_BYTES:
+        raise DecodeError("wrong_shape", f"{size} bytes of CDR are no Twist and no TwistStamped")
     stamped = decode_cdr(TwistStamped, arrival.payload)
     return _TwistPayload(header=stamped.header, twist=stamped.twist)

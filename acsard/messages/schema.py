@@ -6,7 +6,7 @@ structs refuse unknown fields, so a misspelt axis is an error and not a standsti
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from msgspec import Meta, Struct
 
@@ -17,6 +17,10 @@ Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
 Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
+
+T = TypeVar("T")
+Few = Annotated[list[T], Meta(max_length=64)]
+"""More joints than any robot of ours; what a stranger sends must not take long to refuse."""
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True):
@@ -133,10 +137,10 @@ class JointState(Message, frozen=True):
     """Per joint `name`: `position` rad (continuous), `velocity` rad/s, `effort` N m (unused)."""
 
     header: Header = Header()
-    name: list[str] = []
-    position: list[float] = []
-    velocity: list[float] = []
-    effort: list[float] = []
+    name: Few[str] = []
+    position: Few[float] = []
+    velocity: Few[float] = []
+    effort: Few[float] = []
 
 
 class SourceState(Message, frozen=True):

@@ -17,8 +17,12 @@ Unsigned8 = Annotated[int, Meta(extra={"cdr": "B"})]
 Signed64 = Annotated[int, Meta(extra={"cdr": "q"})]
 Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
 
+T = TypeVar("T")
+Some = Annotated[list[T], Meta(max_length=128)]
+"""All parameters at once are fewer; a request of more takes too long to answer in one step."""
+
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
-INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
+DOUBLE_ARRAY, STRING_ARRAY = 8, 9
 
 SEPARATOR = "."
 
@@ -86,7 +90,7 @@ class SetParametersResult(Struct, frozen=True):
 class ListRequest(Struct, frozen=True):
     """`depth` 0 is any depth; no prefixes are all."""
 
-    prefixes: list[str]
+    prefixes: Some[str]
     depth: Unsigned64
 
 
@@ -100,7 +104,7 @@ class ListReply(Struct, frozen=True):
 class Names(Struct, frozen=True):
     """The request of get, types and describe."""
 
-    names: list[str]
+    names: Some[str]
 
 
 class Values(Struct, frozen=True):
@@ -124,7 +128,7 @@ class Descriptors(Struct, frozen=True):
 class SetRequest(Struct, frozen=True):
     """The request of both ways to set."""
 
-    parameters: list[Parameter]
+    parameters: Some[Parameter]
 
 
 class SetReply(Struct, frozen=True):

@@ -39,6 +39,8 @@ class Endpoint(Struct, frozen=True):
     token: str
     """Its liveliness token, "" for none; over rmw also what its GID is made of."""
     latched: bool
+    type: str
+    """The ROS type its key names; by a bridge, where a name may take two, the first."""
 
 
 TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
@@ -153,4 +155,5 @@ def _rmw(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
 
 
 def _endpoint(transport: Transport, row: RosName, key: str, token: str) -> Endpoint:
-    return Endpoint(transport, row.native, row.direction, key, token, row.qos.transient)
+    latched = row.qos.transient
+    return Endpoint(transport, row.native, row.direction, key, token, latched, row.type)

@@ -14,7 +14,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.histogram import Histogram
 from acsard.messages.encodings import DecodeError
-from acsard.messages.incoming import Arrival, Receiver
+from acsard.messages.incoming import Arrival, Receiver, voice
 from acsard.messages.queries import Queries, Query, Reply
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
@@ -162,7 +162,15 @@ class ControlLoop:
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
-                refusals.append(Refusal(error.reason, f"{arrival.key}: {error}"))
+                refusals.append(
+                    Refusal(
+                        error.reason,
+                        f"{arrival.key}: {error}",
+                        arrival.key.partition("/")[2],
+                        voice(arrival),
+                        arrival.arrived_ns,
+                    )
+                )
         for query in got.queries:
             try:
                 served = self._queries.serve(query, self._current, self.outputs)

@@ -14,13 +14,14 @@ import zenoh
 from acsard.messages.encodings import encoding_name
 from acsard.messages.incoming import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.messages.queries import Query, Reply
-from acsard.ros.trees import Endpoint
+from acsard.ros.trees import PARAMETERS, Endpoint
 from acsard.runtime import clock
 from acsard.runtime.control_loop import BusInput
 from acsard.runtime.replies import Replies
 
-ARRIVALS = 256
-"""Samples held between two steps; at 1000 Hz a key and 100 steps a second, 10 is usual."""
+ARRIVALS = 64
+"""Samples held between two steps, the newest: so many can be read in one without holding it up. At
+1000 Hz a key and 100 steps a second 10 are usual, from one who sends all he may."""
 
 STOPS = 16
 """Stops held, apart from all else: no flood of anything can push one out."""
@@ -47,12 +48,14 @@ class Inbox:
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
+        self._slow: deque[Query] = deque()
+        """Questions that take as long to answer as all others of a step."""
         self._overrun = 0
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
         arrivals = _drained(self._stops, STOPS) + _drained(self._arrivals, ARRIVALS)
-        asked = _drained(self._services, queries)
+        asked = _drained(self._services, queries) + _drained(self._slow, 1)
         asked += _drained(self._questions, queries - len(asked))
         overrun, self._overrun = self._overrun, 0
         return BusInput(tuple(arrivals), tuple(asked), overrun)
@@ -68,7 +71,10 @@ class Inbox:
         """A sample on a ROS key, which names its encoding nowhere: it stands for a native one."""
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
-        self._arrived(sample, native, CDR, endpoint.transport)
+        # An rmw key names the type; by a bridge only the length tells a Twist from a TwistStamped.
+        named = endpoint.transport == "rmw"
+        encoding = f"{CDR};{endpoint.type}" if named else CDR
+        self._arrived(sample, native, encoding, endpoint.transport)
 
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
         arrived = clock.now()
@@ -107,6 +113,11 @@ class Inbox:
             native = endpoint.native
             self._asked(query, native, native, endpoint.key, endpoint.transport)
 
+    def _line_for(self, topic: str) -> deque[Query]:
+        if topic.startswith("srv/"):
+            return self._services
+        return self._slow if topic.startswith(PARAMETERS) else self._questions
+
     def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived_ns = clock.now().mono_ns
         if topic == "srv/stop":
@@ -115,7 +126,7 @@ class Inbox:
         number = self._replies.open(query, key)
         if number is None:
             return
-        waiting = self._services if topic.startswith("srv/") else self._questions
+        waiting = self._line_for(topic)
         if len(waiting) >= QUERIES:
             if via == "native":  # a ROS client hears no errors
                 busy = b"busy: too many queries at once; ask again"

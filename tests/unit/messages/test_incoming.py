@@ -28,7 +28,7 @@ JOINTS = list(JointsConfig().as_tuple())
 ARRIVED_NS = 77_000_000_000
 AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
         ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
-HEADER_S = "cmd/app, header on native/cmd/app"
+HEADER_S = "native/cmd/app, header on native/cmd/app"
 """Whose clock the stamp in a message is, when nothing else says who sent it."""
 
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -82,7 +82,9 @@ def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_twist_is_a_command_of_the_source_in_its_key(form: Format) -> None:
-    assert command(twist(), form) == Command("app", Twist(0.5, 0.2), ARRIVED_NS, None, "cmd/app")
+    assert command(twist(), form) == Command(
+        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/cmd/app", "native/app"
+    )
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -92,7 +94,7 @@ def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
         "twist": twist(),
     }
     assert command(body, form) == Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S
+        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app"
     )
 
 
@@ -265,7 +267,7 @@ def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -
     payload = native_twist(header)
     assert len(payload) == 52
     got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "cmd/app")
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/cmd/app", "native/app")
 
 
 @pytest.mark.parametrize("header", ORDERS)
@@ -276,7 +278,7 @@ def test_a_native_stamped_twist_is_a_command_with_its_stamp(
     payload = native_stamped(header, frame)
     assert len(payload) == size
     got = RECEIVER.command(arrival(payload, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S)
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app")
 
 
 @pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
@@ -412,7 +414,7 @@ def test_wheel_commands_are_stamped_the_same_way() -> None:
 
 def test_the_sender_is_the_one_of_the_arrival_else_the_key() -> None:
     assert command(twist(), sender="z1").sender == "z1"
-    assert command(twist(), sender="").sender == "cmd/app"
+    assert command(twist(), sender="").sender == "native/cmd/app"
 
 
 def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
@@ -575,7 +577,7 @@ def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
 
 def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
-    assert command == Command("nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, GID.hex())
+    assert command == Command("nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, GID.hex(), GID.hex())
 
 
 def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
