@@ -9,7 +9,7 @@ from acsard.cli.common import add_config, load
 
 if TYPE_CHECKING:
     from acsard.messages.schema import Topics
-    from acsard.settings import RosConfig
+    from acsard.settings import Config
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,7 +31,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.messages.queries import topic_table
 
     _, config = load(args.config)
-    table = ros_table(config.ros) if args.ros else topic_table(config.robot.id)
+    table = ros_table(config) if args.ros else topic_table(config.robot.id)
     if args.json:
         print(encode(table, "json").decode())
         return 0
@@ -44,15 +44,16 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def ros_table(ros: RosConfig) -> Topics:
+def ros_table(config: Config) -> Topics:
     """The ROS topics and services, each with the native key it stands for."""
     from acsard.messages.schema import TopicInfo, Topics
     from acsard.messages.topics import by_key
     from acsard.ros.names import full_name
-    from acsard.ros.trees import PARAMETERS, ros_names
+    from acsard.ros.trees import PARAMETERS, left_out, ros_names
 
+    ros = config.ros
     rows = []
-    for row in ros_names(ros) if ros.bridge or ros.rmw else ():
+    for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
         note = "the configuration, read-only"
         if not row.native.startswith(PARAMETERS):

@@ -6,7 +6,7 @@ command, and what goes out the same message, as on the native key beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import Literal
 
 from msgspec import Struct
@@ -14,7 +14,7 @@ from msgspec import Struct
 from acsard.messages.topics import Direction
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
-from acsard.settings import RosConfig
+from acsard.settings import Config, RosConfig
 
 Transport = Literal["bridge", "rmw"]
 
@@ -72,11 +72,19 @@ SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2
 """The command source each commanding topic counts as."""
 
 
-def ros_names(ros: RosConfig) -> tuple[RosName, ...]:
+def left_out(config: Config) -> frozenset[str]:
+    """The native keys that have nothing to say: ROS tools would take them for a broadcaster."""
+    silent = set() if config.odometry.publish_tf else {"tf"}
+    if not (config.lidar.publish_tf or config.footprint.publish_tf):
+        silent.add("tf_static")
+    return frozenset(silent)
+
+
+def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """All topics and services; a twist topic that takes both types is there once for each."""
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
-        *PUBLISHED,
+        *(row for row in PUBLISHED if row.native not in silent),
         *(
             RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
             for name in ("cmd_vel", "cmd_vel_teleop")
@@ -99,13 +107,14 @@ def ros_names(ros: RosConfig) -> tuple[RosName, ...]:
     )
 
 
-def endpoints(ros: RosConfig, zid: str) -> tuple[Endpoint, ...]:
+def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
     """The keys of every tree that is switched on, for a session with this Zenoh id."""
+    names = ros_names(ros, silent)
     found: list[Endpoint] = []
     if ros.bridge:
-        found += _bridge(ros, zid)
+        found += _bridge(ros, zid, names)
     if ros.rmw:
-        found += _rmw(ros, zid)
+        found += _rmw(ros, zid, names)
     return tuple(found)
 
 
@@ -132,9 +141,8 @@ def _kind(row: RosName) -> Kind:
     return {"out": "MP", "in": "MS", "query": "SS"}[row.direction]  # type: ignore[return-value]
 
 
-def _bridge(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
+def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
     """One key a name; a topic of two types cannot be announced, as a DDS reader has one."""
-    names = ros_names(ros)
     for row in names:
         twins = [other for other in names if other.name == row.name]
         if row is not twins[0]:
@@ -146,9 +154,9 @@ def _bridge(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
         yield _endpoint("bridge", row, bridge_key(name), token)
 
 
-def _rmw(ros: RosConfig, zid: str) -> Iterator[Endpoint]:
+def _rmw(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
     node = _node(ros, zid)
-    for number, row in enumerate(ros_names(ros), start=1):
+    for number, row in enumerate(names, start=1):
         name = full_name(ros.namespace, row.name)
         token = node.endpoint_token(number, _kind(row), name, row.type, row.qos)
         yield _endpoint("rmw", row, rmw_key(ros.domain, name, row.type), token)

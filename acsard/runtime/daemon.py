@@ -17,6 +17,7 @@ from acsard import __version__
 from acsard.access import access_control
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
+from acsard.ros.trees import left_out
 from acsard.runtime import clock
 from acsard.runtime.certificates import ends_ns as ends_ns_of
 from acsard.runtime.control_loop import ControlLoop
@@ -125,7 +126,14 @@ async def _run(
             mcu = FakeMcu(config, clock.now().mono_ns)
             path = stack.enter_context(SimPty(mcu)).path
         sources = tuple(source.name for source in config.commands.sources)
-        bus = ZenohBus(config.bus, config.ros, config.robot.id, sources, access_control(config))
+        bus = ZenohBus(
+            config.bus,
+            config.ros,
+            left_out(config),
+            config.robot.id,
+            sources,
+            access_control(config),
+        )
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):

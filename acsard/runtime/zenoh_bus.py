@@ -41,12 +41,13 @@ class ZenohBus:
         self,
         bus: BusConfig,
         ros: RosConfig,
+        silent: frozenset[str],
         robot_id: str,
         sources: tuple[str, ...],
         access: dict[str, object],
     ) -> None:
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
-        self._access = access
+        self._access, self._silent = access, silent
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
         self._inbox = Inbox(prefix, self._replies)
@@ -100,7 +101,7 @@ class ZenohBus:
             )
         self._declare_native(session)
         zid = str(session.zid())
-        for endpoint in endpoints(self._ros, zid):
+        for endpoint in endpoints(self._ros, zid, self._silent):
             self._declare_ros(session, endpoint)
         for token in (full_key(self._id, "alive"), *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))

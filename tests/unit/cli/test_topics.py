@@ -7,11 +7,11 @@ import pytest
 from acsard.cli.topics import ros_table
 from acsard.messages.topics import PUBLISHED
 from acsard.ros.trees import PARAMETERS, ros_names
-from acsard.settings import RosConfig
+from acsard.settings import Config, RosConfig
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
-    table = ros_table(RosConfig(namespace="robot1"))
+    table = ros_table(Config(ros=RosConfig(namespace="robot1")))
     rows = [(row.key, row.direction, row.type) for row in table.topics]
     names = ros_names(RosConfig(namespace="robot1"))
     assert rows == [(f"/robot1/{n.name}", n.direction, n.type) for n in names]
@@ -21,7 +21,11 @@ def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
 
 
 def test_a_published_name_has_the_rate_of_its_native_key() -> None:
-    rates = {row.key: row.rate for row in ros_table(RosConfig()).topics if row.direction == "out"}
+    rates = {
+        row.key: row.rate
+        for row in ros_table(Config(ros=RosConfig())).topics
+        if row.direction == "out"
+    }
     published = {topic.key: topic.rate for topic in PUBLISHED}
     assert rates["/joint_states"] == published["wheel_states"]
     assert rates["/tf_static"] == "latched"
@@ -29,8 +33,8 @@ def test_a_published_name_has_the_rate_of_its_native_key() -> None:
 
 @pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True)])
 def test_one_tree_is_enough_to_be_listed(bridge: bool, rmw: bool) -> None:
-    assert ros_table(RosConfig(bridge=bridge, rmw=rmw)).topics
+    assert ros_table(Config(ros=RosConfig(bridge=bridge, rmw=rmw))).topics
 
 
 def test_without_any_tree_there_is_nothing_to_list() -> None:
-    assert ros_table(RosConfig(bridge=False, rmw=False)).topics == []
+    assert ros_table(Config(ros=RosConfig(bridge=False, rmw=False))).topics == []

@@ -6,8 +6,23 @@ import pytest
 
 from acsard.messages.topics import TOPICS
 from acsard.ros.names import TYPE_HASHES
-from acsard.ros.trees import PARAMETERS, Endpoint, command_keys, endpoints, node_tokens, ros_names
-from acsard.settings import CommandsConfig, RosConfig
+from acsard.ros.trees import (
+    PARAMETERS,
+    Endpoint,
+    command_keys,
+    endpoints,
+    left_out,
+    node_tokens,
+    ros_names,
+)
+from acsard.settings import (
+    CommandsConfig,
+    Config,
+    FootprintConfig,
+    LidarConfig,
+    OdometryConfig,
+    RosConfig,
+)
 
 ZID = "abc"
 
@@ -136,3 +151,20 @@ def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
     assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
     assert len(rate_limited) == 3 + 5
+
+
+def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
+    off = Config(odometry=OdometryConfig(publish_tf=False), lidar=LidarConfig(publish_tf=False))
+    assert left_out(off) == {"tf", "tf_static"}
+    kept = endpoints(RosConfig(), ZID, left_out(off))
+    assert not {e.native for e in kept} & {"tf", "tf_static"}
+    assert {e.native for e in endpoints(RosConfig(), ZID)} - {e.native for e in kept} == {
+        "tf",
+        "tf_static",
+    }
+
+
+def test_either_static_transform_keeps_tf_static() -> None:
+    assert left_out(Config()) == set()
+    footprint = FootprintConfig(publish_tf=True)
+    assert left_out(Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)) == set()
