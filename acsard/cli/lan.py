@@ -43,6 +43,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "viewer, operator and maintainer, and print the lines of acsard.toml for them.",
     )
     init.add_argument("--force", action="store_true", help="replace what is there")
+    init.add_argument(
+        "--write", metavar="FILE", help="also set bus.listen and bus.tls in this acsard.toml"
+    )
     init.set_defaults(main=main_init)
     more = actions.add_parser(
         "add",
@@ -88,6 +91,8 @@ def main_init(args: argparse.Namespace) -> int:
     authority.issue(directory, "robot", names, args.days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], args.days)
+    if args.write:
+        _configure(Path(args.write), directory.resolve())
     print(
         _NEXT.format(
             directory=directory.resolve(),
@@ -125,6 +130,29 @@ def main_add(args: argparse.Namespace) -> int:
     print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do:\n")
     print(f"[access]\n{args.role}s = {write([args.role, args.name])}")
     return 0
+
+
+def _configure(file: Path, directory: Path) -> None:
+    """Set the bus's keys in a configuration, its comments kept."""
+    import tomlkit
+
+    from acsard.config import ConfigError, parse
+
+    try:
+        document = tomlkit.parse(file.read_text(encoding="utf-8") if file.exists() else "")
+        bus = document.setdefault("bus", tomlkit.table())
+        listen = [str(one) for one in bus.get("listen", ["tcp/127.0.0.1:7448"])]
+        if not any(one.startswith("tls/") for one in listen):
+            listen.append(f"tls/0.0.0.0:{PORT}")
+        bus["listen"], bus["tls"] = listen, str(directory)
+        text = tomlkit.dumps(document)
+        parse(text.encode())
+        file.write_text(text, encoding="utf-8")
+    except (OSError, ValueError, ConfigError) as error:
+        raise ExitError(
+            Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand"
+        ) from None
+    print(f"{file}: set bus.listen = {write(listen)} and bus.tls\n")
 
 
 def _name(text: str) -> str:

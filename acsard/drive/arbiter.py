@@ -30,11 +30,12 @@ MAX_SENDERS = 1024
 """Clocks remembered at once; the one heard longest ago goes first."""
 
 MAX_VOICES = 16
-"""Senders remembered of one source; those that may not drive go first."""
+"""Senders remembered of one source; nobody pushes out one that is live and may drive."""
 
 REASONS = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
+    "crowded": f"{MAX_VOICES} other senders of this source are live",
     "stale": "held up on the way for longer than the source's timeout (or the sender's clock was "
     "set back: let it pause for 10 s, then send on)",
 }
@@ -122,19 +123,22 @@ class _Commander:
         self._neutral_first = neutral_first
         self.voices: dict[str, _Voice] = {}
 
-    def voice(self, name: str, now_ns: int) -> _Voice:
-        """The sender of this name; the one of least account makes room for a new one."""
+    def voice(self, name: str, now_ns: int) -> _Voice | None:
+        """The sender of this name, for whom one of less account makes room; None for no room."""
         known = self.voices.get(name)
         if known is None:
+            if len(self.voices) >= MAX_VOICES:
+                least = min(self.voices, key=lambda other: self._account(other, now_ns))
+                if self._account(least, now_ns)[0]:
+                    return None
+                del self.voices[least]
             known = self.voices[name] = _Voice(now_ns, armed=not self._neutral_first)
-            if len(self.voices) > MAX_VOICES:
-                others = [other for other in self.voices if other != name]
-                del self.voices[min(others, key=lambda other: self._account(other))]
         return known
 
-    def _account(self, name: str) -> tuple[bool, int]:
+    def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
+        """Who may be driving counts most, then who may drive, then who was there last."""
         voice = self.voices[name]
-        return voice.armed, voice.noticed_ns
+        return voice.armed and self.live(voice, now_ns), voice.armed, voice.noticed_ns
 
     def live(self, voice: _Voice, now_ns: int) -> bool:
         return voice.arrived_ns is not None and now_ns - voice.arrived_ns <= self.timeout_ns
@@ -184,11 +188,13 @@ class Arbiter:
         if commander is None:
             return "unknown_source"
         now_ns, twist = command.arrived_ns, command.twist
-        voice = commander.voice(command.voice, now_ns)
         reason = self._objection(command, commander)
         if reason:
-            voice.noticed_ns = now_ns
+            self.notice(command.source, command.voice, now_ns)
             return reason
+        voice = commander.voice(command.voice, now_ns)
+        if voice is None:
+            return "crowded"
         if not voice.armed and now_ns >= self._since_ns:
             still = twist == REST and not command.cancelled
             voice.armed = still or self._paused(command, voice, commander.timeout_ns)

@@ -19,9 +19,13 @@ from acsard.runtime import clock
 from acsard.runtime.control_loop import BusInput
 from acsard.runtime.replies import Replies
 
-ARRIVALS = 64
-"""Samples held between two steps, the newest: so many can be read in one without holding it up. At
-1000 Hz a key and 100 steps a second 10 are usual, from one who sends all he may."""
+ARRIVALS = 16
+"""Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
+in from one who sends all he may. What comes in on other keys than those of listed sources is held
+together: no flood pushes out a command on another key."""
+
+OTHERS = ""
+"""Where samples on all other keys go."""
 
 STOPS = 16
 """Stops held, apart from all else: no flood of anything can push one out."""
@@ -40,11 +44,14 @@ T = TypeVar("T")
 class Inbox:
     """Samples and queries of one robot, until they are taken."""
 
-    def __init__(self, prefix: str, replies: Replies) -> None:
+    def __init__(self, prefix: str, replies: Replies, sources: tuple[str, ...]) -> None:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
         self._prefix, self._replies = prefix, replies
-        self._arrivals: deque[Arrival] = deque(maxlen=ARRIVALS)
+        listed = [f"{kind}/{name}" for kind in ("cmd", "wheel_cmd") for name in sources]
+        self._arrivals: dict[str, deque[Arrival]] = {
+            key: deque(maxlen=ARRIVALS) for key in (*listed, OTHERS)
+        }
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
@@ -54,7 +61,9 @@ class Inbox:
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
-        arrivals = _drained(self._stops, STOPS) + _drained(self._arrivals, ARRIVALS)
+        arrivals = [one for held in self._arrivals.values() for one in _drained(held, ARRIVALS)]
+        arrivals.sort(key=lambda one: one.arrived_ns)
+        arrivals = _drained(self._stops, STOPS) + arrivals
         asked = _drained(self._services, queries) + _drained(self._slow, 1)
         asked += _drained(self._questions, queries - len(asked))
         overrun, self._overrun = self._overrun, 0
@@ -96,9 +105,10 @@ class Inbox:
         if key == "stop" and put:
             self._stops.append(arrival)
             return
-        if len(self._arrivals) == ARRIVALS:
+        held = self._arrivals.get(key, self._arrivals[OTHERS])
+        if len(held) == ARRIVALS:
             self._overrun += 1
-        self._arrivals.append(arrival)
+        held.append(arrival)
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
         """A query that reached a row of the native table."""

@@ -50,7 +50,7 @@ class ZenohBus:
         self._access, self._silent = access, silent
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
-        self._inbox = Inbox(prefix, self._replies)
+        self._inbox = Inbox(prefix, self._replies, sources)
         self._outlets = Outlets()
         self._session: zenoh.Session | None = None
         self._kept: list[object] = []

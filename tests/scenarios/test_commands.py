@@ -5,8 +5,13 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from acsard.messages.encodings import encode
+from acsard.messages.incoming import Arrival, Via
 from acsard.messages.queries import Query
+from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
+from acsard.ros.attachments import Attachment
 from acsard.settings import CommandsConfig, Config, Source
+from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 
 
@@ -253,3 +258,209 @@ def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
     assert world.loop.at_rest
     assert world.state.mode == "leaving"
     assert not world.call("activate").success
+
+
+# several people on one source, and networks that hold samples back
+
+
+class Person:
+    """One who commands `nav` by one of the three ways; two of them are two voices."""
+
+    def __init__(self, world: World, via: Via, name: str) -> None:
+        self.world, self.via, self.name = world, via, name
+        self._sent = 0
+
+    def twist(self, linear: float) -> bytes:
+        return encode(Twist(Vector3(linear), Vector3()), "cdr")
+
+    def send(self, linear: float, late: float = 0.0) -> None:
+        """A Twist that was stamped so many seconds ago."""
+        self.put(self.twist(linear), late)
+
+    def put(self, payload: bytes, late: float = 0.0, kind: str = "Twist") -> None:
+        instant, via = self.world.instant, self.via
+        stamp_ns = instant.wall_ns - int(late * NS_PER_S)
+        self._sent += 1
+        rmw = via == "rmw"
+        arrival = Arrival(
+            "cmd/nav",
+            True,
+            payload,
+            f"application/cdr;geometry_msgs/msg/{kind}" if rmw else "application/cdr",
+            instant.mono_ns,
+            None if rmw else stamp_ns,
+            "" if rmw else f"session of {self.name}",
+            via,
+            Attachment(self._sent, stamp_ns, self.name.encode().ljust(16)).pack() if rmw else b"",
+        )
+        self.world.bus.arrivals.append(arrival)
+
+    def drive(self, linear: float) -> None:
+        """A zero, then on from there at 20 Hz until it drives."""
+        self.send(0.0)
+        for _ in range(10):
+            self.world.run(0.05)
+            self.send(linear)
+        assert self.world.state.mode == "driving"
+
+
+VIAS: list[Via] = ["rmw", "bridge", "native"]
+
+by_each_way = pytest.mark.parametrize("via", VIAS)
+
+
+def waits_for(world: World, source: str = "nav") -> str:
+    return {s.name: s.waits_for for s in world.state.sources}[source]
+
+
+@by_each_way
+def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
+    world: World, via: Via
+) -> None:
+    holding, other = Person(world, via, "a"), Person(world, via, "b")
+    holding.drive(0.4)
+    for verb in ("stop", "clear"):
+        holding.send(0.4)
+        assert world.call(verb).success
+    # At rest first: what rolls out is none of its doing.
+    for _ in range(40):
+        holding.send(0.4)
+        world.run(0.05)
+    x = world.state.x
+    other.send(0.0)
+    for _ in range(40):
+        holding.send(0.4)
+        world.run(0.05)
+        assert world.state.linear == 0.0
+    assert world.state.x == x
+    assert waits_for(world).startswith("neutral first: nav must send a zero")
+    holding.send(0.0)
+    holding.drive(0.4)
+
+
+@by_each_way
+def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_told(
+    world: World, via: Via
+) -> None:
+    first, second = Person(world, via, "a"), Person(world, via, "b")
+    first.send(0.0)
+    world.run(0.02)
+    second.send(0.0)
+    for _ in range(40):
+        first.send(0.4)
+        world.run(0.025)
+        second.send(-0.4)
+        world.run(0.025)
+        assert world.state.linear >= 0.0
+    assert world.state.linear == pytest.approx(0.4, abs=0.03)
+    assert waits_for(world) == "1 more of its senders: the first until it is silent"
+    for _ in range(40):
+        second.send(-0.4)
+        world.run(0.05)
+    assert world.state.linear == pytest.approx(-0.4, abs=0.03)
+    assert waits_for(world) == ""
+
+
+def test_two_nodes_behind_one_bridge_that_stamps_nothing_are_one_sender(world: World) -> None:
+    def send(linear: float) -> None:
+        payload = encode(Twist(Vector3(linear), Vector3()), "cdr")
+        world.bus.arrivals.append(
+            Arrival("cmd/nav", True, payload, "application/cdr", world.now_ns, None, "", "bridge")
+        )
+
+    send(0.0)
+    for _ in range(20):
+        send(0.4)
+        world.run(0.05)
+    assert world.state.linear == pytest.approx(0.4, abs=0.03)
+    assert waits_for(world) == ""
+
+
+@by_each_way
+@pytest.mark.parametrize("cleared_after", [0.05, 0.2, 0.4, 0.55])
+def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
+    world: World, via: Via, cleared_after: float
+) -> None:
+    person = Person(world, via, "a")
+    person.drive(0.4)
+    world.call("stop")
+    world.run(0.5)
+    # From here on the network holds all that is sent, at 20 Hz, for 0.6 s.
+    world.run(cleared_after)
+    assert world.call("clear").success
+    person.send(0.4)  # one slips through, so that it was heard
+    world.run(0.6)
+    for sent in range(12):
+        person.send(0.4, late=0.6 - 0.05 * sent)
+        world.run(0.002)
+    for _ in range(20):
+        person.send(0.4)
+        world.run(0.05)
+        assert world.state.linear == 0.0
+    assert waits_for(world).startswith("neutral first")
+    assert world.state.counters["command_stale"] > 0
+
+
+@by_each_way
+def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
+    world: World, via: Via
+) -> None:
+    person = Person(world, via, "a")
+    for _ in range(20):  # six at a time every 0.3 s: none later than the timeout
+        world.run(0.3)
+        for late in (0.25, 0.2, 0.15, 0.1, 0.05, 0.0):
+            person.send(0.4, late)
+        world.run(0.01)
+        assert world.state.linear == 0.0
+    assert waits_for(world).startswith("neutral first")
+
+
+@by_each_way
+@pytest.mark.parametrize("nonsense", ["NaN", "cut", "nothing", "a NaN in a stamped one"])
+def test_one_who_sends_nonsense_for_a_while_was_not_silent(
+    world: World, via: Via, nonsense: str
+) -> None:
+    person = Person(world, via, "a")
+    stamp = Time(*divmod(world.instant.wall_ns, NS_PER_S))
+    bad, kind = {
+        "NaN": (person.twist(float("nan")), "Twist"),
+        "cut": (person.twist(0.5)[:-1], "Twist"),
+        "nothing": (b"", "Twist"),
+        "a NaN in a stamped one": (
+            encode(TwistStamped(Header(stamp), Twist(Vector3(float("inf")), Vector3())), "cdr"),
+            "TwistStamped",
+        ),
+    }[nonsense]
+    person.send(0.5)
+    for _ in range(6):
+        world.run(0.05)
+        person.put(bad, kind=kind)
+    for _ in range(20):
+        world.run(0.05)
+        person.send(0.5)
+    world.run(0.05)
+    assert world.state.linear == 0.0
+    assert waits_for(world).startswith("neutral first")
+    world.run(0.3)  # now it was
+    for _ in range(10):
+        person.send(0.5)
+        world.run(0.05)
+    assert world.state.mode == "driving"
+
+
+def test_wheel_speeds_that_cancel_out_do_not_arm_their_sender(world: World) -> None:
+    joints = list(world.config.joints.as_tuple())
+
+    def send(*speeds: float) -> None:
+        world.put("wheel_cmd/app", msgspec.json.encode({"name": joints, "velocity": speeds}))
+        world.run(0.05)
+
+    send(8.0, 8.0, -8.0, -8.0)
+    for _ in range(10):
+        send(8.0, 8.0, 8.0, 8.0)
+    assert world.state.mode == "ready"
+    assert waits_for(world, "app").startswith("neutral first")
+    send(0.0, 0.0, 0.0, 0.0)
+    for _ in range(10):
+        send(8.0, 8.0, 8.0, 8.0)
+    assert world.state.mode == "driving"

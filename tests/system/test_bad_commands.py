@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from tests.system.harness import (
     twist,
     until,
 )
+from tests.system.ros_clients import TWIST, rmw_key
+from tests.system.ros_clients import twist as ros_twist
 from tests.system.strangers import FLOOD, words
 
 GO = json.dumps(twist(0.5)).encode()
@@ -252,3 +255,138 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
     assert stopped.at - sent < 0.2
     assert after["mode"] == "stopped"
     assert "Traceback" not in daemon.stderr
+
+
+# the same by ROS
+
+
+SESSION = """\
+import struct, sys, time
+import zenoh
+from tests.system.harness import client_config
+
+endpoint, key, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
+session = zenoh.open(client_config(endpoint))
+"""
+
+ROS_FLOOD = (
+    SESSION
+    + """
+payload, by_rmw, count = bytes.fromhex(sys.argv[4]), sys.argv[5] == "rmw", 0
+publisher = session.declare_publisher(key)
+print("flooding", flush=True)
+end = time.monotonic() + seconds
+while time.monotonic() < end:
+    count += 1
+    attachment = struct.pack("<qqB16s", count, time.time_ns(), 16, b"g" * 16) if by_rmw else None
+    publisher.put(payload, attachment=attachment)
+print("flooded", count, flush=True)
+session.close()
+"""
+)
+"""One payload on a key as fast as one process can for `seconds`, as a node or a bridge sends it."""
+
+SLOW_WORK = (
+    SESSION
+    + """
+service, joints, names = sys.argv[4], *map(bytes.fromhex, sys.argv[5:])
+publisher, called, count = session.declare_publisher(key), 0, 0
+print("flooding", flush=True)
+start = time.monotonic()
+while (now := time.monotonic()) < start + seconds:
+    publisher.put(joints)
+    count += 1
+    while called < min(1000, 2000 * (now - start) / seconds):
+        called += 1
+        session.get(service, lambda reply: None, payload=names, attachment=b"rqh" + bytes(17))
+print("flooded", count, called, flush=True)
+session.close()
+"""
+)
+"""The same, and 1000 calls of a service in the first half of the time."""
+
+HALF = b"\0\1\0\0"
+
+EMPTY_JOINTS = HALF + struct.pack("<iIIB3xI", 0, 0, 1, 0, 1017)
+EMPTY_JOINTS += bytes(4096 - len(EMPTY_JOINTS))
+EMPTY_NAMES = HALF + struct.pack("<I", 1022) + bytes(4088)
+"""4096 bytes that are as many names without a letter as there is room for."""
+
+
+@pytest.fixture(scope="module")
+def flooded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A daemon of its own for those who flood by ROS."""
+    with Daemon(tmp_path_factory.mktemp("flooded")) as daemon:
+        yield daemon
+
+
+@pytest.mark.parametrize("way", ["bridge", "rmw"])
+def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
+    flooded: Daemon, tmp_path: Path, way: str
+) -> None:
+    key = "cmd_vel" if way == "bridge" else rmw_key("cmd_vel", TWIST)
+    program = words(ROS_FLOOD, flooded.endpoint, key, 1.0, ros_twist(0.0).hex(), way)
+    with Bus(flooded.endpoint) as bus:
+        bus.linked()
+        before = bus.state()
+        with Program(program, tmp_path) as flood:
+            flood.says("flooding")
+            begun = time.monotonic()
+            count = int(flood.says("flooded").split()[1])
+            assert flood.ended(5.0) == 0
+            lasted = time.monotonic() - begun
+        # A tenth of a second of silence: what was under way is through.
+        lines = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= lines + 10, 3.0, "ten more lines")
+        after = bus.state()
+
+    def counted(*names: str) -> int:
+        return sum(after["counters"].get(n, 0) - before["counters"].get(n, 0) for n in names)
+
+    taken, overrun = counted("commands"), counted("bus_overrun")
+    print(f"flood of {count} puts in {lasted:.2f} s by {way}: {taken} taken, overrun {overrun}")
+    assert count > 5000
+    assert taken > 100
+    # Without the limit what is too much is overrun, or comes in all the same.
+    assert taken + overrun + counted("command_stale") <= 1100 * lasted
+
+
+def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at_once(
+    flooded: Daemon, tmp_path: Path
+) -> None:
+    assert len(EMPTY_JOINTS) == len(EMPTY_NAMES) == 4096
+    program = words(
+        SLOW_WORK, flooded.endpoint, "joint_commands", 2.0, "acsard/describe_parameters",
+        EMPTY_JOINTS.hex(), EMPTY_NAMES.hex(),
+    )  # fmt: skip
+    with Bus(flooded.endpoint) as bus, bus.follow("state") as states:
+        bus.linked()
+        before = bus.state()
+        with Program(program, tmp_path) as flood:
+            flood.says("flooding")
+            begun = time.monotonic()
+            states.find(lambda _: True, 3.0, "0.7 s of it", after=begun + 0.7)
+            sent = time.monotonic()
+            bus.session.put("acsard/acsar/stop", b"")
+            stopped = states.find(
+                lambda state: state["mode"] == "stopped", 3.0, "stopped", after=sent
+            )
+            assert flood.process.poll() is None, "it was over too early"
+            count, called = map(int, flood.says("flooded").split()[1:])
+            assert flood.ended(5.0) == 0
+        after = bus.state()
+        assert bus.get("srv/clear")["success"]
+    periods = Periods.between(before, after)
+    refused = after["counters"]["command_malformed"]
+    print(
+        f"{count} puts of 1017 names and {called} calls with 1022: {refused} refused, "
+        f"{periods.missed} of {periods.elapsed:.0f} periods missed, "
+        f"stop latched after {stopped.at - sent:.4f} s"
+    )
+    assert called == 1000
+    assert refused > 100
+    assert "64" in after["refused"]
+    assert periods.missed <= 0.03 * periods.elapsed
+    assert stopped.at - sent < 0.2
+    assert flooded.process.poll() is None
+    assert "Traceback" not in flooded.stderr

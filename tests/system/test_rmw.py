@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import zenoh
 
-from tests.system.harness import Bus, Daemon, Program, Tables, free_endpoint, until
+from tests.system.harness import Bus, Daemon, Program, Tables, client_config, free_endpoint, until
 from tests.system.ros_clients import (
     EMPTY_REQUEST,
     GET,
@@ -313,6 +314,23 @@ def test_a_late_advanced_subscriber_gets_the_static_transforms_at_once(ros: RmwC
         message = decode(TF, got.payload)
         assert [t.child_frame_id for t in message.transforms] == ["lidar_link"]
         assert time.monotonic() - begun < 1.0
+
+
+def test_the_static_transforms_have_the_heartbeat_of_a_late_comer_s_publisher(
+    tmp_path: Path,
+) -> None:
+    # They are put once, at the start: whoever is to see what follows must be there before.
+    meeting, beats = free_endpoint(), Samples()
+    key = rmw_key("tf_static", TF)
+    with zenoh.open(client_config(meeting, "router")) as router:
+        subscriber = router.declare_subscriber(f"{key}/@adv/pub/**", beats.add)
+        with Daemon(tmp_path, config={"bus": {"connect": [meeting]}}) as daemon:
+            beat = beats.first("a heartbeat", within=2.0)
+            unharmed(daemon)
+        subscriber.undeclare()
+    # What it says is the number of the last one; it is no transform, nor meant for those.
+    assert beat.payload == struct.pack("<I", 0)
+    assert not beat.attachment
 
 
 def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:

@@ -387,3 +387,38 @@ def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
     assert done.returncode == Exit.NO_PERMISSION, done
     assert "--directory" in done.stderr
     assert list(locked.iterdir()) == []
+
+
+# the configuration it writes
+
+
+def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, directory = tmp_path / "acsard.toml", tmp_path / "tls"
+    file.write_text('# mine\n[robot]\nid = "r1" # the first\n[bus]\nlisten = ["tcp/127.0.0.1:9"]\n')
+    assert lan("init", "--directory", str(directory), "--write", str(file)) == 0
+    text = file.read_text()
+    assert text.startswith('# mine\n[robot]\nid = "r1" # the first\n')
+    config = parse(text.encode())
+    assert config.bus.listen == ("tcp/127.0.0.1:9", "tls/0.0.0.0:7449")
+    assert config.bus.tls == str(directory)
+    assert str(file) in capsys.readouterr().out
+
+
+def test_init_writes_a_configuration_where_there_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    assert lan("init", "--directory", str(tmp_path / "tls"), "--write", str(file)) == 0
+    assert parse(file.read_bytes()).bus.tls == str(tmp_path / "tls")
+
+
+def test_init_leaves_a_configuration_that_is_wrong_as_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    for text in ("[bus\n", "[bus]\ncolour = 1\n"):
+        file.write_text(text)
+        words = ("--directory", str(tmp_path / "tls"), "--force", "--write", str(file))
+        assert lan("init", *words) == Exit.FAILURE
+        assert "left as it was" in capsys.readouterr().err
+        assert file.read_text() == text

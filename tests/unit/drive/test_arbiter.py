@@ -41,14 +41,27 @@ class Bench:
         self.now_ns += int(ms * MS)
         return self
 
-    def send(self, source: Source | str, twist: Twist = GO) -> str:
+    def send(self, source: Source | str, twist: Twist = GO, voice: str = "") -> str:
         name = source if isinstance(source, str) else source.name
-        return self.arbiter.accept(Command(name, twist, self.now_ns))
+        return self.arbiter.accept(Command(name, twist, self.now_ns, voice=voice))
 
-    def stamped(self, source: Source, late_ms: float = 0.0, sender: str = "") -> str:
+    def stamped(
+        self,
+        source: Source,
+        late_ms: float = 0.0,
+        sender: str = "",
+        twist: Twist = GO,
+        voice: str = "",
+    ) -> str:
         """Send a command that was stamped `late_ms` ago by the sender's clock."""
         stamp_ns = self.now_ns + self.offset_ns - int(late_ms * MS)
-        return self.arbiter.accept(Command(source.name, GO, self.now_ns, stamp_ns, sender))
+        return self.arbiter.accept(
+            Command(source.name, twist, self.now_ns, stamp_ns, sender, voice)
+        )
+
+    def unreadable(self, source: Source, voice: str = "") -> None:
+        """Something that could not be decoded came from there."""
+        self.arbiter.notice(source.name, voice, self.now_ns)
 
     def choice(self) -> Choice:
         return self.arbiter.choose(self.now_ns)
@@ -402,6 +415,422 @@ def test_without_neutral_first_the_first_command_drives() -> None:
     assert bench.driver() == ""
     bench.send(HIGH)
     assert bench.driver() == "high"
+
+
+# the senders of one source
+
+
+def test_the_zero_of_one_sender_arms_no_other_of_its_source() -> None:
+    bench = Bench(HIGH, armed=False)
+    for step in range(40):
+        bench.send(HIGH, GO, "a")
+        if step == 10:
+            bench.send(HIGH, REST, "b")
+        assert bench.choice().twist in (None, REST)
+        bench.wait(50)
+
+
+def test_the_sender_that_was_neutral_drives_while_another_of_its_source_was_not() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    assert bench.driver() == ""
+    bench.wait(50).send(HIGH, REST, "b")
+    for _ in range(10):
+        bench.wait(50).send(HIGH, GO, "a")
+        bench.send(HIGH, BACK, "b")
+        assert bench.choice().twist == BACK
+
+
+def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is_told() -> None:
+    bench = Bench(HIGH, armed=False)
+    for voice in ("a", "b"):
+        bench.send(HIGH, REST, voice)
+        bench.wait(20)
+    for _ in range(50):
+        bench.send(HIGH, GO, "a")
+        assert bench.choice().twist == GO
+        bench.wait(20).send(HIGH, BACK, "b")
+        assert bench.choice().twist == GO
+        assert bench.status(HIGH).waits_for == (
+            "1 more of its senders: the first until it is silent"
+        )
+        bench.wait(20)
+
+
+def test_the_second_sender_of_a_source_has_it_once_the_first_is_silent_and_keeps_it() -> None:
+    bench = Bench(HIGH, armed=False)
+    for voice in ("a", "b"):
+        bench.send(HIGH, REST, voice)
+        bench.wait(20)
+    bench.send(HIGH, GO, "a")
+    bench.wait(200).send(HIGH, BACK, "b")
+    assert bench.wait(50).choice().twist == GO
+    assert bench.wait(1).choice().twist == BACK
+    assert bench.status(HIGH).waits_for == ""
+    bench.send(HIGH, GO, "a")
+    assert bench.choice().twist == BACK
+
+
+def test_a_zero_of_the_second_sender_brakes_nobody_who_came_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "a")
+    bench.wait(20).send(HIGH, GO, "a")
+    bench.wait(20).send(HIGH, REST, "b")
+    assert bench.choice().twist == GO
+
+
+def test_a_sender_that_was_never_neutral_holds_its_source_s_place_with_zero() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(LOW)
+    bench.send(HIGH, GO, "a")
+    choice = bench.choice()
+    assert (choice.source, choice.twist) == ("high", None)
+    assert "neutral first" in bench.status(HIGH).waits_for
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equal_sources_the_sender_who_came_first_counts(sources: tuple[Source, ...]) -> None:
+    bench = Bench(*sources)
+    bench.send(RIGHT, REST, "r")
+    bench.wait(10).send(LEFT, REST, "l")
+    bench.send(RIGHT, GO, "r")
+    bench.send(LEFT, BACK, "l")
+    assert bench.choice().twist == GO
+
+
+def test_each_sender_must_be_neutral_again_once_that_is_required() -> None:
+    bench = Bench(HIGH, armed=False)
+    for voice in ("a", "b"):
+        bench.send(HIGH, REST, voice)
+    bench.arbiter.require_neutral(bench.now_ns)
+    for voice in ("a", "b"):
+        bench.wait(50).send(HIGH, GO, voice)
+        assert bench.driver() == ""
+
+
+@pytest.mark.parametrize("before", [REST, GO])
+def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_heard(
+    before: Twist,
+) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.arbiter.require_neutral(bench.now_ns + 100 * MS)
+    bench.send(HIGH, before, "a")
+    bench.wait(300).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+
+
+def test_the_pause_of_one_sender_is_not_cut_short_by_another_nor_made_up_by_it() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    for _ in range(6):
+        bench.wait(50).send(HIGH, BACK, "b")
+    bench.send(HIGH, GO, "a")
+    assert bench.choice().twist == GO
+
+
+def test_without_neutral_first_the_first_sender_to_come_is_followed() -> None:
+    bench = Bench(HIGH, neutral_first=False, armed=False)
+    bench.send(HIGH, GO, "a")
+    bench.wait(20).send(HIGH, BACK, "b")
+    assert bench.choice().twist == GO
+
+
+def test_a_source_s_age_is_that_of_the_last_command_of_any_sender() -> None:
+    bench = Bench(HIGH, armed=False)
+    for voice in ("a", "b", "a", "b"):
+        bench.wait(50).send(HIGH, REST, voice)
+    assert bench.wait(20).status(HIGH).age_s == 0.02
+    bench.send(HIGH, REST, "a")
+    assert bench.wait(10).status(HIGH).age_s == 0.01
+
+
+# what is no silence
+
+
+def test_what_a_network_held_back_and_then_lets_in_arms_nobody() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(50).arbiter.require_neutral(bench.now_ns)
+    assert bench.stamped(HIGH) == ""
+    bench.wait(400)
+    answers = [bench.stamped(HIGH, late_ms=late) for late in (350, 300, 250, 200, 100, 0)]
+    assert answers == ["stale", "stale", "", "", "", ""]
+    assert bench.driver() == ""
+
+
+def test_what_pours_in_soon_after_a_clear_arms_nobody_however_late_each_came() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(600).arbiter.require_neutral(bench.now_ns)
+    assert [bench.wait(5).stamped(HIGH, late_ms=late) for late in (500, 400, 100)] == [
+        "stale",
+        "stale",
+        "",
+    ]
+    assert bench.driver() == ""
+    assert bench.wait(200).stamped(HIGH) == ""
+    assert bench.driver() == ""
+
+
+def test_a_gap_between_arrivals_that_is_none_between_stamps_is_no_pause() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(260).stamped(HIGH, late_ms=210)
+    assert bench.driver() == ""
+    bench.wait(260).stamped(HIGH, late_ms=240)
+    assert bench.driver() == ""
+
+
+def test_a_pause_that_shows_in_the_stamps_too_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(251).stamped(HIGH, late_ms=1.001)
+    assert bench.driver() == ""
+    bench.wait(300).stamped(HIGH)
+    assert bench.driver() == "high"
+
+
+def test_a_pause_before_a_command_without_a_stamp_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(251).send(HIGH)
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("step_ms", [10, 50, 249])
+def test_one_who_sends_nonsense_is_not_silent(step_ms: int) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH)
+    for _ in range(1 + 300 // step_ms):
+        assert bench.wait(step_ms).send(HIGH, Twist(math.nan, 0.0)) == "not_finite"
+    bench.wait(step_ms).send(HIGH)
+    assert bench.driver() == ""
+
+
+@pytest.mark.parametrize("step_ms", [10, 50, 249])
+def test_one_who_sends_what_cannot_be_read_is_not_silent(step_ms: int) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    for _ in range(1 + 300 // step_ms):
+        bench.wait(step_ms).unreadable(HIGH, "a")
+    bench.wait(step_ms).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+
+
+def test_after_nonsense_a_whole_pause_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    bench.wait(200).unreadable(HIGH, "a")
+    bench.wait(251).send(HIGH, GO, "a")
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("source", [Source("stranger", 1), HIGH])
+def test_what_cannot_be_read_is_nothing_of_one_who_was_never_heard(source: Source) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.unreadable(source, "a")
+    bench.wait(1000).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+    assert bench.status(HIGH).waits_for.startswith("neutral first")
+
+
+def test_what_cannot_be_read_is_no_silence_of_its_own_sender_only() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    bench.wait(200).unreadable(HIGH, "b")
+    bench.wait(51).send(HIGH, GO, "a")
+    assert bench.driver() == "high"
+
+
+def test_a_refused_command_is_no_sign_of_one_who_may_drive() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    assert bench.send(HIGH, Twist(math.nan, 0.0), "a") == "not_finite"
+    bench.unreadable(HIGH, "a")
+    assert bench.driver() == "low"
+
+
+def test_a_twist_that_is_zero_because_opposites_cancel_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    cancelled = Command("high", REST, bench.now_ns, cancelled=True)
+    assert bench.arbiter.accept(cancelled) == ""
+    assert bench.driver() == ""
+    bench.send(HIGH, GO)
+    assert bench.driver() == ""
+
+
+def test_a_twist_that_cancels_out_is_followed_of_one_who_may_drive() -> None:
+    bench = Bench(HIGH)
+    assert bench.arbiter.accept(Command("high", REST, bench.now_ns, cancelled=True)) == ""
+    assert bench.choice().twist == REST
+
+
+# how many senders are remembered
+
+
+def armed_in_turn(bench: Bench, voices: list[str]) -> None:
+    for voice in voices:
+        bench.wait(10).send(HIGH, REST, voice)
+
+
+def drives(bench: Bench, voice: str) -> bool:
+    """Whether it may, asked when all others are silent; it is then silent itself."""
+    bench.wait(300).send(HIGH, GO, voice)
+    allowed = bench.driver() == "high"
+    bench.wait(300)
+    return allowed
+
+
+def test_sixteen_senders_of_a_source_may_drive_in_turn() -> None:
+    bench = Bench(HIGH, armed=False)
+    voices = [f"voice {number}" for number in range(16)]
+    armed_in_turn(bench, voices)
+    assert all(drives(bench, voice) for voice in voices)
+
+
+def test_a_seventeenth_sender_takes_the_place_of_the_one_silent_for_longest() -> None:
+    bench = Bench(HIGH, armed=False)
+    voices = [f"voice {number}" for number in range(16)]
+    armed_in_turn(bench, voices)
+    bench.wait(300).send(HIGH, GO, voices[0])  # now number 1 is the one noticed longest ago
+    assert bench.wait(300).send(HIGH, REST, "one more") == ""
+    # Asked last: who is new again takes a place too.
+    asked = ("one more", voices[0], voices[2], voices[1])
+    assert [drives(bench, voice) for voice in asked] == [True, True, True, False]
+
+
+def test_sixteen_live_senders_let_in_no_other_and_keep_the_one_that_came_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "holder")
+    bench.wait(20).send(HIGH, GO, "holder")
+    answers = [bench.wait(1).send(HIGH, REST, f"stranger {number}") for number in range(16)]
+    assert answers == [""] * 15 + ["crowded"]
+    assert bench.choice().twist == GO
+    assert bench.wait(14).send(HIGH, GO, "holder") == ""
+    assert bench.choice().twist == GO
+
+
+def test_a_refused_sample_of_a_new_sender_makes_nobody_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    voices = [f"voice {number}" for number in range(16)]
+    armed_in_turn(bench, voices)
+    bench.wait(300)
+    assert bench.send(HIGH, Twist(math.nan, 0.0), "one more") == "not_finite"
+    assert all(drives(bench, voice) for voice in voices)
+
+
+def test_of_more_than_sixteen_senders_those_that_may_not_drive_are_forgotten_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    voices = [f"voice {number}" for number in range(15)]
+    armed_in_turn(bench, voices)
+    for number in range(100):
+        bench.wait(1).send(HIGH, BACK, f"stranger {number}")
+    assert all(drives(bench, voice) for voice in voices)
+
+
+def test_a_crowd_that_sends_zeros_takes_the_robot_from_nobody_who_is_heard_as_often() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "a")
+    for number in range(200):
+        if number % 8 == 0:
+            bench.send(HIGH, GO, "a")
+        bench.wait(1).send(HIGH, REST, f"stranger {number}")
+        assert bench.choice().twist == GO
+    assert bench.status(HIGH).waits_for.startswith("15 more of its senders")
+
+
+def test_a_crowd_that_sends_what_cannot_be_read_makes_nobody_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    for number in range(100):
+        bench.wait(1).unreadable(HIGH, f"stranger {number}")
+    bench.wait(251).send(HIGH, GO, "a")
+    assert bench.driver() == "high"
+
+
+def test_the_crowd_of_one_source_is_none_of_another() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST, "a")
+    for number in range(100):
+        bench.send(HIGH, REST, f"stranger {number}")
+    bench.wait(300).send(LOW, GO, "a")
+    assert bench.driver() == "low"
+
+
+# the law of it
+
+TWISTS = {"a": Twist(0.1, 0.0), "b": Twist(0.2, 0.0)}
+"""What tells in these whose twist is followed."""
+
+KINDS = ("go", "zero", "cancelled", "nan", "unreadable", "stamped", "neutral")
+
+
+class Told:
+    """What a sender has done since neutral was last required, as the law says it."""
+
+    def __init__(self) -> None:
+        self.zero = self.paused = False
+        self.counted: int | None = None
+        """The stamp of the last command that counted, or 0 when it had none."""
+        self.sign_ns = 0
+
+    def sent(self, at_ns: int, stamp_ns: int, refused: bool, zero: bool) -> None:
+        silent = at_ns - self.sign_ns > 250 * MS
+        self.sign_ns = at_ns
+        if refused:
+            return
+        if self.counted is not None and silent:
+            held = stamp_ns and self.counted and stamp_ns - self.counted <= 250 * MS
+            self.paused |= not held
+        self.zero |= zero
+        self.counted = stamp_ns
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 20, 100, 249, 251, 300, 600]),
+            st.sampled_from("ab"),
+            st.sampled_from(KINDS),
+            st.sampled_from([0, 60, 200, 249, 260, 400]),
+        ),
+        max_size=30,
+    )
+)
+def test_no_twist_is_followed_of_a_sender_that_was_neither_neutral_nor_silent(
+    story: list[tuple[int, str, str, int]],
+) -> None:
+    bench = Bench(HIGH, armed=False)
+    told = {"a": Told(), "b": Told()}
+    for wait_ms, voice, kind, late_ms in story:
+        now_ns, refused, stamp_ns = bench.wait(wait_ms).now_ns, "", 0
+        twist = TWISTS[voice]
+        if kind == "neutral":
+            bench.arbiter.require_neutral(now_ns)
+            for name, one in told.items():
+                told[name] = Told()
+                told[name].sign_ns = one.sign_ns
+            assert bench.driver() == ""
+            continue
+        if kind == "unreadable":
+            bench.unreadable(HIGH, voice)
+            refused = kind
+        elif kind == "stamped":
+            stamp_ns = now_ns + bench.offset_ns - late_ms * MS
+            refused = bench.stamped(HIGH, late_ms, sender=voice, twist=twist, voice=voice)
+        elif kind == "cancelled":
+            bench.arbiter.accept(Command("high", REST, now_ns, voice=voice, cancelled=True))
+        else:
+            given_twist = {"go": twist, "zero": REST, "nan": Twist(math.nan, 0.0)}[kind]
+            refused = bench.send(HIGH, given_twist, voice)
+        told[voice].sent(now_ns, stamp_ns, bool(refused), kind == "zero")
+        followed = bench.choice().twist
+        if followed == REST:
+            assert told["a"].zero or told["a"].paused or told["b"].zero or told["b"].paused
+        for name, mark in TWISTS.items():
+            if followed == mark:
+                assert told[name].zero or told[name].paused, name
 
 
 # the age of stamped commands

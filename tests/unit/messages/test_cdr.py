@@ -49,6 +49,7 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
+from acsard.ros.parameters import ListRequest, Names, SetRequest
 
 LITTLE, BIG = b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"
 
@@ -690,6 +691,12 @@ def test_a_sequence_longer_than_what_there_is_is_refused_before_it_is_made(
         tracemalloc.stop()
 
 
+class Numbers(Struct, frozen=True):
+    """A list without a bound."""
+
+    items: list[float] = []
+
+
 def test_one_item_more_than_there_are_is_refused() -> None:
     message = JointState(Header(), ["a", "b"], [1.0, 2.0], [3.0], [])
     payload = encoded(message)
@@ -704,12 +711,84 @@ def test_one_item_more_than_there_are_is_refused() -> None:
         Cdr(TFMessage).decode(payload[:4] + struct.pack("<I", 3) + payload[8:])
 
 
+# no more items than there may be
+
+
+class Node(Struct, frozen=True):
+    name: str = ""
+
+
+class Bounded(Struct, frozen=True):
+    numbers: Annotated[list[float], Meta(max_length=3)] = []
+    texts: Annotated[list[str], Meta(max_length=3)] = []
+    nodes: Annotated[list[Node], Meta(max_length=3)] = []
+
+
+@pytest.mark.parametrize("count", range(6))
+@pytest.mark.parametrize("name", ["numbers", "texts", "nodes"])
+def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
+    name: str, count: int
+) -> None:
+    item: dict[str, Any] = {"numbers": 0.5, "texts": "a", "nodes": Node("b")}
+    fields: Any = {name: [item[name]] * count}
+    message = Bounded(**fields)
+    payload = encoded(message)
+    if count <= 3:
+        assert Cdr(Bounded).decode(payload) == message
+        return
+    with pytest.raises(CdrError, match=rf"^{count} items where 3 may be$"):
+        Cdr(Bounded).decode(payload)
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize(
+    ("cls", "before", "most"),
+    [
+        (JointState, struct.pack("<iIIB3x", 0, 0, 1, 0), 64),
+        (Names, b"", 128),
+        (ListRequest, b"", 128),
+        (SetRequest, b"", 128),
+    ],
+)
+def test_too_many_items_are_refused_before_one_of_them_is_decoded(
+    cls: type[Struct], before: bytes, most: int, order: str
+) -> None:
+    if order == ">" and before:
+        before = struct.pack(">iIIB3x", 0, 0, 1, 0)
+    head = (b"\0\1\0\0" if order == "<" else b"\0\0\0\0") + before
+    count = (4096 - len(head) - 4) // 4
+    for items in (bytes(4 * count), b"\xff" * 4 * count):  # of which the second has no item
+        payload = head + struct.pack(order + "I", count) + items
+        assert len(payload) == 4096
+        with pytest.raises(CdrError, match=rf"^{count} items where {most} may be$"):
+            Cdr(cls).decode(payload)
+
+
+@pytest.mark.parametrize(("cls", "most"), [(JointState, 64), (Names, 128), (ListRequest, 128)])
+def test_as_many_names_as_there_may_be_are_read(cls: type[Struct], most: int) -> None:
+    made: dict[type[Struct], Struct] = {
+        JointState: JointState(Header(), ["j"] * most, [0.5] * most, [0.5] * most, [0.5] * most),
+        Names: Names(["n"] * most),
+        ListRequest: ListRequest(["n"] * most, 0),
+    }
+    assert Cdr(cls).decode(encoded(made[cls])) == made[cls]
+
+
+@pytest.mark.parametrize("field", ["name", "position", "velocity", "effort"])
+def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
+    items = ["j"] * 65 if field == "name" else [0.5] * 65
+    payload = oracle_bytes(JointState(**cast(dict[str, Any], {field: items})))
+    with pytest.raises(CdrError, match=r"65 items where 64 may be"):
+        Cdr(JointState).decode(payload)
+
+
 def test_no_memory_is_kept_for_each_length_that_a_stranger_may_send() -> None:
-    codec = Cdr(JointState)
+    codec = Cdr(Numbers)
     payloads = [
-        oracle_bytes(JointState(Header(), [], [0.5] * count), little)  # ours would prepare `codec`
+        # Ours would prepare `codec`.
+        struct.pack(order, 0, flag, 0, 0, count, *[0.5] * count)
         for count in range(1, 501)
-        for little in (True, False)
+        for flag, order in ((1, f"<4BI4x{count}d"), (0, f">4BI4x{count}d"))
     ]
     codec.decode(payloads[0])
     tracemalloc.start()

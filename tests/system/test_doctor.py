@@ -1,0 +1,180 @@
+"""`acsard doctor` and `acsard ports`: each thing that is wrong is found, with its mend."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acsard.cli.certificates import Authority
+from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
+
+
+def examined(where: Path, text: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
+    """Exit code and findings by subject for a configuration."""
+    file = where / "doctor.toml"
+    file.write_text(text)
+    words = [sys.executable, "-m", "acsard", "doctor", "--json", "--config", str(file)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    assert done.stderr == ""
+    found: dict[str, list[dict[str, str]]] = {}
+    for finding in json.loads(done.stdout):
+        found.setdefault(finding["subject"], []).append(finding)
+    return done.returncode, found
+
+
+def toml(port: str = "sim", more: str = "") -> str:
+    return f'[mcu]\nport = "{port}"\n[bus]\nlisten = ["{free_endpoint()}"]\n{more}'
+
+
+def worst(findings: list[dict[str, str]]) -> dict[str, str]:
+    return max(findings, key=lambda one: ("ok", "warning", "failure").index(one["level"]))
+
+
+@pytest.fixture
+def terminal() -> Iterator[str]:
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+def test_a_machine_with_the_simulator_and_no_daemon_has_warnings_only(tmp_path: Path) -> None:
+    code, found = examined(tmp_path, toml())
+    assert code == 0
+    assert found["configuration"][0]["level"] == "ok"
+    assert "simulator" in worst(found["port"])["text"]
+    assert "acsard run" in worst(found["daemon"])["mend"]
+
+
+def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None:
+    code, found = examined(tmp_path, "[mcu]\nbaud = 1\n[robot]\nid = 3\n")
+    assert code == 1
+    assert [one["level"] for one in found["configuration"]] == ["failure", "failure"]
+
+
+def test_a_port_that_is_not_there_is_a_failure_with_what_there_is(tmp_path: Path) -> None:
+    code, found = examined(tmp_path, toml("/dev/acsar_that_is_not"))
+    assert code == 1
+    assert "is not there" in worst(found["port"])["text"]
+    assert "acsard ports" in worst(found["port"])["mend"]
+
+
+def test_a_port_that_is_a_file_is_a_failure(tmp_path: Path) -> None:
+    file = tmp_path / "port"
+    file.touch()
+    code, found = examined(tmp_path, toml(str(file)))
+    assert code == 1
+    assert "no serial device" in worst(found["port"])["text"]
+
+
+def test_who_holds_the_port_is_named_with_the_pid(tmp_path: Path, terminal: str) -> None:
+    holder = subprocess.Popen(
+        [sys.executable, "-c", f"import os, time; os.open({terminal!r}, os.O_RDWR | os.O_NOCTTY)\n"
+         "print('held', flush=True); time.sleep(30)"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        code, found = examined(tmp_path, toml(terminal))
+    finally:
+        holder.terminate()
+        holder.wait(5)
+    assert code == 1
+    held = [one for one in found["port"] if f"(pid {holder.pid})" in one["text"]]
+    assert [one["level"] for one in held] == ["failure"]
+    assert f"kill {holder.pid}" in held[0]["mend"]
+
+
+def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint):
+        peer.awaits(b"ap00.00")
+        listen = f'[bus]\nlisten = ["{daemon.endpoint}"]\n'
+        code, found = examined(tmp_path, f'[mcu]\nport = "{peer.path}"\n{listen}')
+        assert found["daemon"][0]["level"] == "ok"
+        assert found["daemon"][0]["text"].startswith("ready: ")
+        assert all(one["level"] != "failure" for one in found["daemon"])
+    assert code in (0, 1)  # the far peer itself holds the pty
+
+
+def test_an_address_with_something_else_behind_it_is_a_failure(tmp_path: Path) -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        began = time.monotonic()
+        code, found = examined(tmp_path, f'[bus]\nlisten = ["{endpoint}"]\n')
+        assert time.monotonic() - began < 25
+    assert code == 1
+    assert worst(found["daemon"])["level"] == "failure"
+
+
+def with_certificates(where: Path, days: float) -> str:
+    directory = where / "tls"
+    directory.mkdir()
+    Authority.make(directory, "test", 10).issue(directory, "robot", ["localhost"], days)
+    return f'[bus]\nlisten = ["{free_endpoint()}"]\ntls = "{directory}"\n'
+
+
+@pytest.mark.parametrize(
+    ("days", "level", "words"),
+    [(400, "ok", "valid for"), (10, "warning", "ends in"), (-3, "failure", "ended 3 days ago")],
+)
+def test_certificates_are_told_by_how_long_they_last(
+    tmp_path: Path, days: float, level: str, words: str
+) -> None:
+    code, found = examined(tmp_path, with_certificates(tmp_path, days))
+    assert worst(found["certificates"])["level"] == level
+    assert words in worst(found["certificates"])["text"]
+    assert code == (1 if level == "failure" else 0)
+
+
+def test_a_key_that_others_may_read_is_a_failure(tmp_path: Path) -> None:
+    text = with_certificates(tmp_path, 400)
+    (tmp_path / "tls" / "key.pem").chmod(0o644)
+    code, found = examined(tmp_path, text)
+    assert code == 1
+    assert "chmod 600" in worst(found["certificates"])["mend"]
+
+
+def test_certificates_that_are_missing_are_named(tmp_path: Path) -> None:
+    text = with_certificates(tmp_path, 400)
+    (tmp_path / "tls" / "ca.pem").unlink()
+    code, found = examined(tmp_path, text)
+    assert code == 1
+    assert "ca.pem is missing" in worst(found["certificates"])["text"]
+
+
+def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
+    _, found = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
+    assert "everyone behind that router" in worst(found["bus"])["text"]
+
+
+def test_for_people_each_finding_is_a_line_and_its_mend_another(tmp_path: Path) -> None:
+    file = tmp_path / "doctor.toml"
+    file.write_text(toml("/dev/acsar_that_is_not"))
+    words = [sys.executable, "-m", "acsard", "doctor", "--config", str(file)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    lines = done.stdout.splitlines()
+    index = next(i for i, line in enumerate(lines) if line.startswith("FAIL  port: "))
+    assert lines[index + 1].startswith("      -> ")
+
+
+def test_ports_lists_what_there_is_or_says_what_to_look_at() -> None:
+    words = [sys.executable, "-m", "acsard", "ports", "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    found: list[dict[str, Any]] = json.loads(done.stdout)
+    assert done.returncode == (0 if found else 1)
+    assert all(os.path.exists(port["device"]) for port in found)
+    plain = subprocess.run(words[:-1], capture_output=True, text=True, timeout=30, check=False)
+    assert plain.returncode == done.returncode
+    assert found or "dmesg" in plain.stderr
