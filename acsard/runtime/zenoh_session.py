@@ -87,6 +87,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         )
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
+        # What accepts and then says nothing is no daemon; a person waits for this.
+        "transport/unicast/open_timeout": 3000,
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }

@@ -24,6 +24,8 @@ from tests.system import ros_clients as ros
 from tests.system.harness import ZERO, Bus, Daemon, free_endpoint, until
 from tests.system.identities import ADMITTED, Certificates, Identity, free_tls_endpoint
 
+pytestmark = pytest.mark.network
+
 Verb = Literal["put", "delete", "query", "subscribe"]
 IDENTITIES: tuple[Identity, ...] = get_args(Identity)
 VERBS: tuple[Verb, ...] = get_args(Verb)

@@ -473,7 +473,7 @@ def filled(daemon: Daemon, filler: Bus) -> int:
     """
     before = sorted(unsent(port_of(daemon.endpoint)))[-4:]
     for _ in range(40):
-        filler.session.put("acsard/acsar/filler", b"." * 50_000)
+        filler.session.put("acsard/acsar/cmd/filler", b"." * 50_000)
     time.sleep(0.3)
     now = sorted(unsent(port_of(daemon.endpoint)))[-4:]
     return sum(now) if now == before and min(now) > 0 else 0

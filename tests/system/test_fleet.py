@@ -49,6 +49,8 @@ ROUTER = """\
 import json, sys, time
 import zenoh
 
+pytestmark = pytest.mark.network
+
 config = zenoh.Config.from_file(sys.argv[1])
 for key, value in json.loads(sys.argv[2]).items():
     config.insert_json5(key, json.dumps(value))

@@ -51,6 +51,8 @@ from tests.system.ros_clients import (
 )
 from tests.system.strangers import ROUTER, words
 
+pytestmark = pytest.mark.network
+
 COMMANDS = (
     ("/cmd_vel", TWIST, 0.3),
     ("/cmd_vel_teleop", STAMPED, 0.3),

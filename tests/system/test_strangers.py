@@ -101,6 +101,8 @@ def _at(host: str, command: list[str]) -> list[str]:
 VISIT = """\
 import json, sys, threading, time
 import zenoh
+
+pytestmark = pytest.mark.network
 seconds, endpoints, tls = float(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 scouted, heard, counted, opened, own = set(), set(), [], [], []
 scouting = zenoh.scout(lambda hello: scouted.add(str(hello.zid)), what="peer|router")
