@@ -17,7 +17,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import Any
 
@@ -114,6 +114,13 @@ class Client:
                 yield sample
         finally:
             subscriber.undeclare()
+
+    def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
+        """Call back for each sample of a key, on a thread of Zenoh's; `undeclare` it to end."""
+        try:
+            return self.session.declare_subscriber(self.key(name), callback)
+        except zenoh.ZError:
+            raise _no_key(name) from None
 
     def _subscribe(self, name: str) -> Any:
         try:

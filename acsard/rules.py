@@ -191,6 +191,8 @@ def _ros_problems(ros: RosConfig) -> list[str]:
 
 def _host(endpoint: str) -> str | None:
     scheme, _, address = endpoint.partition("/")
+    if set(endpoint) & set("#?;= \t"):
+        return None  # Zenoh's own options could switch off what is promised here
     host, _, port = address.rpartition(":")
     good = (
         scheme in ("tcp", "tls")

@@ -99,12 +99,27 @@ class Address(NamedTuple):
 def robot_address(args: argparse.Namespace) -> Address:
     """Where the robot is that a tool talks to: the options, else the configuration."""
     _, config = load(args.config)
+    return address_of(config, args.connect, args.id, args.tls)
+
+
+def address_of(
+    config: Config,
+    connect: str | None = None,
+    robot_id: str | None = None,
+    tls: str | None = None,
+) -> Address:
+    """Where the robot of a configuration is, unless the options say otherwise."""
     bus = config.bus
     # The daemon listens only as a peer; plain endpoints need no certificate.
     known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
-    endpoint = args.connect or known[0]
-    tls = (args.tls or bus.tls) if _is_tls(endpoint) else ""
-    return Address(endpoint, args.id or config.robot.id, tls)
+    endpoint = connect or _reachable(known[0])
+    certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
+    return Address(endpoint, robot_id or config.robot.id, certificates)
+
+
+def _reachable(endpoint: str) -> str:
+    """Where a tool on this machine reaches what listens on every address."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def _is_tls(endpoint: str) -> bool:

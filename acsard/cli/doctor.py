@@ -18,7 +18,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.cli.common import add_config, find
+from acsard.cli.common import add_config, address_of, find
 from acsard.settings import Config
 from acsard.values import NS_PER_S
 
@@ -182,8 +182,9 @@ def clock_and_scheduling() -> Iterator[Finding]:
 def certificates(config: Config) -> Iterator[Finding]:
     """Are the files of bus.tls there, private and in date?"""
     from acsard.messages.report import EXPIRY_DAYS
-    from acsard.runtime.certificates import ends_ns
+    from acsard.runtime.certificates import check, ends_ns
     from acsard.runtime.clock import now
+    from acsard.runtime.exits import ExitError
     from acsard.runtime.zenoh_session import CA, CERTIFICATE, KEY
 
     if not config.bus.tls:
@@ -196,10 +197,15 @@ def certificates(config: Config) -> Iterator[Finding]:
             yield Finding("certificates", "failure", text, "`sudo acsard lan init`, or sudo doctor")
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
+    try:
+        check(config.bus.tls)
+    except ExitError as error:
+        yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
+        return
     ends = ends_ns(config.bus.tls)
     if ends is None:
         mend = "pip install 'acsard[lan]' to have it read"
-        yield Finding("certificates", "warning", "cannot tell when it ends", mend)
+        yield Finding("certificates", "warning", "cannot tell when they end", mend)
         return
     days = (ends - now().wall_ns) / NS_PER_S / 86400
     mend = "a new one from the authority: `acsard lan add`, where ca-key.pem is"
@@ -221,8 +227,7 @@ def bus(config: Config) -> Iterator[Finding]:
             continue
         text = f"connects to {endpoint}: everyone behind that router has the rights of this machine"
         yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
-    endpoint = (config.bus.listen if config.bus.mode == "peer" else config.bus.connect)[0]
-    tls = config.bus.tls if endpoint.startswith("tls/") else ""
+    endpoint, _, tls = address_of(config)
     if not _answers(endpoint):
         mend = "systemctl status acsard; or start it: acsard run"
         yield Finding("daemon", "warning", f"nobody listens at {endpoint}", mend)
@@ -244,7 +249,7 @@ def bus(config: Config) -> Iterator[Finding]:
 
 def _answers(endpoint: str) -> bool:
     host, _, port = endpoint.partition("/")[2].rpartition(":")
-    host = {"0.0.0.0": "127.0.0.1", "[::]": "::1"}.get(host, host.strip("[]"))
+    host = host.strip("[]")
     try:
         socket.create_connection((host, int(port)), timeout=1.0).close()
     except OSError:

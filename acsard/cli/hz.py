@@ -35,9 +35,7 @@ def main(args: argparse.Namespace) -> int:
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-        subscriber = robot.session.declare_subscriber(
-            robot.key(args.topic), lambda _: times.append(time.monotonic())
-        )
+        subscriber = robot.listen(args.topic, lambda _: times.append(time.monotonic()))
         try:
             while left is None or left > 0:
                 time.sleep(1.0)

@@ -93,6 +93,7 @@ def main_init(args: argparse.Namespace) -> int:
         authority.issue(directory / "clients" / role, role, [], args.days)
     if args.write:
         _configure(Path(args.write), directory.resolve())
+    _admit_service(str(directory.resolve()))
     print(
         _NEXT.format(
             directory=directory.resolve(),
@@ -132,6 +133,19 @@ def main_add(args: argparse.Namespace) -> int:
     return 0
 
 
+def _admit_service(directory: str) -> None:
+    """The installed unit sees loopback only and none of root's files: its drop-in mends both."""
+    from acsard.cli.service import DROP_IN, UNIT, lan_drop_in, put
+
+    if os.geteuid() != 0 or not (DROP_IN.parent.parent / UNIT).exists():
+        return
+    file = lan_drop_in()
+    content = file.content.replace(DIRECTORY.encode(), directory.encode())
+    put(type(file)(file.path, content))
+    print(f"wrote {DROP_IN} for the service; look at its networks, then:")
+    print("systemctl daemon-reload && systemctl restart acsard\n")
+
+
 def _configure(file: Path, directory: Path) -> None:
     """Set the bus's keys in a configuration, its comments kept."""
     import tomlkit
@@ -139,7 +153,9 @@ def _configure(file: Path, directory: Path) -> None:
     from acsard.config import ConfigError, parse
 
     try:
-        document = tomlkit.parse(file.read_text(encoding="utf-8") if file.exists() else "")
+        before = file.read_text(encoding="utf-8") if file.exists() else ""
+        parse(before.encode())
+        document = tomlkit.parse(before)
         bus = document.setdefault("bus", tomlkit.table())
         listen = [str(one) for one in bus.get("listen", ["tcp/127.0.0.1:7448"])]
         if not any(one.startswith("tls/") for one in listen):

@@ -16,7 +16,8 @@ from msgspec import Struct
 
 from acsard.runtime.exits import Exit, ExitError
 
-UNIT = "acsard.service"
+UNIT, STOP = "acsard.service", "acsard-stop"
+DROP_IN = Path("/etc/systemd/system/acsard.service.d/lan.conf")
 HOME = "/opt/acsard/venv"
 """Where the unit of `deploy/` believes acsard to be."""
 
@@ -124,9 +125,7 @@ def main_install(args: argparse.Namespace) -> int:
             continue
         print(f"write   {file.path}  ({len(file.content)} bytes, mode {file.mode:o})")
         if not args.dry_run:
-            file.path.parent.mkdir(parents=True, exist_ok=True)
-            file.path.write_bytes(file.content)
-            file.path.chmod(file.mode)
+            put(file)
     _run(INSTALLED, args.dry_run)
     if not args.dry_run:
         print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then:")
@@ -134,15 +133,35 @@ def main_install(args: argparse.Namespace) -> int:
     return 0
 
 
+def put(file: File) -> None:
+    """Write it, with directories that the service's own user can enter whatever the umask."""
+    made = [place for place in file.path.parents if not place.exists()]
+    file.path.parent.mkdir(parents=True, exist_ok=True)
+    for place in made:
+        place.chmod(0o755)
+    file.path.unlink(missing_ok=True)  # a link is replaced, not written through
+    file.path.write_bytes(file.content)
+    file.path.chmod(file.mode)
+
+
+def lan_drop_in() -> File:
+    """What lets the unit onto the local network and gives it its certificates."""
+    return File(DROP_IN, (_source() / "systemd" / "lan.conf").read_bytes())
+
+
 def main_uninstall(args: argparse.Namespace) -> int:
     """Stop, disable, remove."""
     _ready(args)
-    present = [file for file in files() if file.found() is not None]
+    present = [file for file in [*files(), lan_drop_in()] if file.found() is not None]
     if any(file.path.name == UNIT for file in present):
         _run(LEAVING, args.dry_run)
+    changed = {file.path for file in present if file.found() != file.content and not args.force}
+    if any(path.name == UNIT for path in changed):
+        # A unit that stays, started again, must find what sends zeros after it.
+        changed |= {file.path for file in present if file.path.name == STOP}
     for file in present:
-        if file.found() != file.content and not args.force:
-            print(f"keep    {file.path}  (it was changed; --force removes it)")
+        if file.path in changed:
+            print(f"keep    {file.path}  (changed, or needed by what is; --force removes it)")
             continue
         print(f"remove  {file.path}")
         if not args.dry_run:
@@ -217,7 +236,7 @@ def _run(commands: tuple[tuple[str, ...], ...], dry_run: bool) -> None:
 def _prune(directory: Path) -> None:
     """Remove directories that were made for the file, as far as they are empty."""
     for place in (directory, *directory.parents):
-        if place.name not in ("bin", "acsard"):
+        if place.name not in ("bin", "acsard", "acsard.service.d"):
             return
         try:
             place.rmdir()

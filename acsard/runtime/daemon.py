@@ -19,6 +19,7 @@ from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.ros.trees import left_out
 from acsard.runtime import clock
+from acsard.runtime.certificates import check as check_certificates
 from acsard.runtime.certificates import ends_ns as ends_ns_of
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.logs import Log
@@ -135,6 +136,8 @@ async def _run(
             access_control(config),
         )
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
+        if config.bus.tls:
+            check_certificates(config.bus.tls)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)

@@ -78,10 +78,17 @@ def holders(path: str) -> Iterator[Holder]:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if any(_is_device(entry, wanted) for entry in os.scandir(process / "fd")):
-                name = (process / "comm").read_text().strip()
-                yield Holder(int(process.name), name)
+                yield Holder(int(process.name), _name(process))
         except OSError:
             continue  # ended meanwhile, or not ours to see
+
+
+def _name(process: Path) -> str:
+    """The program's name; acsard's own also when Python runs it as a module or script."""
+    words = (process / "cmdline").read_bytes().split(b"\0")
+    if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
+        return "acsard"
+    return (process / "comm").read_text().strip()
 
 
 def running(name: str) -> bool:

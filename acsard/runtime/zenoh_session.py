@@ -18,7 +18,7 @@ from acsard.settings import BusConfig
 COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
 
-MAX_SESSIONS = 32
+MAX_SESSIONS = 256
 """Clients at once; idle connections of strangers must not keep a person out for long."""
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"

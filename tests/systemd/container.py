@@ -90,11 +90,11 @@ class Ran(NamedTuple):
 class Container:
     """A booted systemd; leaving ends it and everything in it."""
 
-    def __init__(self, rootfs: Path, scratch: Path) -> None:
-        self._rootfs, self._log = rootfs, scratch / "console"
+    def __init__(self, rootfs: Path, scratch: Path, name: str = "acsard-test") -> None:
+        self._rootfs, self._log, self._name = rootfs, scratch / "console", name
         root = _cgroups()
         assert root is not None
-        self._cgroup = root / f"acsard-test-{os.getpid()}"
+        self._cgroup = root / f"{name}-{os.getpid()}"
         self.leader = 0
         """systemd's process as the host sees it."""
 
@@ -106,7 +106,7 @@ class Container:
         procs = self._cgroup / "cgroup.procs"
         words = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(procs), "systemd-nspawn"]
         words += ["--quiet", "--boot", "--register=no", "--keep-unit", "--private-network"]
-        words += ["--volatile=overlay", "--machine=acsard-test", "--console=pipe"]
+        words += ["--volatile=overlay", f"--machine={self._name}", "--console=pipe"]
         # Without these systemd cannot enforce IPAddressDeny= and DevicePolicy=.
         words += ["--capability=CAP_BPF", "--system-call-filter=@memlock bpf"]
         words += [f"--directory={self._rootfs}"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.systemd.container import UNIT, Container
+from tests.systemd.container import UNIT, Container, UnavailableError
 
 pytestmark = pytest.mark.systemd
 
@@ -16,17 +16,26 @@ PLACES = ("/etc", "/opt/acsard/bin")
 CONFIGURATION = "/etc/acsard/acsard.toml"
 
 
+@pytest.fixture(scope="module")
+def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+    """A systemd of its own: what is installed here is nothing the others could rely on."""
+    try:
+        with Container(rootfs, tmp_path_factory.mktemp("alone"), "acsard-service") as container:
+            container.install()
+            yield container
+    except UnavailableError as why:
+        pytest.skip(f"cannot boot a systemd: {why}")
+
+
 @pytest.fixture
-def bare(container: Container) -> Iterator[Container]:
-    """A container with the program alone, as after pip."""
-    for path in (f"/etc/systemd/system/{UNIT}", "/opt/acsard/bin/acsard-stop", CONFIGURATION):
-        container.path(path).unlink()
-    for directory in ("/opt/acsard/bin", "/etc/acsard"):
-        container.path(directory).rmdir()
-    container.run("systemctl", "daemon-reload")
-    yield container
-    container.run(ACSARD, "service", "uninstall", "--force")
-    container.install_unit()
+def bare(alone: Container) -> Iterator[Container]:
+    """The program alone, as after pip."""
+    clean = "rm -rf /etc/systemd/system/acsard.service* /opt/acsard/bin /etc/acsard"
+    alone.run("systemctl", "stop", UNIT)
+    alone.run("sh", "-c", clean)
+    alone.run("systemctl", "daemon-reload")
+    yield alone
+    alone.run(ACSARD, "service", "uninstall", "--force")
 
 
 def listing(container: Container) -> set[str]:
