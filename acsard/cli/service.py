@@ -155,7 +155,11 @@ def main_uninstall(args: argparse.Namespace) -> int:
     present = [file for file in [*files(), lan_drop_in()] if file.found() is not None]
     if any(file.path.name == UNIT for file in present):
         _run(LEAVING, args.dry_run)
-    changed = {file.path for file in present if file.found() != file.content and not args.force}
+    changed = {
+        file.path
+        for file in present
+        if file.found() != file.content and (file.kept or not args.force)
+    }
     if any(path.name == UNIT for path in changed):
         # A unit that stays, started again, must find what sends zeros after it.
         changed |= {file.path for file in present if file.path.name == STOP}

@@ -33,8 +33,8 @@ def mixed(where: Path) -> None:
 
 
 BROKEN: dict[str, Callable[[Path], object]] = {
-    "nothing": lambda where: [os.remove(path) for path in where.glob("*.pem")],
-    "no key": lambda where: os.remove(where / "key.pem"),
+    "nothing": lambda where: [path.rename(where / path.stem) for path in where.glob("*.pem")],
+    "no key": lambda where: [path.rename(where / "gone") for path in where.glob("key.pem")],
     "junk": lambda where: (where / "certificate.pem").write_text("junk"),
     "junk authority": lambda where: (where / "ca.pem").write_text("junk"),
     "another's key": mixed,
