@@ -208,7 +208,7 @@ def certificates(config: Config) -> Iterator[Finding]:
         yield Finding("certificates", "warning", "cannot tell when they end", mend)
         return
     days = (ends - now().wall_ns) / NS_PER_S / 86400
-    mend = "a new one from the authority: `acsard lan add`, where ca-key.pem is"
+    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if days < 0:
         yield Finding("certificates", "failure", f"ended {-days:.0f} days ago", mend)
     elif days < EXPIRY_DAYS:

@@ -1,4 +1,4 @@
-"""`acsard lan init | add`: certificates for a bus that leaves the machine.
+"""`acsard lan init | add | renew`: certificates for a bus that leaves the machine.
 
 One authority of your own; the robot and each person or program get a certificate from it. The
 robot lets in who has one, and the common name in it decides what they may do (`[access]`).
@@ -57,7 +57,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--role", choices=ROLES, help="what it may do; leave it out for a robot or a router"
     )
     more.set_defaults(main=main_add)
-    for action in (init, more):
+    renew = actions.add_parser(
+        "renew",
+        help="a new certificate for the robot, of the same authority",
+        description="Make the robot's certificate anew before it ends; all others stay valid.",
+    )
+    renew.set_defaults(main=main_renew)
+    for action in (init, more, renew):
         action.add_argument(
             "--directory", default=DIRECTORY, metavar="DIR", help=f"default {DIRECTORY}"
         )
@@ -85,10 +91,9 @@ def main_init(args: argparse.Namespace) -> int:
             "--force makes a new authority, and all certificates of the old one are refused then",
         )
     host = socket.gethostname()
-    names = [host, f"{host}.local", "localhost", "127.0.0.1", *args.address]
     _writable(directory)
     authority = maker.make(directory, f"acsard at {host}", args.days)
-    authority.issue(directory, "robot", names, args.days)
+    authority.issue(directory, "robot", _robot_names(args.address), args.days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], args.days)
     if args.write:
@@ -107,19 +112,38 @@ def main_init(args: argparse.Namespace) -> int:
     return 0
 
 
-def main_add(args: argparse.Namespace) -> int:
-    """Make one more client certificate."""
-    maker = _authority()
+def main_renew(args: argparse.Namespace) -> int:
+    """Replace the robot's own certificate."""
     directory = Path(args.directory)
     _writable(directory)
+    _load(_authority(), directory).issue(directory, "robot", _robot_names(args.address), args.days)
+    print(f"{directory / CERTIFICATE} is new; systemctl restart acsard takes it into use")
+    return 0
+
+
+def _robot_names(more: list[str]) -> list[str]:
+    """What the robot is reached by: from elsewhere, by mDNS, and on itself."""
+    host = socket.gethostname()
+    return [host, f"{host}.local", "localhost", "127.0.0.1", *more]
+
+
+def _load(maker: type[Authority], directory: Path) -> Authority:
     try:
-        authority = maker.load(directory)
+        return maker.load(directory)
     except FileNotFoundError:
         raise ExitError(
             Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
         ) from None
     except (OSError, ValueError) as error:
         raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
+
+
+def main_add(args: argparse.Namespace) -> int:
+    """Make one more client certificate."""
+    maker = _authority()
+    directory = Path(args.directory)
+    _writable(directory)
+    authority = _load(maker, directory)
     place = directory / "clients" / args.name
     if place.exists():
         raise ExitError(Exit.FAILURE, f"{place} exists; remove it, or choose another name")

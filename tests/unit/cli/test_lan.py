@@ -422,3 +422,26 @@ def test_init_leaves_a_configuration_that_is_wrong_as_it_was(
         assert lan("init", *words) == Exit.FAILURE
         assert "left as it was" in capsys.readouterr().err
         assert file.read_text() == text
+
+
+def test_renew_makes_the_robot_s_certificate_anew_and_leaves_all_others(tmp_path: Path) -> None:
+    directory = tmp_path / "tls"
+    assert lan("init", "--directory", str(directory), "--days", "5") == 0
+    before = files(directory)
+    old = certificate(directory)
+    words = ("--directory", str(directory), "--days", "9", "--address", "10.0.0.9")
+    assert lan("renew", *words) == 0
+    after = files(directory)
+    assert {name for name in after if after[name] != before[name]} == {"certificate.pem", "key.pem"}
+    new = certificate(directory)
+    assert new.not_valid_after_utc > old.not_valid_after_utc
+    names = new.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "localhost" in names.get_values_for_type(x509.DNSName)
+    assert ipaddress.ip_address("10.0.0.9") in names.get_values_for_type(x509.IPAddress)
+
+
+def test_without_an_authority_nothing_is_renewed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lan("renew", "--directory", str(tmp_path)) == Exit.FAILURE
+    assert "acsard lan init" in capsys.readouterr().err
