@@ -111,3 +111,20 @@ def test_only_root_installs(bare: Container) -> None:
     assert done.code == 77
     assert "sudo" in done.err
     assert not Path(bare.path(CONFIGURATION)).exists()
+
+
+def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> None:
+    assert bare.run(ACSARD, "service", "install").code == 0
+    made = bare.run(ACSARD, "lan", "init", "--write", CONFIGURATION)
+    assert made.code == 0, made.out + made.err
+    bare.run("systemctl", "daemon-reload")
+    bare.run("systemctl", "restart", UNIT)
+    assert bare.show("ActiveState") == "active"
+    assert bare.show("NRestarts") == "0"
+    status = bare.run(ACSARD, "call", "stop", "--config", CONFIGURATION)
+    assert status.code == 0, status.err
+    viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", "/etc/acsard/tls/clients/viewer")
+    assert bare.run(ACSARD, "call", "stop", *viewer).code == 0
+    assert bare.run(ACSARD, "call", "clear", *viewer).code == 69
+    assert bare.run(ACSARD, "service", "uninstall").code == 0
+    assert not bare.path("/etc/systemd/system/acsard.service.d").exists()
