@@ -18,6 +18,9 @@ from acsard.cli.certificates import Authority
 from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
 
 
+pytestmark = pytest.mark.network
+
+
 def examined(where: Path, text: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
     """Exit code and findings by subject for a configuration."""
     file = where / "doctor.toml"

@@ -42,14 +42,14 @@ from tests.system.harness import (
 from tests.system.identities import free_tls_endpoint
 from tests.system.strangers import words
 
+pytestmark = pytest.mark.network
+
 FILES = ROOT / "deploy" / "zenoh"
 ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
 
 ROUTER = """\
 import json, sys, time
 import zenoh
-
-pytestmark = pytest.mark.network
 
 config = zenoh.Config.from_file(sys.argv[1])
 for key, value in json.loads(sys.argv[2]).items():

@@ -32,6 +32,8 @@ from tests.system.harness import (
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
 from tests.system.strangers import words
 
+pytestmark = pytest.mark.network
+
 PORT, TLS_PORT = 7448, 7449
 
 # another host
@@ -101,8 +103,6 @@ def _at(host: str, command: list[str]) -> list[str]:
 VISIT = """\
 import json, sys, threading, time
 import zenoh
-
-pytestmark = pytest.mark.network
 seconds, endpoints, tls = float(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 scouted, heard, counted, opened, own = set(), set(), [], [], []
 scouting = zenoh.scout(lambda hello: scouted.add(str(hello.zid)), what="peer|router")
