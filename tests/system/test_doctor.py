@@ -17,7 +17,6 @@ import pytest
 from acsard.cli.certificates import Authority
 from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
 
-
 pytestmark = pytest.mark.network
 
 
