@@ -29,6 +29,13 @@ class Histogram:
         self._count += 1
         self._max = max(self._max, value)
 
+    def merge(self, other: Histogram) -> None:
+        """Count all that the other has counted."""
+        if other._count:
+            self._buckets = [a + b for a, b in zip(self._buckets, other._buckets, strict=True)]
+            self._count += other._count
+            self._max = max(self._max, other._max)
+
     def spread(self) -> Spread:
         """Median, 99th percentile and maximum so far; a percentile is its bucket's upper end."""
         return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)

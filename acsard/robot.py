@@ -32,7 +32,6 @@ from acsard.values import (
     Request,
     Sample,
     Snapshot,
-    Spread,
 )
 
 MAX_DT = 0.05
@@ -42,6 +41,9 @@ must not leap."""
 UNHEARD_S = 0.25
 """s without a line that left: by its contract the MCU stops by itself soon after, so start over
 from rest instead of resuming a speed it no longer has."""
+
+HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
+"""What brakes by the stop limits."""
 
 MAX_TEXT = 200
 """Characters of a refusal kept: it may quote what a stranger sent."""
@@ -63,6 +65,8 @@ class Robot:
         self._life = Lifecycle(config.control.auto_activate)
         self._choice = Choice("", None, "no commands: no source has sent one yet")
         self._speeds = STILL
+        self._told: tuple[int | None, bool] = (None, False)
+        """Whose command, by its arrival, and whether halted: what the last line was made of."""
         self._limited_ns = 0
         self._before = (self._limiter.state, 0)
         """The limiter and its time before the last line: restored when that line did not go."""
@@ -79,7 +83,7 @@ class Robot:
         self._linked_once = False
         self._arbiter.require_neutral()
 
-    def snapshot(self, now_ns: int, lateness_us: Spread) -> Snapshot:
+    def snapshot(self, now_ns: int) -> Snapshot:
         """What `state` and `diagnostics` show; costs too much for every step."""
         session = self.session
         counters = {"lines": session.good_lines}
@@ -91,7 +95,6 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
-            lateness_us=lateness_us,
         )
 
     def step(self, inputs: Inputs) -> Outputs:
@@ -102,13 +105,15 @@ class Robot:
         self._hear(inputs)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         self._life.fire(Trigger.NO_COMMAND if self._choice.twist is None else Trigger.COMMAND)
-        line = self._drive(inputs) if inputs.tick else None
+        news = self._news()
+        due = inputs.tick or (inputs.at_once and news)
+        line = self._drive(inputs) if due else None
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
         changed, self._status = status != self._status, status
         return Outputs(
             now=inputs.now,
-            tick=inputs.tick,
+            tick=due,
             line=line,
             speeds=self._speeds,
             applied=applied,
@@ -122,6 +127,14 @@ class Robot:
             status_changed=changed,
             events=tuple(events),
             answers=answers,
+            news=news,
+        )
+
+    def _news(self) -> bool:
+        """The next line has something to say that the last did not: worth going at once."""
+        halted = self._life.mode in HALTED
+        return (self._choice.arrived_ns, halted) != self._told and (
+            halted or self._choice.arrived_ns is not None
         )
 
     # fold
@@ -250,6 +263,7 @@ class Robot:
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
+        self._told = (self._choice.arrived_ns, self._life.mode in HALTED)
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
         self._before = (limiter.state, self._limited_ns)
@@ -260,7 +274,7 @@ class Robot:
         elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))
         else:
-            limiter.coast(since, stop=self._life.mode in (Mode.STOPPED, Mode.FAULT, Mode.LEAVING))
+            limiter.coast(since, stop=self._life.mode in HALTED)
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)
         return self._line(now_ns)
 

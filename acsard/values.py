@@ -162,7 +162,8 @@ class SourceStatus(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """Everything one step may know.
 
-    `tick` says that a line may go out with this step; without it only feedback is folded.
+    `tick` says that a line goes out with this step, `at_once` that one may if there is something
+    new to say; without either only feedback is folded.
     `opened` counts how often the port has been opened: a new number is a new session with the MCU.
     """
 
@@ -181,6 +182,7 @@ class Inputs(Struct, frozen=True):
     """Why the guard replaced the previous line with STOP; latches a fault."""
     superseded: bool = False
     """The line of the previous tick did not go out: what it said never happened."""
+    at_once: bool = False
     leaving: bool = False
     """The daemon is going down: ramp to zero and stay there."""
 
@@ -190,6 +192,7 @@ class Outputs(Struct, frozen=True):
 
     now: Instant
     tick: bool
+    """A line was due, by the clock or at once."""
     line: bytes | None
     """The line for the MCU, or None when none is due."""
     speeds: WheelSpeeds
@@ -208,6 +211,8 @@ class Outputs(Struct, frozen=True):
     """One of the four above differs from the step before."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
+    news: bool = False
+    """A new command is followed, or a stop or fault has come, since the last line that was due."""
 
 
 class Spread(Struct, frozen=True):
@@ -217,6 +222,13 @@ class Spread(Struct, frozen=True):
     p50: float = 0.0
     p99: float = 0.0
     max: float = 0.0
+
+
+class Measured(Struct, frozen=True):
+    """One of the daemon's figures of itself, us."""
+
+    since_start: Spread = Spread()
+    last_minute: Spread = Spread()
 
 
 class Snapshot(Struct, frozen=True):
@@ -229,5 +241,5 @@ class Snapshot(Struct, frozen=True):
     counters: dict[str, int]
     refused: str
     """The last command that was refused and why, "" when none was."""
-    lateness_us: Spread
-    """How late the control periods began, us."""
+    figures: dict[str, Measured] = {}
+    """What the daemon measures of itself, by the names in `figures.py`."""

@@ -6,12 +6,13 @@ Only what somebody listens to is built. All messages of one feedback line carry 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 
 from acsard.mcu.wire import line_bytes, wire_use
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
+    Figure,
     Header,
     JointState,
     KeyValue,
@@ -22,6 +23,7 @@ from acsard.messages.schema import (
     Quaternion,
     RobotState,
     SourceState,
+    Spread,
     TFMessage,
     Time,
     Transform,
@@ -33,6 +35,7 @@ from acsard.messages.schema import (
 )
 from acsard.settings import Config
 from acsard.values import NS_PER_S, Instant, Outputs, Sample, Snapshot
+from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
 
 EXPIRY_DAYS = 30
@@ -84,26 +87,33 @@ class Report:
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
-    ) -> list[tuple[str, Message]]:
-        """The (key, message) pairs to publish after this step, of the keys in `wanted`."""
+    ) -> Iterator[tuple[str, Message]]:
+        """The (key, message) pairs to publish after this step, of the keys in `wanted`.
+
+        One by one, feedback first: a `state` takes as long to build as ten of the others.
+        """
         self._outputs = outputs
-        found: list[tuple[str, Message]] = []
+        if outputs.samples:
+            self._sample = outputs.samples[-1]
+        return self._due(outputs, wanted, look)
+
+    def _due(
+        self, outputs: Outputs, wanted: Collection[str], look: Look
+    ) -> Iterator[tuple[str, Message]]:
         for sample in outputs.samples:
-            self._sample = sample
             if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(sample.at.mono_ns):
                 if "odom" in wanted:
-                    found.append(("odom", self._odom(sample)))
+                    yield "odom", self._odom(sample)
                 if "tf" in wanted and self._config.odometry.publish_tf:
-                    found.append(("tf", self._tf(sample)))
+                    yield "tf", self._tf(sample)
             if "wheel_states" in wanted and self._rates["wheel_states"].due(sample.at.mono_ns):
-                found.append(("wheel_states", self._wheel_states(sample)))
+                yield "wheel_states", self._wheel_states(sample)
         now_ns = outputs.now.mono_ns
         if outputs.tick and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
-            found.append(("cmd_vel_out", self._cmd_vel_out(outputs)))
+            yield "cmd_vel_out", self._cmd_vel_out(outputs)
         for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
-                found.append((key, build(outputs, look())))
-        return found
+                yield key, build(outputs, look())
 
     def current(self, key: str, look: Look) -> Message | None:
         """The present value of a published key; None when there has been none yet."""
@@ -199,6 +209,10 @@ class Report:
             refused=snapshot.refused,
             certificate=self._certificate(outputs.now)[1],
             counters=snapshot.counters,
+            figures={
+                name: Figure(_spread(one.since_start), _spread(one.last_minute))
+                for name, one in snapshot.figures.items()
+            },
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -213,11 +227,12 @@ class Report:
         return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
-        config, counters, late = self._config, snapshot.counters, snapshot.lateness_us
+        config, counters, figures = self._config, snapshot.counters, snapshot.figures
         ok, warning, error = 0, 1, 2
         use = wire_use(config.rate_hz, config.mcu.baud_rate, line_bytes(config.mcu.trailing_comma))
         certificate = self._certificate(outputs.now)
-        missed, periods = counters.get("missed_periods", 0), max(1, late.count)
+        periods = figures["period_lateness"].since_start.count if figures else 0
+        missed = counters.get("missed_periods", 0)
         mode_level = error if outputs.mode == "fault" else ok
         statuses = (
             ("mode", mode_level, outputs.reason, {"mode": outputs.mode, "source": outputs.source}),
@@ -230,12 +245,13 @@ class Report:
             ),
             (
                 "control loop",
-                warning if missed > 0.01 * periods else ok,
+                warning if missed > 0.01 * max(1, periods) else ok,
                 f"{missed} of {periods} periods missed",
                 {
-                    "lateness_p50_us": f"{late.p50:.0f}",
-                    "lateness_p99_us": f"{late.p99:.0f}",
-                    "lateness_max_us": f"{late.max:.0f}",
+                    f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
+                    for name, one in figures.items()
+                    for when, spread in (("", one.since_start), ("_minute", one.last_minute))
+                    for share in ("p50", "p99", "max")
                 },
             ),
             (
@@ -260,6 +276,10 @@ class Report:
                 for name, level, message, values in statuses
             ],
         )
+
+
+def _spread(spread: Measurements) -> Spread:
+    return Spread(spread.count, spread.p50, spread.p99, spread.max)
 
 
 def _twist(twist: BodyTwist) -> Twist:

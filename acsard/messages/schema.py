@@ -152,6 +152,22 @@ class SourceState(Message, frozen=True):
     waits_for: str
 
 
+class Spread(Message, frozen=True):
+    """Median, 99th percentile and maximum of `count` measurements, us."""
+
+    count: int
+    p50: float
+    p99: float
+    max: float
+
+
+class Figure(Message, frozen=True):
+    """A duration that the daemon measures of itself."""
+
+    since_start: Spread
+    last_minute: Spread
+
+
 class RobotState(Message, frozen=True):
     """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s)."""
 
@@ -173,6 +189,9 @@ class RobotState(Message, frozen=True):
     counters: dict[str, int]
     certificate: str = ""
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
+    figures: dict[str, Figure] = {}
+    """How fast it is: period_lateness, step_time, command_age, command_to_wire, feedback_to_bus,
+    mcu_round_trip; at most a second old."""
 
 
 class KeyValue(Message, frozen=True):

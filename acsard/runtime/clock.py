@@ -7,6 +7,11 @@ import time
 from acsard.values import Instant
 
 
+def mono_ns() -> int:
+    """The monotonic clock alone."""
+    return time.monotonic_ns()
+
+
 def now() -> Instant:
     """Both clocks, read together."""
     return Instant(time.monotonic_ns(), time.time_ns())

@@ -9,10 +9,14 @@ from collections.abc import Callable
 from typing import Literal, Protocol
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.drive.kinematics import Kinematics
+from acsard.figures import Figures
 from acsard.guard import Guard
-from acsard.histogram import Histogram
+from acsard.mcu.pace import Pace
+from acsard.mcu.roundtrip import RoundTrip
+from acsard.mcu.wire import line_bytes, wire_ns
 from acsard.messages.encodings import DecodeError
 from acsard.messages.incoming import Arrival, Receiver, voice
 from acsard.messages.queries import Queries, Query, Reply
@@ -34,6 +38,9 @@ from acsard.values import (
 
 Offered = Literal["sent", "superseded", "down"]
 
+FEEDBACK = ("odom", "tf", "wheel_states")
+"""What is published of each feedback line."""
+
 QUERIES_PER_STEP = 8
 """Replies built in one step; a crowd of questions waits its turn instead of costing a period."""
 
@@ -44,6 +51,8 @@ class Port(Protocol):
     is_open: bool
     opened: int
     trouble: str
+    sent_ns: int
+    """When the last line had been handed over, monotonic."""
 
     def take(self) -> tuple[Received, ...]:
         """What was received since the last call."""
@@ -80,6 +89,9 @@ class Bus(Protocol):
     def done(self, number: int) -> None:
         """No more replies to this query."""
 
+    def alert(self, on: bool) -> None:
+        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
+
 
 class ControlLoop:
     """One robot between its port and its bus."""
@@ -92,11 +104,12 @@ class ControlLoop:
         bus: Bus,
         start: Instant,
         log: Callable[[Event], None],
+        mono_ns: Callable[[], int],
         certificate_ends_ns: int | None = None,
     ) -> None:
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
-        self.lateness_us = Histogram()
+        self.figures = Figures()
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
@@ -105,9 +118,15 @@ class ControlLoop:
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._port, self._bus, self._log = port, bus, log
+        self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded = False
         self._trip = ""
+        line_ns = wire_ns(line_bytes(config.mcu.trailing_comma), config.mcu.baud_rate)
+        self._pace = Pace(line_ns)
+        self._round_trip = RoundTrip(2 * line_ns)
+        self._prompted = not config.mcu.reply_period
+        self._followed_ns: int | None = None
+        """When the command arrived that the last line followed."""
 
     @property
     def at_rest(self) -> bool:
@@ -115,18 +134,24 @@ class ControlLoop:
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
+    @property
+    def retry_ns(self) -> int | None:
+        """When to wake again for a command that came too soon after a line; None for no need."""
+        return self._pace.retry_ns
+
     def wake(self, now: Instant, tick: bool, missed: int = 0, late_ns: int = 0) -> Outputs:
         """One step at `now`; `tick` with the period's lateness and how many were missed."""
         counters = self.robot.counters
         if tick:
-            self.lateness_us.add(late_ns / 1000)
+            self.figures.add("period_lateness", now.mono_ns, late_ns)
             if missed:
                 counters["missed_periods"] += missed
         commands, refusals, requests = self._from_bus(now)
-        port = self._port
+        port, pace = self._port, self._pace
         inputs = Inputs(
             now=now,
-            tick=tick,
+            tick=tick and pace.tick(),
+            at_once=pace.at_once(now.mono_ns),
             port_open=port.is_open,
             opened=port.opened,
             port_trouble=port.trouble,
@@ -140,8 +165,12 @@ class ControlLoop:
         )
         self._trip = ""
         outputs = self.outputs = self.robot.step(inputs)
-        self._send(outputs, now)
+        sent = self._send(outputs, now)
+        heard = bool(commands or refusals or requests)
+        pace.note(now.mono_ns, inputs.tick, sent, outputs.news, heard)
         self._publish(outputs)
+        self._bus.alert(pace.listens)
+        self.figures.add("step_time", now.mono_ns, self._mono_ns() - now.mono_ns)
         return outputs
 
     def _from_bus(
@@ -185,24 +214,45 @@ class ControlLoop:
             self._bus.done(query.number)
         return tuple(commands), tuple(refusals), tuple(requests)
 
-    def _send(self, outputs: Outputs, now: Instant) -> None:
+    def _send(self, outputs: Outputs, now: Instant) -> bool:
         line = self._guard.check(outputs)
         self._trip = self._guard.trip
         if line is None:
             self._superseded = self._superseded and not outputs.tick
-            return
+            return False
         offered = self._port.offer(line, now)
         self._superseded = offered != "sent"
         if offered == "sent":
+            self._measure(outputs)
             self._guard.note_sent()
             self.robot.counters["lines_sent"] += 1
         elif offered == "superseded":
             self.robot.counters["lines_superseded"] += 1
+        return offered == "sent"
+
+    def _measure(self, outputs: Outputs) -> None:
+        """A line went: how old is what it says?"""
+        sent_ns, command_ns = self._port.sent_ns, outputs.command_ns
+        if self._prompted:
+            self._round_trip.sent(sent_ns)
+        if command_ns is not None and outputs.mode == "driving":
+            self.figures.add("command_age", sent_ns, sent_ns - command_ns)
+            if command_ns != self._followed_ns:
+                self.figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
+        self._followed_ns = command_ns
 
     def _publish(self, outputs: Outputs) -> None:
-        bus = self._bus
+        bus, told_ns = self._bus, None
         for key, message in self.report.due(outputs, bus.wanted, self._look):
             bus.publish(key, message)
+            if key in FEEDBACK:
+                told_ns = self._mono_ns()
+        for sample in outputs.samples:
+            round_trip_ns = self._round_trip.replied(sample.at.mono_ns)
+            if round_trip_ns is not None:
+                self.figures.add("mcu_round_trip", sample.at.mono_ns, round_trip_ns)
+        if told_ns is not None:
+            self.figures.add("feedback_to_bus", told_ns, told_ns - outputs.samples[-1].at.mono_ns)
         for answer in outputs.answers:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:
@@ -217,4 +267,4 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        return self.robot.snapshot(now_ns, self.lateness_us.spread())
+        return replace(self.robot.snapshot(now_ns), figures=self.figures.measured(now_ns))

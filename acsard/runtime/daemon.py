@@ -26,7 +26,7 @@ from acsard.runtime.logs import Log
 from acsard.runtime.serial_port import SerialPort
 from acsard.runtime.sim_pty import SimPty
 from acsard.runtime.systemd import PATIENCE_S, Systemd
-from acsard.runtime.ticker import Ticker
+from acsard.runtime.ticker import Alarm, Ticker
 from acsard.runtime.zenoh_bus import ZenohBus
 from acsard.runtime.zenoh_session import log_from_environment
 from acsard.settings import Config
@@ -47,9 +47,17 @@ class _Wakeup:
 
     def __init__(self) -> None:
         self._event = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
 
     def __call__(self) -> None:
         self._event.set()
+
+    def from_thread(self) -> None:
+        """The same, from any thread."""
+        try:
+            self._loop.call_soon_threadsafe(self._event.set)
+        except RuntimeError:
+            pass  # the loop has closed: nobody is left to wake
 
     async def wait(self) -> None:
         """Until somebody calls."""
@@ -134,6 +142,7 @@ async def _run(
             config.robot.id,
             sources,
             access_control(config),
+            wake.from_thread,
         )
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         if config.bus.tls:
@@ -144,7 +153,9 @@ async def _run(
         await stack.enter_async_context(port)
         ends_ns = ends_ns_of(config.bus.tls) if config.bus.tls else None
         info = _info(config, path)
-        control = ControlLoop(config, info, port, bus, clock.now(), log.event, ends_ns)
+        control = ControlLoop(
+            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns
+        )
         announce(path, port.trouble)
         manager.ready()
         departure.started()
@@ -169,7 +180,7 @@ async def _control(
     await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
     gc.collect()
     gc.freeze()  # what lives now lives to the end; later collections need not look at it
-    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
+    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker, Alarm(wake) as alarm:
         ticker.start(clock.now().mono_ns)
         while True:
             await wake.wait()
@@ -179,6 +190,7 @@ async def _control(
             late_ns = now.mono_ns - period.due_ns
             outputs = control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
             manager.step(outputs)
+            alarm.set(control.retry_ns)
             if departure.over(now.mono_ns, control.at_rest):
                 return
 

@@ -7,6 +7,7 @@ from it when it steps.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import TypeVar
 
 import zenoh
@@ -44,7 +45,9 @@ T = TypeVar("T")
 class Inbox:
     """Samples and queries of one robot, until they are taken."""
 
-    def __init__(self, prefix: str, replies: Replies, sources: tuple[str, ...]) -> None:
+    def __init__(
+        self, prefix: str, replies: Replies, sources: tuple[str, ...], wake: Callable[[], None]
+    ) -> None:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
         self._prefix, self._replies = prefix, replies
@@ -58,6 +61,13 @@ class Inbox:
         self._slow: deque[Query] = deque()
         """Questions that take as long to answer as all others of a step."""
         self._overrun = 0
+        self._wake, self._alert = wake, False
+
+    def alert(self, on: bool) -> None:
+        """Wake the loop for the next command or stop, once; or leave it to the next period."""
+        self._alert = on
+        if on and (self._stops or any(self._arrivals.values())):
+            self._rouse()
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
@@ -104,11 +114,19 @@ class Inbox:
         )
         if key == "stop" and put:
             self._stops.append(arrival)
+            self._rouse()
             return
         held = self._arrivals.get(key, self._arrivals[OTHERS])
         if len(held) == ARRIVALS:
             self._overrun += 1
         held.append(arrival)
+        self._rouse()
+
+    def _rouse(self) -> None:
+        # Once until the loop asks for it again: a flood wakes nobody more often than that.
+        if self._alert:
+            self._alert = False
+            self._wake()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
         """A query that reached a row of the native table."""
@@ -133,6 +151,7 @@ class Inbox:
         if topic == "srv/stop":
             # The stop itself never waits in a line with other questions, nor is it turned away.
             self._stops.append(Arrival("stop", True, b"", "", arrived_ns, None, ""))
+            self._rouse()
         number = self._replies.open(query, key)
         if number is None:
             return

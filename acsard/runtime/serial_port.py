@@ -68,6 +68,8 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._waiting = array.array("i", [0])
+        self.sent_ns = 0
+        """When the last line had been handed to the kernel, monotonic."""
         self.trouble = ""
         """Why the port is closed, in words; "" while it is open."""
 
@@ -97,7 +99,8 @@ class SerialPort:
             self._leave(error)
             return "down"
         # From the moment it went, not from the start of the step that made it.
-        self._gate.note_sent(clock.now().mono_ns, len(data), taken)
+        self.sent_ns = clock.now().mono_ns
+        self._gate.note_sent(self.sent_ns, len(data), taken)
         return "sent" if taken == len(data) and not instead else "superseded"
 
     def _kernel_bytes(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from types import TracebackType
+from typing import Self
 
 from msgspec import Struct
 
@@ -18,33 +19,15 @@ class Period(Struct, frozen=True):
     due_ns: int
 
 
-class Ticker:
-    """Calls `wake` every period while entered; `take` says what the wake-up means."""
+class _Timer:
+    """A kernel timer that the event loop waits on while entered."""
 
-    def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
-        self._period_ns = period_ns
+    def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
         self._timer = TimerFd()
-        self._expired = 0
-        self._due_ns = 0
 
-    def start(self, now_ns: int) -> None:
-        """Begin; the first period ends one period from now."""
-        self._due_ns = now_ns
-        self._timer.set(now_ns + self._period_ns, self._period_ns)
+    def __enter__(self) -> Self:
         asyncio.get_running_loop().add_reader(self._timer.fileno(), self._expire)
-
-    def take(self) -> Period:
-        """The periods that ended since the last call."""
-        expired, self._expired = self._expired, 0
-        self._due_ns += expired * self._period_ns
-        return Period(expired, self._due_ns)
-
-    def _expire(self) -> None:
-        self._expired += self._timer.expirations()
-        self._wake()
-
-    def __enter__(self) -> Ticker:
         return self
 
     def __exit__(
@@ -55,3 +38,46 @@ class Ticker:
     ) -> None:
         asyncio.get_running_loop().remove_reader(self._timer.fileno())
         self._timer.close()
+
+    def _expire(self) -> None:
+        self._timer.expirations()
+        self._wake()
+
+
+class Alarm(_Timer):
+    """Calls `wake` once, at a time that may be set again and again."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        super().__init__(wake)
+        self._at_ns: int | None = None
+
+    def set(self, at_ns: int | None) -> None:
+        """Wake at monotonic `at_ns`; None: not at all (one already set still comes)."""
+        if at_ns is not None and at_ns != self._at_ns:
+            self._timer.set(at_ns)
+        self._at_ns = at_ns
+
+
+class Ticker(_Timer):
+    """Calls `wake` every period while entered; `take` says what the wake-up means."""
+
+    def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
+        super().__init__(wake)
+        self._period_ns = period_ns
+        self._expired = 0
+        self._due_ns = 0
+
+    def start(self, now_ns: int) -> None:
+        """Begin; the first period ends one period from now."""
+        self._due_ns = now_ns
+        self._timer.set(now_ns + self._period_ns, self._period_ns)
+
+    def take(self) -> Period:
+        """The periods that ended since the last call."""
+        expired, self._expired = self._expired, 0
+        self._due_ns += expired * self._period_ns
+        return Period(expired, self._due_ns)
+
+    def _expire(self) -> None:
+        self._expired += self._timer.expirations()
+        self._wake()

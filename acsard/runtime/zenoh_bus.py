@@ -6,6 +6,7 @@ Whatever may block (open, declare, reply, close) runs in a thread.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 from types import TracebackType
 
@@ -45,12 +46,13 @@ class ZenohBus:
         robot_id: str,
         sources: tuple[str, ...],
         access: dict[str, object],
+        wake: Callable[[], None],
     ) -> None:
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
-        self._inbox = Inbox(prefix, self._replies, sources)
+        self._inbox = Inbox(prefix, self._replies, sources, wake)
         self._outlets = Outlets()
         self._session: zenoh.Session | None = None
         self._kept: list[object] = []
@@ -78,6 +80,10 @@ class ZenohBus:
     def done(self, number: int) -> None:
         """No more replies to this query."""
         self._replies.done(number)
+
+    def alert(self, on: bool) -> None:
+        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
+        self._inbox.alert(on)
 
     # opening
 

@@ -10,6 +10,7 @@ import pytest
 
 from acsard.messages.schema import JointState, TFMessage, TwistStamped
 from acsard.settings import CommandsConfig, Config, ControlConfig, DriveConfig, McuConfig, WheelMap
+from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 
 
@@ -77,10 +78,14 @@ def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
 def test_what_is_applied_ramps_by_the_acceleration(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     twists = world.bus.published["cmd_vel_out"]
-    speeds = [t.twist.linear.x for t in twists if isinstance(t, TwistStamped)]
-    steps = [b - a for a, b in pairwise(speeds)]
-    assert max(steps) == pytest.approx(0.01)
-    assert speeds[-1] == 0.5
+    lines = [
+        (t.header.stamp.to_ns() / NS_PER_S, t.twist.linear.x)
+        for t in twists
+        if isinstance(t, TwistStamped)
+    ]
+    rates = [(v - u) / (t - s) for (s, u), (t, v) in pairwise(lines)]
+    assert max(rates) == pytest.approx(1.0, rel=1e-4)
+    assert lines[-1][1] == 0.5
 
 
 def test_silence_begins_a_ramp_within_the_timeout_and_a_tick(world: World) -> None:

@@ -34,6 +34,7 @@ class VirtualPort:
         self.opened = 0
         self.blocked = False
         self.trouble = ""
+        self.sent_ns = 0
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._baud_rate = baud_rate
@@ -67,6 +68,7 @@ class VirtualPort:
         data = self._gate.prefix + line
         self.mcu.receive(now.mono_ns, data)
         self._gate.note_sent(now.mono_ns, len(data), len(data))
+        self.sent_ns = now.mono_ns
         self.sent.append((now.mono_ns, line))
         return "superseded" if instead else "sent"
 
@@ -81,6 +83,10 @@ class MemoryBus:
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
         self.queries: list[Query] = []
+        self.alerted = False
+
+    def alert(self, on: bool) -> None:
+        self.alerted = on
 
     def take(self, queries: int) -> BusInput:
         got = BusInput(tuple(self.arrivals), tuple(self.queries[:queries]))
@@ -119,7 +125,13 @@ class World:
         self.watch: Callable[[Outputs], None] = lambda outputs: None
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
         self.loop = ControlLoop(
-            self.config, info, self.port, self.bus, self.instant, self.events.append
+            self.config,
+            info,
+            self.port,
+            self.bus,
+            self.instant,
+            self.events.append,
+            lambda: self.now_ns,
         )
         self._queries = 0
         self._missed = 0
@@ -136,6 +148,11 @@ class World:
             mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
             tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
             at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
+            retry_ns = self.loop.retry_ns
+            if retry_ns is not None and self.now_ns < retry_ns < min(at_ns, end_ns):
+                self.now_ns = retry_ns
+                self._wake(tick=False)
+                continue
             if at_ns > end_ns:
                 self.now_ns = max(self.now_ns, end_ns)
                 return
@@ -179,6 +196,9 @@ class World:
         self.bus.arrivals.append(
             Arrival(key, put, payload, "", self.now_ns, stamp_ns, "peer" if stamp_ns else "")
         )
+        if self.bus.alerted:
+            self.bus.alerted = False
+            self._wake(tick=False)
 
     def drive(
         self,

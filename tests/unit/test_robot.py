@@ -32,7 +32,6 @@ from acsard.values import (
     Received,
     Refusal,
     Request,
-    Spread,
     Twist,
     Verb,
     WheelSpeeds,
@@ -138,7 +137,7 @@ class Bench:
         return self.out.mode
 
     def counters(self) -> dict[str, int]:
-        return self.robot.snapshot(self.now_ns, Spread()).counters
+        return self.robot.snapshot(self.now_ns).counters
 
 
 def names(outputs: Outputs) -> list[str]:
@@ -218,7 +217,7 @@ def test_odometry_follows_the_wheels() -> None:
     assert sample.twist == Twist(0.5, 0.0)
     assert sample.positions == pytest.approx((10.0,) * 4)
     assert sample.covariance.xx == pytest.approx(1e-6 + 0.5e-4)  # 1e-4 m2 per metre
-    snapshot = bench.robot.snapshot(bench.now_ns, Spread())
+    snapshot = bench.robot.snapshot(bench.now_ns)
     assert (snapshot.pose, snapshot.measured) == (sample.pose, sample.twist)
     assert snapshot.speeds == ROLLING
 
@@ -330,12 +329,12 @@ def test_commands_are_counted_and_refusals_by_reason() -> None:
 
 def test_the_last_refusal_is_shown_in_words() -> None:
     bench = Bench().linked()
-    assert bench.robot.snapshot(bench.now_ns, Spread()).refused == ""
+    assert bench.robot.snapshot(bench.now_ns).refused == ""
     bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
-    assert bench.robot.snapshot(bench.now_ns, Spread()).refused == "cmd/**: no wildcards"
+    assert bench.robot.snapshot(bench.now_ns).refused == "cmd/**: no wildcards"
     bench.step(REST, source="stranger")
     bench.step(REST)
-    refused = bench.robot.snapshot(bench.now_ns, Spread()).refused
+    refused = bench.robot.snapshot(bench.now_ns).refused
     assert refused == "source stranger: not one of commands.sources"
 
 
@@ -361,7 +360,7 @@ def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None
     bench = Bench().driving()
     bench.step(REST, source="teleop")
     assert bench.step(GO).source == "teleop"
-    snapshot = bench.robot.snapshot(bench.now_ns, Spread())
+    snapshot = bench.robot.snapshot(bench.now_ns)
     waits = {source.name: source.waits_for for source in snapshot.sources}
     assert waits["app"] == "teleop has the higher priority: until it is silent"
     assert waits["teleop"] == ""
@@ -380,7 +379,7 @@ def test_an_unplugged_port_is_rest_in_the_same_step() -> None:
 def test_a_lost_port_clears_every_command() -> None:
     bench = Bench().driving()
     bench.unplug().step()
-    sources = bench.robot.snapshot(bench.now_ns, Spread()).sources
+    sources = bench.robot.snapshot(bench.now_ns).sources
     assert {source.age_s for source in sources} == {None}
 
 
@@ -389,7 +388,7 @@ def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
     bench.step()
     bench.step(GO)
     bench.step(ms=100)
-    ages = {s.name: s.age_s for s in bench.robot.snapshot(bench.now_ns, Spread()).sources}
+    ages = {s.name: s.age_s for s in bench.robot.snapshot(bench.now_ns).sources}
     assert ages["app"] == 0.1
 
 
@@ -397,7 +396,7 @@ def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there()
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # never yet
     bench.step(GO)
-    waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns, Spread()).sources}
+    waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns).sources}
     assert waits["app"] == ""
 
 
@@ -735,7 +734,7 @@ def test_a_lost_link_begins_the_count_of_impossible_lines_anew() -> None:
 def test_a_fault_clears_every_command() -> None:
     bench = Bench().driving()
     bench.step(guard_trip="a wheel is too fast")
-    sources = bench.robot.snapshot(bench.now_ns, Spread()).sources
+    sources = bench.robot.snapshot(bench.now_ns).sources
     assert {source.age_s for source in sources} == {None}
 
 

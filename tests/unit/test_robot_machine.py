@@ -42,7 +42,6 @@ from acsard.values import (
     Pose,
     Received,
     Request,
-    Spread,
     Twist,
     Verb,
 )
@@ -467,7 +466,7 @@ class RobotMachine(RuleBasedStateMachine):
         assert outputs.reason
         self.check_mode(outputs, requests)
         self.check_odometry(outputs)
-        snapshot = self.robot.snapshot(self.now_ns, Spread())
+        snapshot = self.robot.snapshot(self.now_ns)
         told = msgspec.to_builtins((outputs.samples, snapshot, outputs.applied, outputs.speeds))
         assert all(map(math.isfinite, numbers(told)))
         assert all(source.waits_for or source.age_s is not None for source in snapshot.sources)
@@ -505,7 +504,7 @@ class RobotMachine(RuleBasedStateMachine):
             turned = math.remainder(sample.pose.yaw - self.pose.yaw, math.tau)
             assert abs(turned) <= fastest * 2 / drive.wheel_separation * dt + 1e-9
             self.pose, self.sampled_ns = sample.pose, sample.at.mono_ns
-        self.pose = self.robot.snapshot(self.now_ns, Spread()).pose
+        self.pose = self.robot.snapshot(self.now_ns).pose
 
     def send(self, outputs: Outputs) -> None:
         """The rest of `ControlLoop._send`, with the wire watched."""

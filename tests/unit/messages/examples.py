@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from acsard.values import (
     Instant,
+    Measured,
     Outputs,
     Pose,
     PoseCovariance,
@@ -56,7 +57,9 @@ SNAPSHOT = Snapshot(
     ),
     counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
     refused="source nav: held up",
-    lateness_us=Spread(1000, 50.0, 400.0, 900.0),
+    figures={
+        "period_lateness": Measured(Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0))
+    },
 )
 
 

@@ -16,12 +16,14 @@ from acsard.messages.report import Report, from_rpy, from_yaw
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
+    Figure,
     JointState,
     Message,
     Odometry,
     Quaternion,
     RobotState,
     SourceState,
+    Spread,
     TFMessage,
     Time,
     TwistStamped,
@@ -112,7 +114,7 @@ def test_the_frames_are_the_configured_ones() -> None:
 
 def test_each_message_is_of_the_type_its_topic_says() -> None:
     report = Report(CONFIG, START)
-    report.due(OUTPUTS, set(), never)
+    list(report.due(OUTPUTS, set(), never))
     for topic in PUBLISHED:
         assert type(report.current(topic.key, look)).__name__ == topic.type
 
@@ -325,6 +327,11 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
         sources=[SourceState("app", 50, 0.01, ""), SourceState("nav", 10, None, "a command")],
         refused="source nav: held up",
         counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
+        figures={
+            "period_lateness": Figure(
+                Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
+            )
+        },
     )
 
 
@@ -380,9 +387,12 @@ def test_more_than_one_missed_period_in_a_hundred_is_a_warning(missed: int, leve
     one = status("control loop", counters={"missed_periods": missed})
     assert (one.level, one.message) == (level, f"{missed} of 1000 periods missed")
     assert values(one) == {
-        "lateness_p50_us": "50",
-        "lateness_p99_us": "400",
-        "lateness_max_us": "900",
+        "period_lateness_p50_us": "50",
+        "period_lateness_p99_us": "400",
+        "period_lateness_max_us": "900",
+        "period_lateness_minute_p50_us": "40",
+        "period_lateness_minute_p99_us": "80",
+        "period_lateness_minute_max_us": "90",
     }
 
 
@@ -407,15 +417,20 @@ def test_only_what_is_wanted_is_published(wanted: set[str]) -> None:
     assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
 
 
+def test_feedback_is_out_before_the_summary_is_built() -> None:
+    due = Report(CONFIG, START).due(OUTPUTS, ALL, never)
+    assert [next(due)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
+
+
 def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
     wanted = ALL - {"state", "diagnostics"}
-    assert len(Report(CONFIG, START).due(OUTPUTS, wanted, never)) == 4
+    assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 4
 
 
 def test_nobody_looks_at_the_robot_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
-    report.due(at(later(0)), ALL, look)
-    assert report.due(at(later(0.01), samples=()), {"state", "diagnostics"}, never) == []
+    list(report.due(at(later(0)), ALL, look))
+    assert not list(report.due(at(later(0.01), samples=()), {"state", "diagnostics"}, never))
 
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:
@@ -453,7 +468,7 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
     report, count = Report(rates(odom=hz), START), 0
     for step in range(1000):
         late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond either way
-        count += len(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look))
+        count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)))
     assert abs(count - hz * 10) <= 1
 
 
@@ -462,7 +477,7 @@ def test_steps_a_little_early_or_late_do_not_make_the_gaps_uneven(hz: float, ste
     report, found = Report(rates(odom=hz), START), []
     for step in range(1000):
         late = (5 - step * 7 % 11) * 1e-5  # the first is the latest of all
-        if report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look):
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)):
             found.append(step)
     assert {b - a for a, b in pairwise(found)} == {steps}
 
@@ -486,7 +501,7 @@ def test_state_comes_at_ten_and_diagnostics_at_one_hertz_by_default() -> None:
 @pytest.mark.parametrize("key", ["state", "diagnostics"])
 def test_a_change_is_published_at_once(key: str) -> None:
     report = Report(CONFIG, START)
-    report.due(at(later(0)), {key}, look)
+    list(report.due(at(later(0)), {key}, look))
     for step in (1, 2, 3):
         changed = at(later(step / 100), status_changed=True)
         assert [name for name, _ in report.due(changed, {key}, look)] == [key]
@@ -497,7 +512,7 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
     found = [
         step
         for step in range(60)
-        if report.due(at(later(step / 100), status_changed=step == 25), {"state"}, look)
+        if list(report.due(at(later(step / 100), status_changed=step == 25), {"state"}, look))
     ]
     after = [step for step in found if step > 25]
     assert 25 in found
@@ -506,8 +521,8 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
 
 def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
     report = Report(CONFIG, START)
-    report.due(at(later(0)), {"state"}, look)
-    found = [s for s in range(500, 520) if report.due(at(later(s / 100)), {"state"}, look)]
+    list(report.due(at(later(0)), {"state"}, look))
+    found = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
     assert found[0] == 500
     assert len(found) <= 3
 
@@ -528,13 +543,13 @@ def test_the_static_transforms_are_there_from_the_start() -> None:
 @pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
 def test_the_present_value_is_what_was_or_would_have_been_published(key: str) -> None:
     report = Report(CONFIG, START)
-    report.due(OUTPUTS, set(), never)
+    list(report.due(OUTPUTS, set(), never))
     assert report.current(key, look) == published()[key]
 
 
 def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
     report = Report(CONFIG, START)
-    report.due(OUTPUTS, set(), never)
+    list(report.due(OUTPUTS, set(), never))
     report.due(at(later(9), samples=()), set(), never)
     odom: Message | None = report.current("odom", never)
     assert odom == published()["odom"]
@@ -552,7 +567,7 @@ def test_at_ten_hertz_the_gaps_are_even_too() -> None:
     found: list[int] = []
     for step in range(3000):
         late = rnd.uniform(0, 1e-4)
-        if report.due(at(later(1.0 + step / 100 + late)), {"state"}, lambda: SNAPSHOT):
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, look)):
             found.append(step)
     assert {b - a for a, b in pairwise(found[2:])} == {10}
 

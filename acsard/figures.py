@@ -1,0 +1,89 @@
+"""What the daemon measures of itself all the time: fixed memory, no clock of its own.
+
+Each figure is a duration in us, told as median, 99th percentile and maximum since the start and
+over the last minute. They go out in `state` and `diagnostics`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from acsard.histogram import Histogram
+from acsard.values import NS_PER_S, Measured, Spread
+
+Name = Literal[
+    "period_lateness",
+    "step_time",
+    "command_age",
+    "command_to_wire",
+    "feedback_to_bus",
+    "mcu_round_trip",
+]
+"""The figures, in the order of the way a command goes:
+
+period_lateness  how late a control period began
+step_time        from a wake-up of the control task to the end of its work
+command_age      from a command's arrival here to each line that follows it
+command_to_wire  from a command's arrival here to the first line that follows it
+feedback_to_bus  from the end of a feedback line to its last message handed to the bus
+mcu_round_trip   from a line handed to the port to the end of its answer
+"""
+
+NAMES: tuple[Name, ...] = get_args(Name)
+
+SLOT_NS = 5 * NS_PER_S
+"""The last minute is kept in pieces of this length; the oldest makes room for the newest."""
+
+SLOTS = 12
+
+FRESH_NS = NS_PER_S
+"""How old the told values may be: adding up the minute costs more than a step."""
+
+
+class _Figure:
+    def __init__(self) -> None:
+        self.total = Histogram()
+        self._slots = [Histogram() for _ in range(SLOTS)]
+        self._number = -SLOTS
+
+    def add(self, now_ns: int, value: float) -> None:
+        self._advance(now_ns // SLOT_NS)
+        self.total.add(value)
+        self._slots[self._number % SLOTS].add(value)
+
+    def last_minute(self, now_ns: int) -> Spread:
+        self._advance(now_ns // SLOT_NS)
+        minute = Histogram()
+        for slot in self._slots:
+            minute.merge(slot)
+        return minute.spread()
+
+    def _advance(self, number: int) -> None:
+        if number == self._number:
+            return
+        for old in range(max(self._number, number - SLOTS) + 1, number + 1):
+            self._slots[old % SLOTS] = Histogram()
+        self._number = number
+
+
+class Figures:
+    """All of them."""
+
+    def __init__(self) -> None:
+        self._figures = {name: _Figure() for name in NAMES}
+        self._told: dict[str, Measured] = {}
+        self._told_ns = -FRESH_NS
+
+    def add(self, name: Name, now_ns: int, duration_ns: int) -> None:
+        """Count one measurement made at monotonic `now_ns`."""
+        self._figures[name].add(now_ns, duration_ns / 1000)
+
+    def measured(self, now_ns: int) -> dict[str, Measured]:
+        """Every figure by its name; at most a second old."""
+        if now_ns - self._told_ns >= FRESH_NS:
+            self._told_ns = now_ns
+            self._told = {
+                name: Measured(figure.total.spread(), figure.last_minute(now_ns))
+                for name, figure in self._figures.items()
+            }
+        return self._told
