@@ -96,6 +96,7 @@ class McuConfig(Struct, frozen=True):
 class ControlConfig(Struct, frozen=True):
     rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
     auto_activate: bool = True
+    real_time: bool = True
 
 
 class DriveConfig(Struct, frozen=True):

@@ -61,6 +61,7 @@ ORDER = (
     "runtime.exits",
     "runtime.clock",
     "runtime.threads",
+    "runtime.real_time",
     "runtime.timerfd",
     "runtime.ticker",
     "runtime.journal",

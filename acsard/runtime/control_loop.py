@@ -6,6 +6,7 @@ Synchronous on purpose: the daemon calls `wake` from one task, the tests call it
 from __future__ import annotations
 
 from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from typing import Literal, Protocol
 
 from msgspec import Struct
@@ -74,7 +75,7 @@ class Bus(Protocol):
     """The bus as the loop sees it."""
 
     @property
-    def wanted(self) -> set[str]:
+    def wanted(self) -> AbstractSet[str]:
         """Published keys that somebody listens to."""
 
     def take(self, queries: int) -> BusInput:

@@ -18,7 +18,7 @@ from acsard.access import access_control
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.ros.trees import left_out
-from acsard.runtime import clock
+from acsard.runtime import clock, real_time
 from acsard.runtime.certificates import check as check_certificates
 from acsard.runtime.certificates import ends_ns as ends_ns_of
 from acsard.runtime.control_loop import ControlLoop
@@ -43,26 +43,32 @@ SIMULATOR = "sim"
 
 
 class _Wakeup:
-    """Wakes the control task; many calls before it runs are one."""
+    """Wakes the control task; many calls before it runs are one. An Event for one who waits."""
 
     def __init__(self) -> None:
-        self._event = asyncio.Event()
         self._loop = asyncio.get_running_loop()
+        self._called = False
+        self._waiter: asyncio.Future[None] | None = None
 
     def __call__(self) -> None:
-        self._event.set()
+        self._called = True
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
 
     def from_thread(self) -> None:
         """The same, from any thread."""
         try:
-            self._loop.call_soon_threadsafe(self._event.set)
+            self._loop.call_soon_threadsafe(self)
         except RuntimeError:
             pass  # the loop has closed: nobody is left to wake
 
     async def wait(self) -> None:
         """Until somebody calls."""
-        await self._event.wait()
-        self._event.clear()
+        if not self._called:
+            self._waiter = self._loop.create_future()
+            await self._waiter
+            self._waiter = None
+        self._called = False
 
 
 class _Departure:
@@ -112,6 +118,10 @@ async def run(config: Config, log: Log, announce: Announce) -> None:
     departure = _Departure(log, wake, manager)
     departure.watch()
     log_from_environment()
+    # Before the first thread: those the bus starts are not to inherit it.
+    refused = real_time.ask() if config.control.real_time else ""
+    if refused:
+        log.info("real_time", text=refused)
     try:
         await _run(config, log, announce, departure, wake, manager)
     except asyncio.CancelledError:

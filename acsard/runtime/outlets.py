@@ -54,15 +54,16 @@ class Outlets:
     def __init__(self) -> None:
         self._outlets: dict[str, list[_Outlet]] = {}
         self._kept: list[object] = []
-
-    @property
-    def wanted(self) -> set[str]:
+        self.wanted: frozenset[str] = frozenset()
         """The topics that somebody listens to."""
-        return {
+
+    def _count(self) -> None:
+        # Replaced whole: the loop may be reading it while one of Zenoh's threads is here.
+        self.wanted = frozenset(
             topic
-            for topic, outlets in self._outlets.items()
+            for topic, outlets in list(self._outlets.items())
             if any(outlet.wanted for outlet in outlets)
-        }
+        )
 
     def publish(self, topic: str, message: Message) -> None:
         """Send a message to its listeners."""
@@ -101,10 +102,13 @@ class Outlets:
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:
             outlet.wanted = True  # it is kept for those who are still to come
+            self._count()
             return
 
         def matching(status: zenoh.MatchingStatus) -> None:
             outlet.wanted = status.matching
+            self._count()
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
         outlet.wanted = outlet.wanted or publisher.matching_status.matching
+        self._count()

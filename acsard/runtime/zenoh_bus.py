@@ -61,7 +61,7 @@ class ZenohBus:
     # the control loop's view
 
     @property
-    def wanted(self) -> set[str]:
+    def wanted(self) -> frozenset[str]:
         """Published keys that somebody listens to, in whatever tree."""
         return self._outlets.wanted
 

@@ -134,6 +134,8 @@ class World:
             lambda: self.now_ns,
         )
         self._queries = 0
+        self._rung_ns: int | None = None
+        """The last alarm that rang: each rings once."""
         self._missed = 0
         self._due_ns = self.now_ns
 
@@ -149,8 +151,13 @@ class World:
             tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
             at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
             retry_ns = self.loop.retry_ns
-            if retry_ns is not None and self.now_ns < retry_ns < min(at_ns, end_ns):
-                self.now_ns = retry_ns
+            if (
+                retry_ns is not None
+                and retry_ns != self._rung_ns
+                and retry_ns <= min(at_ns, end_ns)
+            ):
+                self._rung_ns = retry_ns
+                self.now_ns = max(self.now_ns, retry_ns)
                 self._wake(tick=False)
                 continue
             if at_ns > end_ns:
