@@ -47,7 +47,7 @@ FIELDS = {
     "cmd_vel_out": {"header", "twist"},
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
-        "source", "sources", "refused", "counters", "certificate",
+        "source", "sources", "refused", "counters", "certificate", "figures",
     },
     "diagnostics": {"header", "status"},
 }  # fmt: skip
