@@ -3,7 +3,7 @@
 One process, one asyncio event loop: a serial microcontroller below, a Zenoh bus above, a control
 step every 10 ms between.
 
-            one task, every 10 ms (earlier when feedback is in hand)
+      one task, every 10 ms (earlier when a fresh command or feedback is in hand)
 
  serial -> received bytes ---+                          +-> report -> encode -> bus
                              +-> robot.step(inputs) ----+
@@ -17,7 +17,9 @@ Where to look, in the order the modules may import each other:
     values.py         the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
     settings.py       the keys of acsard.toml; validation.py, rules.py, config.py: file -> Config,
                       or why not
-    mcu/              wire time, lines, frames (the protocol), session (is the MCU there?)
+    figures.py        what the daemon measures of itself, in histograms of fixed size
+    mcu/              wire time, pace (when a line may go), round trip, lines, frames (the
+                      protocol), session (is the MCU there?)
     drive/            kinematics, odometry, sanity (can this feedback be true?), arbiter (who
                       commands?), limits, modes (the table), lifecycle (what latched it)
     messages/         schema (the published structs), topics (**the** key table), cdr, encodings,
@@ -27,7 +29,7 @@ Where to look, in the order the modules may import each other:
     access.py         who may do what: the topic table -> Zenoh's access rules
     robot.py          the order; guard.py: the last look at every outgoing line
     sim/              the vehicle and the fake microcontroller
-    runtime/          clock, ticker, serial device and port, Zenoh bus (inbox, outlets, replies),
+    runtime/          clock, ticker, real_time, serial device and port, Zenoh bus (inbox, outlets, replies),
                       systemd and its journal, logs, control loop, daemon
     client.py         drive and follow a robot from Python
     cli/              one verb per file

@@ -422,7 +422,7 @@ def flooded(where: Path, length: float) -> Flooded:
     assert count > 10_000 * length
     assert periods.missed <= 0.03 * periods.elapsed + 1
     assert grown < 10_000
-    assert after["mode"] != "fault"
+    assert after["mode"] != "fault", after["reason"]
     return found
 
 
