@@ -222,6 +222,7 @@ class Daemon(Program):
         ready: bool = True,
         words: Sequence[str] = (),
         shell: str = "",
+        before: Sequence[str] = (),
         **how: Any,
     ) -> None:
         self.endpoint = endpoint or free_endpoint()
@@ -230,7 +231,7 @@ class Daemon(Program):
         given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
         self.config = write_config(where / f"{name}.toml", given)
         self._ready = ready
-        run = acsard("run", "--config", str(self.config), *words)
+        run = [*before, *acsard("run", "--config", str(self.config), *words)]
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
         super().__init__(run, where, **how)

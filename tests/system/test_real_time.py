@@ -1,0 +1,60 @@
+"""Real-time scheduling and locked memory: taken where permitted, done without where not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import Bus, Daemon
+
+POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+
+
+def permitted() -> bool:
+    """May this process, and so the daemon it starts, become real-time and lock its memory?"""
+    capabilities = int(Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0], 16)
+    return bool(capabilities >> 23 & 1 and capabilities >> 14 & 1)  # CAP_SYS_NICE, CAP_IPC_LOCK
+
+
+needs_permission = pytest.mark.skipif(not permitted(), reason="not permitted here")
+
+
+def locked_kb(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmLck:")[2].split()[0])
+
+
+@needs_permission
+def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        policies = {
+            int(task.name): os.sched_getscheduler(int(task.name))
+            for task in Path(f"/proc/{daemon.pid}/task").iterdir()
+        }
+        assert policies.pop(daemon.pid) == POLICY
+        assert len(policies) > 3, "the bus has threads"
+        assert set(policies.values()) == {os.SCHED_OTHER}
+        assert locked_kb(daemon.pid) > 0
+        assert daemon.events("real_time") == []
+
+
+@needs_permission
+def test_it_can_be_switched_off(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config={"control": {"real_time": False}}) as daemon:
+        assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
+        assert locked_kb(daemon.pid) == 0
+        assert daemon.events("real_time") == []
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can take root's permissions away")
+def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_path: Path) -> None:
+    without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
+    with Daemon(tmp_path, before=without) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
+        (event,) = daemon.events("real_time")
+    assert "real-time scheduling and locked memory" in event["text"]
+    assert "control.real_time = false" in event["text"]
