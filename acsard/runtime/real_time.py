@@ -38,7 +38,7 @@ def ask() -> str:
 
 
 def _schedule() -> bool:
-    if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR):
         return True  # as systemd started us
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK

@@ -58,3 +58,13 @@ def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_pat
         (event,) = daemon.events("real_time")
     assert "real-time scheduling and locked memory" in event["text"]
     assert "control.real_time = false" in event["text"]
+
+
+@needs_permission
+def test_what_it_was_started_with_is_not_asked_for_again(tmp_path: Path) -> None:
+    as_a_service = ["chrt", "--fifo", "--reset-on-fork", "5"]
+    without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
+    with Daemon(tmp_path, before=[*as_a_service, *without]) as daemon:
+        assert os.sched_getparam(daemon.pid).sched_priority == 5
+        (event,) = daemon.events("real_time")
+    assert "no permission for locked memory:" in event["text"]
