@@ -32,7 +32,7 @@ from tests.system.harness import (
     until,
 )
 
-VERBS = ("run", "sim", "check", "topics", "echo", "hz", "drive", "call")
+VERBS = ("run", "sim", "check", "topics", "echo", "hz", "top", "drive", "call")
 
 
 def tool(shared: Daemon, *words: str) -> Finished:
