@@ -13,10 +13,24 @@ import traceback
 from typing import NoReturn
 
 from acsard import __version__
-from acsard.cli import call, check, doctor, drive, echo, hz, lan, ports, run, service, sim, topics
+from acsard.cli import (
+    call,
+    check,
+    doctor,
+    drive,
+    echo,
+    hz,
+    lan,
+    ports,
+    run,
+    service,
+    sim,
+    top,
+    topics,
+)
 from acsard.runtime.exits import Exit, ExitError
 
-VERBS = (run, sim, check, topics, echo, hz, drive, call, doctor, ports, lan, service)
+VERBS = (run, sim, check, topics, echo, hz, top, drive, call, doctor, ports, lan, service)
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address
@@ -25,6 +39,7 @@ or robot id in use, 77 no permission, 78 bad configuration
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)
       acsard echo odom -n 1     (in a third: where is it?)
+      acsard top                (all of it on one screen)
 """
 
 

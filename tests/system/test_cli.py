@@ -32,7 +32,7 @@ from tests.system.harness import (
     until,
 )
 
-VERBS = ("run", "sim", "check", "topics", "echo", "hz", "drive", "call")
+VERBS = ("run", "sim", "check", "topics", "echo", "hz", "top", "drive", "call")
 
 
 def tool(shared: Daemon, *words: str) -> Finished:
@@ -234,7 +234,7 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
     assert lines[1]["hz"] == pytest.approx(100.0, rel=0.03)
 
 
-@pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["call", "stop"]])
+@pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
 def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
     tmp_path: Path, words: list[str]
 ) -> None:

@@ -1,0 +1,107 @@
+"""`acsard top` at a terminal and in a pipe."""
+
+from __future__ import annotations
+
+import fcntl
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.system.harness import Bus, Daemon, Program, acsard, environment, until
+from tests.system.test_cli import ON_TERMINAL, Terminal
+
+SIZE = 80, 24
+
+FRAME = "\x1b[H"
+"""What each screen begins with: the cursor goes home."""
+
+
+@contextmanager
+def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard top` at a terminal of 80x24 of its own."""
+    env = environment(TERM="xterm-256color")
+    for name in ("COLUMNS", "LINES", "NO_COLOR"):
+        env.pop(name, None)
+    command = [sys.executable, "-c", ON_TERMINAL, "top", "--config", str(daemon.config)]
+    with Terminal() as terminal:
+        columns, rows = SIZE
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+        with Program(
+            command,
+            daemon.config.parent,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            yield terminal, program
+
+
+def shown(terminal: Terminal) -> list[str]:
+    """The lines of the last whole screen, without their colours; none before the first."""
+    for frame in reversed(terminal.screen.split(FRAME)):
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", frame).split("\r\n")
+        if len(lines) >= SIZE[1] and len(lines[-1]) >= SIZE[0]:
+            return [line.rstrip() for line in lines]
+    return []
+
+
+def shows(terminal: Terminal, text: str, within: float) -> list[str]:
+    """The first screen with that text on it."""
+
+    def look() -> list[str] | None:
+        lines = shown(terminal)
+        return lines if any(text in line for line in lines) else None
+
+    return until(look, within, f"{text!r} on the screen")
+
+
+def piped(daemon: Daemon) -> Program:
+    """`acsard top` without a terminal, though it is told to show colours."""
+    env = environment(COLUMNS="80", FORCE_COLOR="1")
+    return Program(acsard("top", "--config", str(daemon.config)), daemon.config.parent, env)
+
+
+def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon(
+    tmp_path: Path,
+) -> None:
+    # All in one, for the 2 s that a silence takes.
+    with Daemon(tmp_path) as daemon, piped(daemon) as once, top(daemon) as (terminal, program):
+        told = shows(terminal, " READY ", 10.0)
+        assert len(told) == SIZE[1]
+        assert max(map(len, told)) <= SIZE[0]
+        for text in (daemon.endpoint, "no commands", "SIMULATOR", "teleop", "mcu_round_trip"):
+            assert any(text in line for line in told), text
+
+        with Bus(daemon.endpoint) as bus, bus.commanding(0.5):
+            told = shows(terminal, " DRIVING ", 5.0)
+            assert any(line.startswith("▶ app") for line in told)
+
+        assert (once.ended(10.0), once.stderr) == (0, "")
+        assert re.match(r" [A-Z]+  ", once.out[1])
+        assert all(len(line) <= 80 and line.isprintable() for line in once.out)
+        assert re.search(r"lines +in +[\d.-]+/s of [\d,]+ +out", once.stdout)
+
+        daemon.signal(signal.SIGKILL)
+        daemon.ended(5.0)
+        told = shows(terminal, "s: is the daemon running?", 5.0)
+        assert len(told) == SIZE[1]
+        with Daemon(tmp_path, endpoint=daemon.endpoint, name="again"):
+            shows(terminal, " READY ", 5.0)
+            during = terminal.settings
+            terminal.press("q")
+            assert program.ended(3.0) == 0
+        after = terminal.settings
+    # It leaves a cursor, and the screen and the terminal as they were.
+    assert terminal.screen.endswith("\x1b[?25h\x1b[?1049l")
+    assert "Traceback" not in terminal.screen + program.stderr
+    assert during != after
+    with Terminal() as fresh:
+        assert after == fresh.settings
