@@ -231,3 +231,5 @@ class Snapshot(Struct, frozen=True):
     """The last command that was refused and why, "" when none was."""
     lateness_us: Spread
     """How late the control periods began, us."""
+    check: str = "plain"
+    """Which check the serial lines have, in words."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 
-from acsard.mcu.wire import line_bytes, wire_use
+from acsard.mcu.wire import wire_use
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -215,7 +215,7 @@ class Report:
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, late = self._config, snapshot.counters, snapshot.lateness_us
         ok, warning, error = 0, 1, 2
-        use = wire_use(config.rate_hz, config.mcu.baud_rate, line_bytes(config.mcu.trailing_comma))
+        use = wire_use(config.rate_hz, config.mcu.baud_rate, config.mcu.line_bytes)
         certificate = self._certificate(outputs.now)
         missed, periods = counters.get("missed_periods", 0), max(1, late.count)
         mode_level = error if outputs.mode == "fault" else ok
@@ -225,7 +225,7 @@ class Report:
                 "serial link",
                 ok if outputs.link == "up" else error,
                 outputs.link,
-                {"port": config.mcu.port, "wire_use": f"{use:.2f}"}
+                {"port": config.mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
                 | {k: str(v) for k, v in counters.items() if k.startswith("line")},
             ),
             (

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
-from acsard.mcu.session import Feedback
+from acsard.mcu.feedback import Feedback
 from acsard.settings import DriveConfig, OdometryConfig
 from acsard.values import Instant, Pose, PoseCovariance, Sample, Twist, WheelSpeeds
 from tests.vectors.drive import (

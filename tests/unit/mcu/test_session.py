@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.mcu.session import GOOD_LINES, LONG_GAP_NS, Feedback, McuSession
+from acsard.mcu.feedback import Feedback
+from acsard.mcu.session import GOOD_LINES, LONG_GAP_NS, McuSession
 from acsard.mcu.wire import wire_ns
 from acsard.settings import McuConfig, WheelMap
 from acsard.values import NS_PER_S, Instant, Received, WheelSpeeds
