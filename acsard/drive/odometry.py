@@ -75,21 +75,17 @@ class Odometry:
 
         After a gap without counts only the uncertainty advances.
         """
-        speeds, turned = feedback.speeds, feedback.turned
+        speeds, turned, gap = feedback.speeds, feedback.turned, feedback.gap
         lost_dt, self._lost_dt = self._lost_dt, 0.0
         lost_turned, self._lost_turned = self._lost_turned, NOWHERE
-        gap, dt = (feedback.gap if turned is None else 0.0), 0.0
-        if lost_dt > MAX_LOST_S:
-            gap += lost_dt  # too long to guess how it moved
-        else:
-            dt = lost_dt  # it went on at about this speed
-        if gap > 0.0:
-            self._add_gap(gap)
-        twist = self._kinematics.twist(speeds)
+        # Of lost lines without counts: it went on at about this speed, or too long to guess.
+        dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
         if turned is None:
-            dt += feedback.dt
-        else:
-            self._move(_sum(turned, lost_turned))
+            turned, dt, unknown = NOWHERE, dt + feedback.dt, unknown + gap
+        if unknown > 0.0:
+            self._add_gap(unknown)
+        twist = self._kinematics.twist(speeds)
+        self._move(_sum(turned, lost_turned))
         if dt > 0.0:
             self._advance(twist.linear * dt, twist.angular * dt)
             self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
@@ -98,6 +94,8 @@ class Odometry:
 
     def _move(self, turned: Motors) -> None:
         """Advance by these wheel angles in rad: equations (4) to (7) are linear."""
+        if turned == NOWHERE:
+            return
         moved = self._kinematics.twist(WheelSpeeds(*turned))
         self._advance(moved.linear, moved.angular)
         self._positions = _sum(self._positions, turned)

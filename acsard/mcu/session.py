@@ -218,6 +218,10 @@ class McuSession:
         if check.in_force != before[1] and check.state != "asking":
             fallen = check.state == "plain" or (self._wants_samples and not check.samples)
             text = f"the serial lines are {check.in_force}"
+            if check.state == "plain":
+                text += ": the microcontroller answers without a check"
+            elif fallen:
+                text += ": the microcontroller sends no counts"
             self.events.append(Event("link_check", text, "warning" if fallen else "info"))
         if check.refused and not before[2]:
             self.events.append(Event("link_check", check.refusal(), "error"))

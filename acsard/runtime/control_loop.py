@@ -101,7 +101,10 @@ class ControlLoop:
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._guard = Guard(
-            self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
+            self.robot.session.codec.stop,
+            config.limits.wheel_speed,
+            config.commands.sources,
+            require_check=config.mcu.link_check == "require",
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
