@@ -23,7 +23,8 @@ SEQUENCES = 256
 ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
-_SUFFIX = re.compile(rb"([^#*]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
+# The plain part's characters too: zero bytes in front of a line do not change an XMODEM check.
+_REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
 
 
 class Reading(Struct, frozen=True):
@@ -53,7 +54,7 @@ def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
 
 def unseal(line: bytes) -> Checked:
     """The parts of a reply without its end; raises `FrameError` unless all of it is right."""
-    match = _SUFFIX.fullmatch(line)
+    match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line
         raise FrameError("wrong_check" if has_suffix else "unchecked", line)

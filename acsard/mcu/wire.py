@@ -15,7 +15,7 @@ PLAIN_BYTES = 33
 """`ap12.50,bn08.75,cp15.00,dn10.25` and CR LF; one more with a trailing comma."""
 
 CHECK_BYTES = 8
-"""`#07*3CA1`: sequence and check, in both directions."""
+"""`#07*585F`: sequence and check, in both directions."""
 
 SAMPLE_BYTES = 21
 """`@` and the five sample fields of a reply; the command that asks for them has one letter more."""

@@ -56,7 +56,7 @@ class Faults:
         """The data after the wire: one bit of it may be turned."""
         if not data or not self._hit("bit", self.bit_error):
             return data
-        place, bit = divmod(self._passed["bit"] * 53 % (8 * len(data)), 8)
+        place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
     def mute(self) -> Fault:
