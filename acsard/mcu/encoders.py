@@ -24,6 +24,9 @@ SLACK_COUNTS = 4
 ROUNDING_MS = 2
 """What two readings rounded to whole milliseconds may be off."""
 
+DRIFT = 0.01
+"""By which share the two clocks may go apart; a ceramic resonator has half of it."""
+
 Unknown = Literal["unknown", "leap", "restarted"]
 """Why a difference says nothing: nothing to compare with or too long ago, further than a motor can
 have turned, another power-on of the MCU."""
@@ -42,13 +45,15 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """`counts` per turn; `wheel_speed` rad/s is the fastest a wheel can turn.
 
-        Less than `quiet_ns` a line of a live link is read late. By so much the host's clock may
-        seem to have advanced less than the MCU's; by more, the MCU's has started again.
+        No reading is read before it was made: by the MCU's clock no more time can have passed than
+        by the host's, but for how late the last one was read. That is known to `quiet_ns`.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
+        self._late_ms = 0.0
+        """How much later than the promptest one the last reading was read."""
 
     def forget(self) -> None:
         """The next reading is a first one: what came before is of another run or accounted for."""
@@ -65,7 +70,10 @@ class Encoders:
         before, before_ns = last
         host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
         mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
-        if mcu_ms > host_ms + self._early_ms:
+        late_ms = self._late_ms + host_ms - mcu_ms
+        self._late_ms = max(0.0, late_ms - DRIFT * host_ms)
+        if late_ms < -self._early_ms:
+            self._late_ms = 0.0
             return "restarted"
         if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
             return "unknown"

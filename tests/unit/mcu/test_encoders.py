@@ -71,7 +71,7 @@ def test_counts_and_milliseconds_go_on_over_their_wrap(bench: Bench) -> None:
 
 @given(
     steps=st.lists(
-        st.tuples(st.integers(1, 400), st.floats(-1.0, 1.0), st.floats(0.0, 90.0)), max_size=40
+        st.tuples(st.integers(1, 400), st.floats(-1.0, 1.0), st.floats(0.0, 300.0)), max_size=40
     )
 )
 def test_what_is_told_adds_up_to_all_that_was_counted(
@@ -140,6 +140,21 @@ def test_a_clock_that_went_back_is_a_restart(bench: Bench) -> None:
 def test_a_clock_that_leaps_ahead_of_the_hosts_is_a_restart(bench: Bench) -> None:
     assert bench.read(111, host_ms=10.0) == "restarted"
     assert isinstance(bench.read(109, host_ms=10.0), Turned)
+
+
+def test_a_reading_read_late_does_not_make_the_next_one_a_restart(bench: Bench) -> None:
+    assert bench.read(10, (50, 50, 50, 50), host_ms=300) == turned(50, 50, 50, 50)
+    found = bench.read(295, (50, 50, 50, 50), host_ms=15)  # none was made while the host slept
+    assert isinstance(found, Turned)
+    bench.mcu_ms = 0.0
+    assert bench.read(3, host_ms=10.0) == "restarted"
+
+
+@pytest.mark.parametrize("drift", [0.995, 1.005])
+def test_clocks_that_go_apart_are_no_restart_and_hide_none(bench: Bench, drift: float) -> None:
+    for _ in range(5000):
+        assert isinstance(bench.read(10, host_ms=10 * drift), Turned)
+    assert bench.read(125, host_ms=10.0) == "restarted"
 
 
 @given(old_ms=st.integers(0, 65535), since_ms=st.integers(0, 90), host_ms=st.integers(1, 100))
