@@ -285,11 +285,11 @@ def test_an_answer_without_a_sample_ends_asking_for_them() -> None:
 def test_samples_that_stop_coming_are_asked_for_no_more() -> None:
     bench = Bench(SAMPLES).checked(READING)
     for _ in range(FEW_SAMPLES - 1):
-        bench.reply(*bench.drive())
-    bench.reply(*bench.drive(), READING)
+        bench.reply(bench.drive()[0])
+    bench.reply(bench.drive()[0], READING)
     for _ in range(FEW_SAMPLES):
         assert bench.check.in_force == "checked with samples"
-        bench.reply(*bench.drive())
+        bench.reply(bench.drive()[0])
     assert bench.check.in_force == "checked"
 
 
