@@ -170,9 +170,9 @@ def test_a_slow_wire_is_given_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
     bench.check.heard_plain()
     bench.ask(3 * 190)
-    assert bench.check.state == "asking"
+    assert bench.check.in_force == "being asked for"
     bench.ask(100)
-    assert bench.check.state == "plain"
+    assert bench.check.in_force == "plain"
 
 
 def test_required_and_refused_it_is_asked_for_ever_and_says_why() -> None:
