@@ -1,10 +1,10 @@
 """The last look at every outgoing line, with code of its own.
 
-Shares nothing with `limits.py` or `frames.py`: it reads the finished bytes as the MCU will, and
-lets them pass only if they are finite, within the hard limit, and no faster than the last line sent
-unless a fresh command, a live link and mode DRIVING agreed (invariant 2). Without a link only
-zero passes. Anything else becomes the stop line, and the reason goes back into the robot, which
-latches a fault.
+Shares nothing with `limits.py`, `frames.py` or `check.py`: it reads the finished bytes as the MCU
+will, and lets them pass only if they are finite, within the hard limit, with a right check if they
+have one, and no faster than the last line sent unless a fresh command, a live link and mode DRIVING
+agreed (invariant 2). Without a link only zero passes. Anything else becomes the stop line, and the
+reason goes back into the robot, which latches a fault.
 """
 
 from __future__ import annotations
@@ -13,14 +13,22 @@ from acsard.settings import Source
 from acsard.values import Outputs
 
 _ZERO = (0, 0, 0, 0)
+_HEX = b"0123456789ABCDEF"
 
 
 class Guard:
     """Passes a line on or replaces it with `stop`; `trip` says why it did."""
 
-    def __init__(self, stop: bytes, wheel_speed: float, sources: tuple[Source, ...]) -> None:
+    def __init__(
+        self,
+        stop: bytes,
+        wheel_speed: float,
+        sources: tuple[Source, ...],
+        require_check: bool = False,
+    ) -> None:
+        """`stop` is the plain stop line: an MCU in any state obeys it."""
         self._stop = stop
-        self._length = len(stop)
+        self._require_check = require_check
         self._most = int(wheel_speed * 100 + 1)
         self._timeouts = {source.name: source.timeout * 1e9 for source in sources}
         self._sent = _ZERO
@@ -35,7 +43,7 @@ class Guard:
         if line is None:
             return None
         wheels = self._read(line)
-        self.trip = self._objection(wheels, outputs)
+        self.trip = self._objection(wheels, line, outputs)
         if self.trip or wheels is None:
             self._passed = _ZERO
             return self._stop
@@ -46,7 +54,9 @@ class Guard:
         """The line passed last has gone out: the next one is compared with it."""
         self._sent = self._passed
 
-    def _objection(self, wheels: tuple[int, int, int, int] | None, outputs: Outputs) -> str:
+    def _objection(
+        self, wheels: tuple[int, int, int, int] | None, line: bytes, outputs: Outputs
+    ) -> str:
         if wheels is None:
             return "it is not a whole line of four wheels"
         if wheels == _ZERO:
@@ -55,6 +65,8 @@ class Guard:
             return "a wheel is over limits.wheel_speed"
         if not outputs.linked:
             return "it moves a wheel without a link"
+        if self._require_check and b"#" not in line:
+            return "it moves a wheel without the check that mcu.link_check requires"
         grows = any(
             abs(new) > abs(old) or new * old < 0
             for new, old in zip(wheels, self._sent, strict=True)
@@ -72,7 +84,7 @@ class Guard:
 
     def _read(self, line: bytes) -> tuple[int, int, int, int] | None:
         """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
-        if len(line) != self._length or line[31:] != self._stop[31:]:
+        if line[31:] != self._stop[31:] and not self._sealed(line):
             return None
         found = []
         for motor, start in zip(b"abcd", (0, 8, 16, 24), strict=True):
@@ -83,3 +95,25 @@ class Guard:
                 return None
             found.append(int(digits) if token[1] == 0x70 else -int(digits))
         return found[0], found[1], found[2], found[3]
+
+    def _sealed(self, line: bytes) -> bool:
+        """From column 31 on: the dialect's comma, `#`, two digits, perhaps `S`, a right check."""
+        body, check = line[:-7], line[-7:]
+        comma, mark = self._stop[31:-2], body[31:]
+        digits = mark[len(comma) + 1 : len(comma) + 3]
+        return (
+            mark in (comma + b"#" + digits, comma + b"#" + digits + b"S")
+            and len(digits) == 2
+            and all(digit in _HEX for digit in digits)
+            and check == b"*%04X\r\n" % _crc(body)
+        )
+
+
+def _crc(data: bytes) -> int:
+    """CRC-16/XMODEM by the shifts of avr-libc's notes, not by the library that made the line."""
+    crc = 0
+    for byte in data:
+        x = crc >> 8 ^ byte
+        x ^= x >> 4
+        crc = (crc << 8 ^ x << 12 ^ x << 5 ^ x) & 0xFFFF
+    return crc

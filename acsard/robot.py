@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-from msgspec.structs import replace
-
 from acsard.drive.arbiter import REASONS, Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
@@ -18,7 +16,8 @@ from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger
 from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
-from acsard.mcu.session import LINK_WORDS, Feedback, Link, McuSession
+from acsard.mcu.feedback import Feedback
+from acsard.mcu.session import McuSession
 from acsard.settings import Config
 from acsard.values import (
     NS_PER_S,
@@ -48,15 +47,12 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
 MAX_TEXT = 200
 """Characters of a refusal kept: it may quote what a stranger sent."""
 
-BLIND_PERIOD_NS = NS_PER_S // 10
-"""Zero lines go out at 10 Hz while nothing comes back: enough to wake the MCU, little to queue."""
-
 
 class Robot:
     """One robot base: its link, pose, mode and commanders."""
 
     def __init__(self, config: Config) -> None:
-        self.session = McuSession(config.mcu, config.rate_hz)
+        self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(config.odometry, self._kinematics)
         self._arbiter = Arbiter(config.commands)
@@ -70,14 +66,12 @@ class Robot:
         self._limited_ns = 0
         self._before = (self._limiter.state, 0)
         """The limiter and its time before the last line: restored when that line did not go."""
-        self._line_ns = -BLIND_PERIOD_NS
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (superseded lines, missed periods)."""
         self._refused = ""
         self._sanity = Sanity(config.feedback)
-        self._lost_dt = 0.0
         self._told_ns: dict[str, int] = {}
         self._port_trouble = ""
         self._linked_once = False
@@ -95,6 +89,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
+            check=session.check.in_force,
         )
 
     def step(self, inputs: Inputs) -> Outputs:
@@ -141,7 +136,10 @@ class Robot:
 
     def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Sample, ...]:
         session, before = self.session, self.session.link
-        feedback = session.update(inputs.now, inputs.port_open, inputs.opened, inputs.received)
+        unsent = inputs.superseded or bool(inputs.guard_trip)
+        feedback = session.update(
+            inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent
+        )
         link = session.link
         if link != "up":
             self._sanity.forget()
@@ -149,8 +147,7 @@ class Robot:
         if session.restarted:
             # Nobody has driven before the first link: a zero sent while we started counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
-        if link != before:
-            events.append(_link_event(link))
+        events += session.events
         if link != "up":
             # Nobody can be ramped at the other end, and what was wished then is old now.
             self._limiter.cut()
@@ -172,18 +169,13 @@ class Robot:
         why = self._sanity.impossible(line)
         if why:
             self.counters["line_impossible"] += 1
-            self._lost_dt += line.dt
+            self._odometry.skip(line)
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now_ns, events)
             return None
         fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
         if fault:
             self._fault(fault, now_ns, events)
-        lost, self._lost_dt = self._lost_dt, 0.0
-        if lost > MAX_DT:
-            line = replace(line, gap=line.gap + lost)  # too long to guess how it moved
-        elif lost:
-            line = replace(line, dt=line.dt + lost)  # it went on at about this speed
         return self._odometry.fold(line)
 
     # requests
@@ -276,26 +268,16 @@ class Robot:
         else:
             limiter.coast(since, stop=self._life.mode in HALTED)
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)
-        return self._line(now_ns)
-
-    def _line(self, now_ns: int) -> bytes | None:
-        codec = self.session.codec
-        if not self.session.silent(now_ns):
-            self._line_ns = now_ns
-            return codec.stop if self._speeds == STILL else codec.encode(self._speeds)
-        if now_ns - self._line_ns < BLIND_PERIOD_NS:
-            return None
-        self._line_ns = now_ns
-        return codec.stop
+        return self.session.line(now_ns, self._speeds)
 
     # report
 
     def _reason(self) -> str:
         match self._life.mode:
             case Mode.DRIVING:
-                return f"driving: {self._choice.reason}"
+                return f"driving: {self._choice.reason}{self.session.note}"
             case Mode.READY:
-                return self._choice.reason
+                return f"{self._choice.reason}{self.session.note}"
             case Mode.WAITING:
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT:
@@ -304,9 +286,3 @@ class Robot:
                 return "switched off; call srv/activate"
             case Mode.LEAVING:
                 return "the daemon is going down"
-
-
-def _link_event(link: Link) -> Event:
-    return Event(
-        f"link_{link}", LINK_WORDS[link], "info" if link in ("up", "booting") else "warning"
-    )

@@ -6,11 +6,15 @@ Each contradiction is a line with key, value and mend; each warning a sentence.
 from __future__ import annotations
 
 import ipaddress
+import math
 
-from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes, wire_ns, wire_use
-from acsard.settings import AccessConfig, BusConfig, Config, RosConfig
+from acsard.mcu.wire import COMFORTABLE_USE, FIELD, highest_rate, line_bytes, wire_ns, wire_use
+from acsard.settings import AccessConfig, BusConfig, Config, McuConfig, RosConfig
 from acsard.validation import show
 from acsard.values import ROOT, WHEELS
+
+LEAST_BRIDGE = 2
+"""Control periods that encoder counts must last without a wrap: one lost line must cost nothing."""
 
 LEAST_JERK = 0.01
 """m/s3 or rad/s3; at less a robot takes over ten seconds to reach walking pace."""
@@ -19,7 +23,7 @@ LEAST_JERK = 0.01
 def warnings(config: Config) -> list[str]:
     """What is allowed but will surprise; a sentence each."""
     found = []
-    count = line_bytes(config.mcu.trailing_comma)
+    count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
     if use > COMFORTABLE_USE:
         comfortable = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE)
@@ -28,6 +32,7 @@ def warnings(config: Config) -> list[str]:
             f"{config.mcu.baud_rate} baud: lines will be superseded; "
             f"{comfortable} Hz is comfortable"
         )
+    found += _count_warnings(config)
     drive, limits = config.drive, config.limits
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
@@ -56,10 +61,28 @@ def warnings(config: Config) -> list[str]:
     return found
 
 
+def _count_warnings(config: Config) -> list[str]:
+    mcu = config.mcu
+    if not mcu.encoder_counts:
+        return []
+    if not mcu.wants_samples:
+        return [
+            f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: counts come with checked "
+            'lines only, and mcu.link_check = "off"; write "auto" or "require"'
+        ]
+    if mcu.port == "sim" and mcu.encoder_counts != config.sim.encoder_counts:
+        return [
+            f"mcu.encoder_counts = {mcu.encoder_counts} but the simulated robot's encoders have "
+            f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong"
+        ]
+    return []
+
+
 def contradictions(config: Config) -> list[str]:
     """What cannot be: a line each."""
     return [
         *_wire_problems(config),
+        *_count_problems(config),
         *_name_problems(config),
         *_limit_problems(config),
         *_bus_problems(config.bus),
@@ -70,7 +93,7 @@ def contradictions(config: Config) -> list[str]:
 
 def _wire_problems(config: Config) -> list[str]:
     mcu, rate = config.mcu, config.rate_hz
-    count = line_bytes(mcu.trailing_comma)
+    count = mcu.line_bytes
     if wire_use(rate, mcu.baud_rate, count) <= 1.0:
         return []
     ms = wire_ns(count, mcu.baud_rate) / 1e6
@@ -80,6 +103,32 @@ def _wire_problems(config: Config) -> list[str]:
     return [
         f"control.rate = {rate:g}: {count} B at {mcu.baud_rate} baud = {ms:.1f} ms per line, "
         f'at most {most} Hz, {good} Hz at 80 %; write {faster}control.rate = {good} or "auto"'
+        f"{_shorter_lines(mcu, rate)}"
+    ]
+
+
+def _shorter_lines(mcu: McuConfig, rate: float) -> str:
+    """The way out by what makes the lines long, where it is one."""
+    ways = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
+    for check, way in ways:
+        count = line_bytes(mcu.trailing_comma, check)
+        if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
+            return f", or {way} (lines of {count} B)"
+    return ""
+
+
+def _count_problems(config: Config) -> list[str]:
+    """Counts that wrap too soon: a difference could be read as one in the other direction."""
+    counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
+    lasts = LEAST_BRIDGE / config.rate_hz
+    if fastest * counts * lasts <= FIELD / 2:
+        return []
+    return [
+        f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
+        f"{config.feedback.wheel_speed:g} rad/s they could wrap in "
+        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, and must last {LEAST_BRIDGE} control "
+        f"periods ({lasts * 1000:.0f} ms); write {int(FIELD / 2 / fastest / lasts)} at most "
+        "(count fewer edges), a lower feedback.wheel_speed, or 0"
     ]
 
 

@@ -71,6 +71,9 @@ PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = e
 SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
 Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
+EncoderCounts = Annotated[
+    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = do not ask for them)"})
+]
 Baud = Literal[9600, 19200, 38400, 57600, 115200]
 
 
@@ -90,7 +93,19 @@ class McuConfig(Struct, frozen=True):
     baud_rate: Baud = 115200
     trailing_comma: bool = False
     reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
+    link_check: Literal["off", "auto", "require"] = "off"
+    encoder_counts: EncoderCounts = 0
     wheels: WheelMap = WheelMap()
+
+    @property
+    def wants_samples(self) -> bool:
+        """The MCU is asked for its encoder counts with every line."""
+        return self.link_check != "off" and self.encoder_counts > 0
+
+    @property
+    def line_bytes(self) -> int:
+        """Length of the longest line of either direction that may be on the wire."""
+        return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
 
 
 class ControlConfig(Struct, frozen=True):
@@ -253,5 +268,5 @@ class Config(Struct, frozen=True):
         """Control periods per second; "auto" is what fits comfortably, at most 100."""
         if self.control.rate != "auto":
             return float(self.control.rate)
-        count = line_bytes(self.mcu.trailing_comma)
-        return float(min(100, highest_rate(self.mcu.baud_rate, count, COMFORTABLE_USE)))
+        mcu = self.mcu
+        return float(min(100, highest_rate(mcu.baud_rate, mcu.line_bytes, COMFORTABLE_USE)))

@@ -243,3 +243,5 @@ class Snapshot(Struct, frozen=True):
     """The last command that was refused and why, "" when none was."""
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `figures.py`."""
+    check: str = "plain"
+    """Which check the serial lines have, in words."""

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from acsard.cli.common import add_config, load
 from acsard.runtime.exits import Exit, ExitError
-from acsard.sim.fake_mcu import FAULTS, FakeMcu
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.faults import FAULTS
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

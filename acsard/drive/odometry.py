@@ -20,12 +20,19 @@ from __future__ import annotations
 import math
 
 from acsard.drive.kinematics import Kinematics
-from acsard.mcu.session import Feedback
+from acsard.mcu.feedback import Feedback
+from acsard.mcu.frames import Motors
 from acsard.settings import OdometryConfig
-from acsard.values import REST, STILL, Pose, PoseCovariance, Sample
+from acsard.values import REST, STILL, Pose, PoseCovariance, Sample, WheelSpeeds
+
+MAX_LOST_S = 0.05
+"""s of lines that could not be true, up to which the robot is held to have gone on as it did."""
 
 MAX_VARIANCE = 1e9
 """m2 or rad2; a pose this uncertain says nothing, and the numbers must stay finite for years."""
+
+
+NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 
 class Odometry:
@@ -34,7 +41,8 @@ class Odometry:
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         self._settings = odometry
         self._kinematics = kinematics
-        self._positions = (0.0, 0.0, 0.0, 0.0)
+        self._positions = NOWHERE
+        self._lost_dt, self._lost_turned = 0.0, NOWHERE
         self.twist = REST
         """Twist of the last feedback."""
         self.speeds = STILL
@@ -52,23 +60,49 @@ class Odometry:
         """Pose of base_link in odom now."""
         return self._pose
 
+    def skip(self, feedback: Feedback) -> None:
+        """Pass over a line that cannot be true: what it should have told is left to the next one.
+
+        Counts are cumulative: what they made of it then stays true. Else only its time is known.
+        """
+        if feedback.turned is None:
+            self._lost_dt += feedback.dt
+        else:
+            self._lost_turned = _sum(self._lost_turned, feedback.turned)
+
     def fold(self, feedback: Feedback) -> Sample:
-        """Advance by one feedback line; after a gap only the uncertainty advances."""
-        if feedback.gap > 0.0:
-            self._add_gap(feedback.gap)
-        twist = self._kinematics.twist(feedback.speeds)
-        dt = feedback.dt
+        """Advance by one feedback line: by its counts, else by its speeds times dt.
+
+        After a gap without counts only the uncertainty advances.
+        """
+        speeds, turned, gap = feedback.speeds, feedback.turned, feedback.gap
+        lost_dt, self._lost_dt = self._lost_dt, 0.0
+        lost_turned, self._lost_turned = self._lost_turned, NOWHERE
+        # Of lost lines without counts: it went on at about this speed, or too long to guess.
+        dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
+        if turned is None:
+            turned, dt, unknown = NOWHERE, dt + feedback.dt, unknown + gap
+        if unknown > 0.0:
+            self._add_gap(unknown)
+        twist = self._kinematics.twist(speeds)
+        self._move(_sum(turned, lost_turned))
         if dt > 0.0:
-            distance, turn = twist.linear * dt, twist.angular * dt
-            self._covariance = self._propagate(distance, turn)
-            self._pose = arc(self._pose, distance, turn)
-            a, b, c, d = self._positions
-            fr, fl, rl, rr = feedback.speeds.as_tuple()
-            self._positions = (a + fr * dt, b + fl * dt, c + rl * dt, d + rr * dt)
-        self.twist, self.speeds = twist, feedback.speeds
-        return Sample(
-            feedback.at, self._pose, twist, self._covariance, self._positions, feedback.speeds
-        )
+            self._advance(twist.linear * dt, twist.angular * dt)
+            self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
+        self.twist, self.speeds = twist, speeds
+        return Sample(feedback.at, self._pose, twist, self._covariance, self._positions, speeds)
+
+    def _move(self, turned: Motors) -> None:
+        """Advance by these wheel angles in rad: equations (4) to (7) are linear."""
+        if turned == NOWHERE:
+            return
+        moved = self._kinematics.twist(WheelSpeeds(*turned))
+        self._advance(moved.linear, moved.angular)
+        self._positions = _sum(self._positions, turned)
+
+    def _advance(self, distance: float, turn: float) -> None:
+        self._covariance = self._propagate(distance, turn)
+        self._pose = arc(self._pose, distance, turn)
 
     def _add_gap(self, gap: float) -> None:
         """The robot may have gone on as it last moved, or stood: one deviation is all of that."""
@@ -105,6 +139,14 @@ class Odometry:
             p.yyaw + fy * p.yawyaw,
             p.yawyaw + turned,
         )
+
+
+def _sum(a: Motors, b: Motors) -> Motors:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
+
+
+def _times(a: Motors, dt: float) -> Motors:
+    return a[0] * dt, a[1] * dt, a[2] * dt, a[3] * dt
 
 
 def _over(p: PoseCovariance) -> bool:

@@ -11,7 +11,7 @@ counts as evidence, and evidence must last.
 
 from __future__ import annotations
 
-from acsard.mcu.session import Feedback
+from acsard.mcu.feedback import Feedback
 from acsard.settings import FeedbackConfig
 from acsard.values import WHEELS, WheelSpeeds
 

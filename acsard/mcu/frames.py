@@ -17,10 +17,14 @@ from acsard.values import STILL, AcsardError, WheelSpeeds
 
 LETTERS = "abcd"
 
+Motors = tuple[float, float, float, float]
+
 MAX_SPEED = 99.99
 """rad/s; what two integer digits and two decimals can say."""
 
-Reason = Literal["malformed", "wheel_twice", "over_range"]
+Reason = Literal[
+    "malformed", "wheel_twice", "over_range", "unchecked", "wrong_check", "stale_sequence"
+]
 
 _TOKEN = rb"([abcd])([pn])([0-9]{1,2}\.[0-9]{1,3})"
 _LINE = re.compile(_TOKEN + (rb", *" + _TOKEN) * 3 + rb"(?:, *)?")
@@ -57,6 +61,14 @@ class Codec:
         wheel = speeds.as_tuple()
         tokens = [_token(letter, sign * wheel[index]) for letter, index, sign in self._wiring]
         return ",".join(tokens).encode() + self._end
+
+    def wheels(self, motors: Motors) -> Motors:
+        """What the motors a to d did, as what the wheels did: in `WHEELS` order, forward is +."""
+        wheel = [0.0] * 4
+        for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
+            wheel[index] = motor * sign
+        front_right, front_left, rear_left, rear_right = wheel
+        return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
         """The speeds a line without its end says; raises `FrameError` unless all of it is right."""

@@ -7,7 +7,7 @@ Knows nothing of what a line means. Lines end with LF or CR LF; empty ones are d
 from __future__ import annotations
 
 MAX_LINE = 128
-"""Bytes of a line with its end; the longest frame is under 50, so more is noise without newline."""
+"""Bytes of a line with its end; the longest frame has 62, so more is noise without newline."""
 
 
 class LineReader:

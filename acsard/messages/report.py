@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator
 
-from acsard.mcu.wire import line_bytes, wire_use
+from acsard.mcu.wire import wire_use
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -229,7 +229,7 @@ class Report:
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures
         ok, warning, error = 0, 1, 2
-        use = wire_use(config.rate_hz, config.mcu.baud_rate, line_bytes(config.mcu.trailing_comma))
+        use = wire_use(config.rate_hz, config.mcu.baud_rate, config.mcu.line_bytes)
         certificate = self._certificate(outputs.now)
         periods = figures["period_lateness"].since_start.count if figures else 0
         missed = counters.get("missed_periods", 0)
@@ -240,7 +240,7 @@ class Report:
                 "serial link",
                 ok if outputs.link == "up" else error,
                 outputs.link,
-                {"port": config.mcu.port, "wire_use": f"{use:.2f}"}
+                {"port": config.mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
                 | {k: str(v) for k, v in counters.items() if k.startswith("line")},
             ),
             (

@@ -17,7 +17,7 @@ from acsard.figures import Figures
 from acsard.guard import Guard
 from acsard.mcu.pace import Pace
 from acsard.mcu.roundtrip import RoundTrip
-from acsard.mcu.wire import line_bytes, wire_ns
+from acsard.mcu.wire import PLAIN_BYTES, wire_ns
 from acsard.messages.encodings import DecodeError
 from acsard.messages.incoming import Arrival, Receiver, voice
 from acsard.messages.queries import Queries, Query, Reply
@@ -115,16 +115,19 @@ class ControlLoop:
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._guard = Guard(
-            self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
+            self.robot.session.codec.stop,
+            config.limits.wheel_speed,
+            config.commands.sources,
+            require_check=config.mcu.link_check == "require",
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded = False
         self._trip = ""
-        line_ns = wire_ns(line_bytes(config.mcu.trailing_comma), config.mcu.baud_rate)
-        self._pace = Pace(line_ns)
-        self._round_trip = RoundTrip(2 * line_ns)
+        # The longest line of either direction: answers must not queue in the MCU either.
+        self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate))
+        self._round_trip = RoundTrip(2 * wire_ns(PLAIN_BYTES, config.mcu.baud_rate))
         self._prompted = not config.mcu.reply_period
         self._followed_ns: int | None = None
         """When the command arrived that the last line followed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import binascii
 import random
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
 from acsard.guard import Guard
+from acsard.mcu.check import seal
 from acsard.mcu.frames import Codec
 from acsard.robot import Robot
 from acsard.settings import CommandsConfig, Config, DriveConfig, LimitsConfig, Source, WheelMap
@@ -472,3 +474,59 @@ def test_on_the_wire_no_wheel_grows_without_a_fresh_command_nor_moves_without_a_
                     assert abs(new) <= abs(old)
                     assert new * old >= 0.0
             before = wheels
+
+
+# the checked line
+
+NO_CHECK = "it moves a wheel without the check that mcu.link_check requires"
+
+
+@pytest.mark.parametrize("comma", [False, True])
+@pytest.mark.parametrize("letters", [b"", b"S"])
+@given(sequence=st.integers(0, 255), speed=st.floats(-40.0, 40.0))
+def test_a_line_with_a_right_check_passes(
+    comma: bool, letters: bytes, sequence: int, speed: float
+) -> None:
+    codec = Codec(WheelMap(), comma)
+    sealed = seal(codec.encode(WheelSpeeds(speed, -speed, speed, -speed)), sequence, letters)
+    assert objection(Guard(codec.stop, 40.0, SOURCES), outputs(sealed)) == ""
+
+
+def test_what_a_checked_line_says_is_judged_as_ever(guard: Guard) -> None:
+    assert objection(guard, outputs(seal(line(41.0), 7))) == TOO_FAST
+    assert objection(guard, outputs(seal(line(1.0), 7), linked=False)) == NO_LINK
+    assert objection(guard, coasting(seal(line(1.0), 7))) == GROWS
+    assert objection(guard, outputs(seal(STOP, 7), mode="fault", linked=False)) == ""
+
+
+@pytest.mark.parametrize("place", range(42))
+@pytest.mark.parametrize("bit", range(8))
+def test_a_checked_line_with_one_bit_wrong_is_none(guard: Guard, place: int, bit: int) -> None:
+    good = seal(line(12.5, -8.75, 15.0, -10.25), 7, b"S")
+    bad = b"%b%c%b" % (good[:place], good[place] ^ 1 << bit, good[place + 1 :])
+    assert objection(guard, outputs(bad)) == NOT_A_LINE
+
+
+@pytest.mark.parametrize(
+    ("suffix", "letters"),
+    [(b"#07", b"Z"), (b"#07", b"SS"), (b"#0", b""), (b"#007", b""), (b"#0a", b""), (b",#07", b"")],
+)
+def test_another_suffix_is_none_even_under_a_right_check(
+    guard: Guard, suffix: bytes, letters: bytes
+) -> None:
+    body = line(1.0)[:-2] + suffix + letters
+    closed = b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+    assert objection(guard, outputs(closed)) == NOT_A_LINE
+
+
+def test_the_comma_of_the_dialect_is_not_left_out_of_a_checked_line() -> None:
+    guard = Guard(STOP[:-2] + b",\r\n", 40.0, SOURCES)
+    guard.check(outputs(seal(line(1.0), 7)))
+    assert guard.trip == NOT_A_LINE
+
+
+def test_where_the_check_is_required_no_wheel_moves_without() -> None:
+    guard = Guard(STOP, 40.0, SOURCES, require_check=True)
+    assert objection(guard, outputs(line(1.0))) == NO_CHECK
+    assert objection(guard, outputs(STOP)) == ""
+    assert objection(guard, outputs(seal(line(1.0), 7))) == ""

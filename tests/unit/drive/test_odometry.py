@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
-from acsard.mcu.session import Feedback
+from acsard.mcu.feedback import Feedback
 from acsard.settings import DriveConfig, OdometryConfig
 from acsard.values import Instant, Pose, PoseCovariance, Sample, Twist, WheelSpeeds
 from tests.vectors.drive import (
@@ -376,3 +376,67 @@ def test_the_covariance_stays_finite_for_years(gap: float) -> None:
     assert np.isfinite(values).all()
     assert np.diag(values).max() >= MAX_VARIANCE
     assert np.abs(values).max() < 1e15
+
+
+# counts
+
+
+def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0.0) -> Feedback:
+    """A line whose wheels turned by so much, in rad; one figure is for all of them."""
+    a, b, c, d = turned if len(turned) == 4 else turned * 4
+    return Feedback(AT, WheelSpeeds(*(speed,) * 4), dt, gap, (a, b, c, d))
+
+
+def test_counts_move_the_robot_and_its_wheels_by_what_they_say() -> None:
+    sample = odometry().fold(counted(2.0, dt=99.0, speed=50.0))
+    assert same_pose(sample.pose, (0.1, 0.0, 0.0))
+    assert sample.positions == (2.0, 2.0, 2.0, 2.0)
+    assert sample.twist.linear == pytest.approx(2.5)
+
+
+@given(path=st.lists(moves, max_size=30))
+def test_counts_that_agree_with_the_speeds_make_the_same_path(
+    path: list[tuple[float, float, float]],
+) -> None:
+    by_speed, by_counts = odometry(), odometry()
+    for left, right, dt in path:
+        by_speed.fold(feedback(left, right, dt))
+        by_counts.fold(counted(right * dt, left * dt, left * dt, right * dt))
+    pose = by_speed.pose
+    assert same_pose(by_counts.pose, (pose.x, pose.y, pose.yaw))
+
+
+def test_counts_bridge_a_gap_without_a_doubt_of_their_own() -> None:
+    by_gap, at_once = odometry(), odometry()
+    by_gap.fold(counted(0.0, speed=10.0))
+    bridged = by_gap.fold(counted(5.0, dt=0.0, gap=0.5))
+    whole = at_once.fold(counted(5.0))
+    assert same_pose(bridged.pose, (whole.pose.x, whole.pose.y, whole.pose.yaw))
+    assert bridged.covariance == whole.covariance
+
+
+def test_a_skipped_line_leaves_its_time_to_the_next() -> None:
+    robot = odometry()
+    robot.skip(feedback(90.0, 90.0, 0.01))
+    sample = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert sample.pose.x == pytest.approx(0.01)
+    assert robot.fold(feedback(10.0, 10.0, 0.01)).pose.x == pytest.approx(0.015)
+
+
+def test_more_than_50_ms_of_skipped_lines_are_a_gap() -> None:
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.0))
+    for _ in range(6):
+        robot.skip(feedback(90.0, 90.0, 0.01))
+    sample = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert sample.pose.x == pytest.approx(0.005)
+    assert sample.covariance.xx > 0.03**2
+
+
+@pytest.mark.parametrize("after", [counted(1.0), feedback(20.0, 20.0, 0.05)])
+def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
+    robot = odometry()
+    for _ in range(10):
+        robot.skip(counted(1.0, speed=99.0))
+    assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
+    assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.drive.sanity import Sanity
-from acsard.mcu.session import Feedback
+from acsard.mcu.feedback import Feedback
 from acsard.settings import FeedbackConfig
 from acsard.values import STILL, WHEELS, Instant, WheelSpeeds
 

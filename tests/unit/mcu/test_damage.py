@@ -15,9 +15,9 @@ from collections import Counter
 import pytest
 
 from acsard.drive.sanity import Sanity
+from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
-from acsard.mcu.session import Feedback
 from acsard.settings import FeedbackConfig, WheelMap
 from acsard.values import STILL, Instant, WheelSpeeds
 

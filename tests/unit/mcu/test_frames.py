@@ -329,3 +329,18 @@ def test_a_damaged_line_is_rejected_whole_or_is_itself_a_well_formed_line(count:
                 assert got == expected, line
     assert sum(seen.values()) > 0.95 * count
     assert all(seen.values()), seen
+
+
+def test_what_the_motors_did_is_put_in_the_wheels_order_with_their_signs() -> None:
+    codec = Codec(WheelMap("-d", "+c", "-b", "+a"))
+    assert codec.wheels((1.0, 2.0, 3.0, 4.0)) == (-4.0, 3.0, -2.0, 1.0)
+
+
+@given(wiring=wirings, motors=st.tuples(*[st.floats(0.0, 99.0)] * 4))
+def test_motors_become_wheels_as_a_line_of_theirs_does(wiring: WheelMap, motors: Motors) -> None:
+    rounded = tuple(round(motor, 2) for motor in motors)
+    tokens = zip("abcd", rounded, strict=True)
+    line = ",".join(f"{letter}p{speed:05.2f}" for letter, speed in tokens).encode()
+    codec = Codec(wiring)
+    a, b, c, d = rounded
+    assert codec.decode(line).as_tuple() == codec.wheels((a, b, c, d))

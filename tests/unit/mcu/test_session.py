@@ -8,16 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.mcu.session import GOOD_LINES, LONG_GAP_NS, Feedback, McuSession
+from acsard.mcu.check import seal
+from acsard.mcu.feedback import Feedback
+from acsard.mcu.session import BAD_LINES, GOOD_LINES, LONG_GAP_NS, McuSession
 from acsard.mcu.wire import wire_ns
 from acsard.settings import McuConfig, WheelMap
-from acsard.values import NS_PER_S, Instant, Received, WheelSpeeds
-from tests.vectors.lines import SEED_LINE, SEED_MOTORS
+from acsard.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
+from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
 
 MS = 1_000_000
 GOOD = SEED_LINE + b"\r\n"
 BAD = b"hello\r\n"
 WALL_NS = 1_800_000_000 * NS_PER_S
+SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
 class Bench:
@@ -35,6 +38,35 @@ class Bench:
 
     def link(self) -> str:
         return self.session.link
+
+    def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
+        return self.session.line(self.now_ns, speeds)
+
+    def answer(self, line: bytes | None) -> bytes:
+        """The checked reply to a line of ours."""
+        assert line is not None
+        assert b"#" in line
+        return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
+
+    def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
+        """So many times: a line leaves, and what it asks for comes back `ms` later."""
+        heard = []
+        for _ in range(count):
+            line = self.line()
+            checked = line is not None and b"#" in line
+            heard += self.wait(ms, self.answer(line)) if checked else self.wait(ms)
+        return heard
+
+    def checked(self) -> Bench:
+        """A session whose link is up and checked."""
+        self.open().wait(10)
+        self.talk(count=30)
+        assert (self.link(), self.session.check.state) == ("up", "checked")
+        return self
+
+    def names(self) -> list[str]:
+        """The events of the last update."""
+        return [event.name for event in self.session.events]
 
     def open(self) -> Bench:
         self.opened += 1
@@ -432,3 +464,179 @@ def test_good_lines_with_silences_between_them_do_not_bring_the_link_up() -> Non
     for _ in range(10):
         bench.wait(150, GOOD)
     assert bench.link() == "booting"
+
+
+# the checked link
+
+AUTO = McuConfig(link_check="auto")
+REQUIRE = McuConfig(link_check="require")
+BOOTED = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
+
+
+def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() -> None:
+    bench = Bench(REQUIRE).open()
+    for _ in range(300):
+        bench.wait(10, GOOD)
+        line = bench.line()
+        assert line is None or line.startswith(ZERO)
+        assert bench.link() == "booting"
+    assert bench.session.good_lines == 0
+
+
+def test_the_link_is_up_with_the_third_right_reply() -> None:
+    bench = Bench(AUTO).open()
+    bench.wait(10)
+    while bench.session.check.state == "asking":
+        bench.talk()
+    assert (bench.link(), bench.session.good_lines) == ("booting", 1)
+    bench.talk(count=2)
+    assert (bench.link(), bench.session.good_lines) == ("up", 3)
+
+
+def test_an_mcu_without_the_check_is_driven_plainly() -> None:
+    bench = Bench(AUTO).open()
+    for _ in range(40):
+        bench.wait(10, GOOD)
+        bench.line()
+    assert (bench.link(), bench.session.check.state) == ("up", "plain")
+    assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+    assert bench.session.rejects == {}
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (GOOD, "unchecked"),
+        (seal(GOOD, 200), "stale_sequence"),
+        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "wrong_check"),
+        (seal(b"ap12.50\r\n", 1), "malformed"),
+        (b"x" * 200 + b"\n", "too_long"),
+    ],
+)
+def test_on_a_checked_link_a_reply_without_a_right_suffix_is_dropped_and_counted(
+    line: bytes, reason: str
+) -> None:
+    bench = Bench(AUTO).checked()
+    bench.session.rejects.clear()
+    assert bench.wait(1, line) == []
+    assert bench.session.rejects == {reason: 1}
+    assert bench.link() == "up"
+
+
+def test_a_reply_counts_once() -> None:
+    bench = Bench(AUTO).checked()
+    reply = bench.answer(bench.line())
+    assert len(bench.wait(10, reply + reply + reply)) == 1
+    assert bench.session.rejects["stale_sequence"] == 2
+
+
+def test_replies_to_piped_lines_count_each() -> None:
+    bench = Bench(AUTO).checked()
+    replies = []
+    for _ in range(4):
+        replies.append(bench.answer(bench.line()))
+        bench.wait(10)
+    assert len(bench.wait(1, b"".join(replies))) == 4
+
+
+def test_five_bad_replies_in_a_row_are_no_link_and_the_check_is_asked_for_again() -> None:
+    bench = Bench(AUTO).checked()
+    bench.wait(1, BAD * (BAD_LINES - 1))
+    assert bench.link() == "up"
+    bench.wait(1, BAD)
+    assert (bench.link(), bench.session.check.state) == ("stale", "asking")
+    assert "damaged" in bench.session.words()
+    line = bench.line()
+    assert line is not None
+    assert line.startswith(ZERO + b"#")
+    bench.wait(10, bench.answer(line))
+    bench.talk(count=2)
+    assert bench.link() == "up"
+    assert bench.line() is not None
+
+
+def test_bad_replies_among_right_ones_are_only_counted() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(50):
+        bench.wait(10, BAD * (BAD_LINES - 1) + bench.answer(bench.line()))
+    assert bench.link() == "up"
+
+
+def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(3):
+        bench.wait(30, GOOD)
+    assert bench.link() == "up"
+    bench.wait(11, GOOD)
+    assert (bench.link(), bench.session.check.state) == ("stale", "asking")
+
+
+def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(500):
+        bench.wait(10, GOOD)
+        line = bench.line()
+        assert line is None or line.startswith(ZERO) or bench.link() == "up"
+    assert bench.session.check.state == "asking"
+    assert "before and now does not" in bench.session.words()
+
+
+@pytest.mark.parametrize("mcu", [McuConfig(), AUTO], ids=["plain", "checked"])
+def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
+    bench = Bench(mcu).checked() if mcu is AUTO else Bench(mcu).up()
+    bench.wait(10, BOOTED)
+    assert bench.session.restarted
+    assert bench.link() == "booting"
+    assert bench.names() == ["mcu_restarted", "link_booting"]
+    line = bench.line()
+    assert line is None or line.startswith(ZERO)
+    assert bench.session.rejects == {}
+
+
+def test_what_the_mcu_says_while_it_is_awaited_is_no_news() -> None:
+    bench = Bench(AUTO).open()
+    bench.wait(10, BOOTED)
+    assert bench.names() == ["link_booting"]
+    assert bench.session.restarted
+
+
+def test_the_outcome_is_an_event() -> None:
+    bench = Bench(AUTO).open()
+    told = []
+    for _ in range(40):
+        bench.talk()
+        told += bench.session.events
+    (outcome,) = [event for event in told if event.name == "link_check"]
+    assert (outcome.level, outcome.text) == ("info", "the serial lines are checked")
+
+
+def test_a_refusal_is_an_event_and_the_reason() -> None:
+    bench = Bench(REQUIRE).open()
+    told = []
+    for _ in range(100):
+        bench.wait(10, GOOD)
+        bench.line()
+        told += bench.session.events
+    (outcome,) = [event for event in told if event.name == "link_check"]
+    assert outcome.level == "error"
+    assert bench.session.words() == outcome.text
+
+
+def test_the_note_behind_a_reason_says_the_check_in_force() -> None:
+    assert Bench().up().session.note == ""
+    assert Bench(AUTO).checked().session.note == " (serial lines checked)"
+
+
+def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    assert bench.line(WheelSpeeds(5.0, 5.0, 5.0, 5.0)) == bench.session.codec.stop
+    lines = []
+    for _ in range(100):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert [line for line in lines if line] == [bench.session.codec.stop] * 10
+
+
+def test_zero_is_the_stop_line() -> None:
+    assert Bench().up().line(STILL) == ZERO + b"\r\n"

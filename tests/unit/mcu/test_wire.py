@@ -46,6 +46,13 @@ def test_a_command_is_as_long_as_the_seed_line_in_either_dialect() -> None:
     assert line_bytes(trailing_comma=True) == len(SEED_LINE + b",\r\n") == 34
 
 
+def test_the_longest_line_of_either_direction_is_what_counts() -> None:
+    assert line_bytes(False, check=True) == 41
+    assert line_bytes(True, check=True) == 42
+    assert line_bytes(False, check=True, sample=True) == 62  # the reply; the command has 42
+    assert line_bytes(True, check=True, sample=True) == 62
+
+
 def test_100_hz_take_29_percent_of_115200_baud_and_more_than_all_of_9600() -> None:
     # 33 bytes x 10 bits x 100 / 115200 = 0.2865; / 9600 = 3.4375
     assert wire_use(100.0, 115200, 33) == pytest.approx(0.2865, abs=1e-4)

@@ -377,6 +377,7 @@ def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> Non
     assert values(one) == {
         "port": "/dev/x",
         "wire_use": "0.43",  # 33 bytes of 10 bits, 50 times a second, of 38400
+        "check": "plain",
         "lines": "100",
         "line_malformed": "2",
     }

@@ -1,0 +1,132 @@
+"""What can be wrong with the fake MCU and its wire: each fault a small named `with` block.
+
+Here are the switches; what they do is `fake_mcu.py`'s. Nothing is by chance: every n-th line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+from acsard.sim import protocol
+from acsard.values import NS_PER_S
+
+Fault = AbstractContextManager[None]
+
+
+class Faults:
+    """The switches, all off; a `with` block turns one on and back."""
+
+    def __init__(self) -> None:
+        self.muted = False
+        self.noise_bytes = b""
+        self.cut_replies = False
+        self.gains = [1.0] * 4
+        self.stuck: int | None = None
+        self.extra_delay_ns = 0
+        self.separator = ","
+        self.ending = "\r\n"
+        self.unpadded = False
+        self.unprompted_ns = 0
+        self.watchdog = True
+        self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
+        self.samples = True
+        self.lose_reply = self.lose_command = self.bit_error = 0
+        """Every how many-th is hit; 0 is none."""
+        self._passed = {"reply": 0, "command": 0, "bit": 0}
+        self._clock = b""
+
+    @contextmanager
+    def _with(self, **values: object) -> Iterator[None]:
+        before = {name: getattr(self, name) for name in values}
+        for name, value in values.items():
+            setattr(self, name, value)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                setattr(self, name, value)
+
+    def _hit(self, what: str, every: int) -> bool:
+        """Count one more of `what`; whether it is the n-th."""
+        self._passed[what] += 1
+        return every > 0 and self._passed[what] % every == 0
+
+    def _damaged(self, data: bytes) -> bytes:
+        """The data after the wire: one bit of it may be turned."""
+        if not data or not self._hit("bit", self.bit_error):
+            return data
+        place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
+        return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
+
+    def mute(self) -> Fault:
+        """Hears and drives, but answers nothing."""
+        return self._with(muted=True)
+
+    def noise(self, data: bytes = b"\x00\xff~") -> Fault:
+        """Puts garbage in front of every reply."""
+        return self._with(noise_bytes=data)
+
+    def partial_line(self) -> Fault:
+        """Sends only the first half of every reply."""
+        return self._with(cut_replies=True)
+
+    def bias(self, wheel: int, gain: float) -> Fault:
+        """Sees motor `wheel` (0 to 3 for a to d) turn `gain` times as fast and as far."""
+        return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
+
+    def stuck_encoder(self, wheel: int) -> Fault:
+        """Sees motor `wheel` (0 to 3 for a to d) stand whatever it does."""
+        return self._with(stuck=wheel)
+
+    def slow_reply(self, delay_s: float = 0.03) -> Fault:
+        """Takes `delay_s` longer to act and answer."""
+        return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
+
+    def spaces(self) -> Fault:
+        """Writes a space after every comma."""
+        return self._with(separator=", ")
+
+    def trailing_comma(self) -> Fault:
+        """Ends its replies with a comma."""
+        return self._with(ending=",\r\n")
+
+    def comma_latched(self) -> Fault:
+        """Takes a value only when a comma follows it, as the old sketches do; knows no check."""
+        return self._with(understand=protocol.latched)
+
+    def no_check(self) -> Fault:
+        """Does not look beyond the fourth value: runs checked lines, answers plain."""
+        return self._with(understand=protocol.prefix)
+
+    def plain_only(self) -> Fault:
+        """Takes plain lines only: a checked one is no line to it."""
+        return self._with(understand=protocol.plain_only)
+
+    def no_sample(self) -> Fault:
+        """Answers with the check, but never with the sample fields."""
+        return self._with(samples=False)
+
+    def no_watchdog(self) -> Fault:
+        """Keeps the motors running when the host falls silent."""
+        return self._with(watchdog=False)
+
+    def lost_replies(self, every: int = 5) -> Fault:
+        """Every so many-th reply is lost on the way."""
+        return self._with(lose_reply=every)
+
+    def lost_commands(self, every: int = 5) -> Fault:
+        """Every so many-th line is lost on its way to the MCU."""
+        return self._with(lose_command=every)
+
+    def bit_errors(self, every: int = 7) -> Fault:
+        """In every so many-th line, of either direction, one bit is turned; another each time."""
+        return self._with(bit_error=every)
+
+
+FAULTS = (
+    "mute", "noise", "partial_line", "slow_reply", "spaces", "trailing_comma", "comma_latched",
+    "no_check", "plain_only", "no_sample", "no_watchdog", "lost_replies", "lost_commands",
+    "bit_errors", "unprompted",
+)  # fmt: skip
+"""The faults that need no argument, by method name: what `acsard sim --fault` offers."""

@@ -1,0 +1,121 @@
+"""The microcontroller's language from its side: what it takes for a command, what it answers.
+
+Three kinds of firmware: today's takes whole valid lines only, plain or with a right suffix; two
+older kinds know no suffix, and take the line before it as ever. Shares no code with the host.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+MOTORS = "abcd"
+
+HEX = b"0123456789ABCDEF"
+
+PLAIN = 31
+"""Bytes of a plain line without comma and end."""
+
+
+class Command(Struct, frozen=True):
+    """Speeds by motor, in rad/s, and for a checked line the digits of its sequence."""
+
+    values: dict[int, float]
+    sequence: bytes = b""
+    wants_sample: bool = False
+
+
+def whole(line: bytes) -> Command | None:
+    """Today's firmware: a whole valid line; one with `#` or `*` needs all of a right suffix."""
+    text = line.removesuffix(b"\n").removesuffix(b"\r")
+    if b"#" not in text and b"*" not in text:
+        return _plain(text)
+    body, check = text[:-5], text[-5:]
+    if check != b"*" + _hex(_crc(body), 4):
+        return None
+    plain, _, suffix = body.partition(b"#")
+    sequence, letters = suffix[:2], suffix[2:]
+    if len(sequence) != 2 or any(digit not in HEX for digit in sequence):
+        return None
+    if not all(0x47 <= letter <= 0x5A for letter in letters):  # G to Z
+        return None
+    command = _plain(plain)
+    return command and Command(command.values, sequence, b"S" in letters)
+
+
+def plain_only(line: bytes) -> Command | None:
+    """Firmware that compares the whole line with the plain form: a suffix makes it no line."""
+    return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
+
+
+def prefix(line: bytes) -> Command | None:
+    """Firmware that is strict up to the fourth value and does not look further."""
+    return _plain(line[:PLAIN])
+
+
+def latched(line: bytes) -> Command:
+    """The old sketches: a value counts when a comma ends it, whatever the rest says."""
+    values = {}
+    for token in line.split(b",")[:-1]:
+        motor, sign = token[:1], token[1:2]
+        if motor and motor in MOTORS.encode() and sign in (b"p", b"n"):
+            try:
+                value = float(token[2:])
+            except ValueError:
+                continue
+            if math.isfinite(value):
+                values[MOTORS.encode().index(motor)] = value if sign == b"p" else -value
+    return Command(values)
+
+
+def _plain(text: bytes) -> Command | None:
+    tokens = text.removesuffix(b",").split(b",")
+    if [token[:1] for token in tokens] != [b"a", b"b", b"c", b"d"]:
+        return None
+    values = []
+    for token in tokens:
+        digits, point, part = token[2:].partition(b".")
+        if token[1:2] not in (b"p", b"n") or point != b".":
+            return None
+        if len(digits) != 2 or len(part) != 2 or not (digits + part).isdigit():
+            return None
+        values.append((int(digits) + int(part) / 100) * (1 if token[1:2] == b"p" else -1))
+    return Command(dict(enumerate(values)))
+
+
+def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> bytes:
+    """The plain part of a reply."""
+    form = ".2f" if unpadded else "05.2f"
+    return separator.join(
+        f"{motor}{'n' if speed < 0 else 'p'}{min(abs(speed), 99.99):{form}}"
+        for motor, speed in zip(MOTORS, speeds, strict=True)
+    ).encode()
+
+
+def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
+    """What follows the plain part of a checked reply; `sample` is empty or ms and four counts."""
+    fields = b"".join(_hex(number % 65536, 4) for number in sample)
+    body = b"#" + sequence + (b"@" + fields if fields else b"")
+    return body + b"*" + _hex(_crc(text + body), 4)
+
+
+def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
+    """The line with which the firmware names itself."""
+    text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
+    return text.encode() + b"\r\n"
+
+
+def _hex(number: int, digits: int) -> bytes:
+    return bytes(HEX[number >> 4 * place & 15] for place in reversed(range(digits)))
+
+
+def _crc(data: bytes) -> int:
+    """CRC-16/XMODEM, bit by bit: polynomial x16 + x12 + x5 + 1, from 0."""
+    crc = 0
+    for byte in data:
+        for bit in range(8):
+            top = crc >> 15 ^ byte >> (7 - bit) & 1
+            crc = (crc << 1 & 0xFFFF) ^ (0x1021 if top else 0)
+    return crc

@@ -1,0 +1,531 @@
+"""The checked link from end to end: new firmware and old, noise, losses, resets, counts.
+
+pytest -m soak -s tests/scenarios/test_link_check.py
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.mcu.check import unseal
+from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.lines import LineReader
+from acsard.messages.schema import DiagnosticArray
+from acsard.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
+from acsard.sim import protocol
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import NS_PER_S, Outputs, Received
+from tests.scenarios.world import VirtualPort, World
+from tests.unit.mcu.test_damage import drive as replies_of_a_drive
+
+MS = 1_000_000
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
+
+
+def config(check: str = "auto", counts: int = 0, **mcu: object) -> Config:
+    return Config(mcu=McuConfig(link_check=check, encoder_counts=counts, **mcu))  # type: ignore[arg-type]
+
+
+def started(made: Config) -> World:
+    world = World(made)
+    world.run(0.3)
+    return world
+
+
+def moving(lines: list[bytes]) -> list[bytes]:
+    return [line for line in lines if line.strip() and not line.startswith(ZERO)]
+
+
+def check_of(world: World) -> str:
+    """What the diagnostics say of the check in force."""
+    message = world.loop.report.current("diagnostics", world.loop._look)
+    assert isinstance(message, DiagnosticArray)
+    (link,) = [status for status in message.status if status.name == "acsard: serial link"]
+    return {pair.key: pair.value for pair in link.values}["check"]
+
+
+def stopped(world: World) -> bool:
+    return world.mcu.vehicle.set_points == [0.0] * 4
+
+
+def texts(world: World, name: str) -> list[str]:
+    return [event.text for event in world.events if event.name == name]
+
+
+def off_by(world: World) -> float:
+    """How far the pose is from where the robot really is, as a share of the way."""
+    at, true = world.state, world.mcu.vehicle.pose
+    return math.hypot(at.x - true.x, at.y - true.y) / math.hypot(true.x, true.y)
+
+
+# who is at the other end
+
+
+@pytest.mark.parametrize("check", ["auto", "require"])
+def test_a_new_mcu_is_driven_with_checked_lines(check: str) -> None:
+    world = started(config(check))
+    world.drive(0.5, seconds=2.0)
+    assert world.state.mode == "driving"
+    assert "(serial lines checked)" in world.state.reason
+    assert check_of(world) == "checked"
+    assert texts(world, "link_check") == ["the serial lines are checked"]
+    heard = moving(world.lines())
+    assert len(heard) > 150
+    assert all(protocol.whole(line) and b"#" in line for line in heard)
+    world.run(1.5)
+    assert stopped(world)
+    assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
+
+
+def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured() -> None:
+    world = started(config(counts=3200))
+    world.drive(0.5, seconds=1.0)
+    assert check_of(world) == "checked with samples"
+    assert "(serial lines checked with samples)" in world.state.reason
+    assert all(b"S*" in line for line in moving(world.lines()))
+
+
+def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missing() -> None:
+    world = World(config(counts=3200))
+    with world.mcu.no_sample():
+        world.run(0.3)
+        world.drive(0.5, seconds=1.0)
+        assert check_of(world) == "checked"
+        assert not any(b"S*" in line for line in moving(world.lines()))
+        assert "sends no counts" in texts(world, "link_check")[-1]
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize(
+    ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
+)
+@pytest.mark.parametrize("counts", [0, 3200])
+def test_auto_drives_old_firmware_plainly_and_unharmed(
+    firmware: str, comma: bool, counts: int
+) -> None:
+    world = World(config(counts=counts, trailing_comma=comma))
+    with getattr(world.mcu, firmware)():
+        while "link_up" not in {event.name for event in world.events}:
+            world.run(0.01)
+            assert stopped(world)
+            assert world.now_ns < 6 * NS_PER_S
+        world.drive(0.5, 0.2, seconds=2.0)
+        assert world.state.mode == "driving"
+        assert "(serial lines plain)" in world.state.reason
+        assert check_of(world) == "plain"
+        assert not any(b"#" in line for line in moving(world.lines()))
+        world.run(1.5)
+        assert stopped(world)
+        assert off_by(world) < 0.01
+    assert not [name for name in world.state.counters if name.startswith("line_")]
+
+
+@pytest.mark.parametrize(
+    ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
+)
+def test_require_never_drives_old_firmware_and_says_why(firmware: str, comma: bool) -> None:
+    world = World(config("require", trailing_comma=comma))
+    with getattr(world.mcu, firmware)():
+        world.drive(0.5, seconds=5.0)
+        assert not moving(world.lines())
+        assert (world.state.mode, world.state.link) == ("waiting", "booting")
+        assert 'mcu.link_check = "require"' in world.state.reason
+        assert len(texts(world, "link_check")) == 1
+    world.run(0.5)  # new firmware has been put in
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+def test_an_mcu_that_boots_slowly_is_asked_until_it_answers() -> None:
+    world = World(config("require"))
+    world.mcu.reset(world.now_ns)
+    world.run(2.4)
+    assert world.state.link == "up"
+    assert check_of(world) == "checked"
+
+
+def test_a_slow_wire_carries_checked_lines_with_samples() -> None:
+    world = World(
+        Config(
+            mcu=McuConfig(baud_rate=9600, link_check="require", encoder_counts=3200),
+            control=ControlConfig(rate="auto"),
+        )
+    )
+    assert world.config.rate_hz == 12
+    world.run(2.0)
+    world.drive(0.5, seconds=3.0, hz=10.0)
+    world.send(0.0)
+    world.run(1.5)
+    assert off_by(world) < 0.001
+    assert world.state.counters.get("lines_superseded", 0) == 0
+
+
+# resets
+
+
+@pytest.mark.parametrize("deaf_ms", [20, 60, 500, 2000])
+@pytest.mark.parametrize(("check", "counts"), [("off", 0), ("auto", 0), ("require", 3200)])
+def test_a_reset_mcu_does_not_move_before_it_is_asked_and_commanders_are_neutral(
+    check: str, counts: int, deaf_ms: int
+) -> None:
+    world = started(config(check, counts))
+    world.drive(0.5, seconds=1.0)
+    before = world.state.x
+    world.mcu.reset(world.now_ns, deaf_ms * MS)
+    world.hold(0.5, seconds=deaf_ms / 1000 + 0.02, hz=100.0)
+    heard = len(world.lines())
+    world.hold(0.5, seconds=3.0)
+    assert not moving(world.lines()[heard + 1 :])
+    assert world.state.mode == "ready"
+    assert "neutral first" in world.state.reason
+    assert stopped(world)
+    assert world.state.x - before < 0.08
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
+    world = started(config("require", 3200))
+    world.drive(0.5, seconds=1.0)
+    x = world.state.x
+    world.mcu.reset(world.now_ns, 30 * MS)
+    world.mcu._events.clear()  # neither noise nor name comes through
+    world.hold(0.5, seconds=2.0)
+    assert any("its clock went back" in text for text in texts(world, "mcu_restarted"))
+    assert world.state.mode == "ready"
+    assert stopped(world)
+    assert world.state.x - x < 0.05
+
+
+def test_replugging_another_mcu_is_negotiated_anew() -> None:
+    world = started(config(counts=3200))
+    world.drive(0.5, seconds=1.0)
+    x = world.state.x
+    world.port.unplug()
+    world.run(0.5)
+    world.mcu = FakeMcu(world.config, world.now_ns)
+    world.port.plug(world.mcu)
+    with world.mcu.no_check():
+        world.hold(0.5, seconds=1.0)
+        assert not moving(world.lines())
+        assert check_of(world) == "plain"
+    assert world.state.x == pytest.approx(x, abs=0.02)
+
+
+# damage
+
+
+def test_a_burst_of_damaged_replies_stops_asks_again_and_goes_on() -> None:
+    world = started(config("require", 3200))
+    world.drive(0.5, seconds=1.0)
+    sent = len(world.port.sent)
+    with world.mcu.noise(b"~"):
+        world.hold(0.5, seconds=0.08, hz=100.0)
+        assert world.state.link == "stale"
+        assert "damaged" in world.state.reason
+        world.hold(0.5, seconds=0.3)
+        late = [line for _, line in list(world.port.sent)[sent + 8 :]]
+        assert late
+        assert not moving(late)
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "driving"  # a short gap only ramps up again from rest
+    assert check_of(world) == "checked with samples"
+    assert world.state.counters["line_wrong_check"] >= 5
+    world.send(0.0)
+    world.run(1.0)
+    assert off_by(world) < 0.001
+
+
+def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
+    world = started(config("auto"))
+    world.drive(0.5, seconds=1.0)
+    for _ in range(5):
+        with world.mcu.no_check():
+            world.hold(0.5, seconds=2.0)
+            assert stopped(world)
+            assert "before and now does not" in world.state.reason
+        world.run(0.3)
+        assert check_of(world) == "checked"
+
+
+@pytest.mark.parametrize("every", [2, 3, 7])
+def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
+    world = started(config("require", 3200))
+    world.drive(0.4, seconds=0.5)
+    told: set[float] = set()
+    with world.mcu.bit_errors(every):
+        for _ in range(200):
+            world.hold(0.4, seconds=0.01, hz=100.0)
+            told.update(world.mcu.vehicle.set_points)
+            assert all(abs(speed) < 8.5 for speed in world.state.wheels)
+    assert max(told) <= 8.0
+    assert min(told) >= 0.0
+
+
+def flips(line: bytes) -> Iterator[bytes]:
+    for place in range(len(line)):
+        for bit in range(8):
+            yield b"%b%c%b" % (line[:place], line[place] ^ 1 << bit, line[place + 1 :])
+
+
+def accepted_by_the_mcu(data: bytes, understand: object = protocol.whole) -> list[object]:
+    """What an MCU that cuts its input at line feeds makes of these bytes."""
+    assert callable(understand)
+    found = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
+    return [command.values for command in found if command is not None]
+
+
+def accepted_by_the_host(data: bytes, codec: Codec, checked: bool) -> list[object]:
+    found: list[object] = []
+    for line, _ in LineReader().feed(data):
+        try:
+            found.append(codec.decode(unseal(line).plain if checked else line))
+        except FrameError:
+            continue
+    return found
+
+
+@pytest.mark.parametrize(
+    "count",
+    [10_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],
+)
+def test_of_single_bit_errors_none_changes_a_value_on_a_checked_link(count: int) -> None:
+    codec, tried, wrong = Codec(WheelMap()), Counter[str](), Counter[str]()
+    for number, plain in enumerate(itertools.cycle(replies_of_a_drive(random.Random(7), 5000))):
+        if number * 8 * 41 >= count:
+            break
+        sequence = b"%02X" % (number % 256)
+        sample = [number * 10, *(number * n for n in (3, 5, 7, 9))] if number % 2 else []
+        text = plain[:-2]
+        reply = text + protocol.suffix(text, sequence, sample) + b"\r\n"
+        command = text + protocol.suffix(text, sequence, ()) + b"\r\n"
+        said, meant = codec.decode(text), protocol.whole(plain)
+        assert meant is not None
+        # An end of line more, so that no accident reaches the next one.
+        for data in flips(reply):
+            tried["reply"] += 1
+            got = accepted_by_the_host(data + b"\n", codec, checked=True)
+            wrong["reply"] += any(speeds != said for speeds in got)
+        for data in flips(command):
+            tried["command"] += 1
+            got = accepted_by_the_mcu(data + b"\n")
+            wrong["command"] += any(values != meant.values for values in got)
+        for data in flips(plain) if number % 8 == 0 else ():
+            tried["plain reply"] += 1
+            got = accepted_by_the_host(data + b"\n", codec, checked=False)
+            wrong["plain reply"] += any(speeds != said for speeds in got)
+            tried["plain command"] += 1
+            got = accepted_by_the_mcu(data + b"\n", protocol.plain_only)
+            wrong["plain command"] += any(values != meant.values for values in got)
+    print()
+    for name, number in tried.items():
+        print(f"  {name:<13} {number:8} bit errors, {wrong[name] / number:7.3%} a wrong value")
+    assert tried["command"] >= count <= tried["reply"]
+    assert wrong["reply"] == wrong["command"] == 0
+    assert 0.17 < wrong["plain reply"] / tried["plain reply"] < 0.25
+
+
+# counts
+
+
+def lossy_drive(check: str, counts: int) -> World:
+    """20 % of the lines lost in either direction, on a way with curves."""
+    world = started(config(check, counts))
+    with world.mcu.lost_replies(every=5), world.mcu.lost_commands(every=5):
+        for turn in (0.0, 0.6, -0.6, 0.3, 0.0):
+            world.drive(0.5, turn, seconds=4.0)
+        world.send(0.0)
+        world.run(1.5)
+    assert "fault" not in {event.name for event in world.events}
+    assert world.mcu.vehicle.pose.x > 5.0
+    return world
+
+
+def test_with_counts_lost_lines_lose_no_distance() -> None:
+    by_speeds, by_counts = off_by(lossy_drive("off", 0)), off_by(lossy_drive("require", 3200))
+    print(f"\n  20 % lost: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
+    assert by_counts < 0.001
+
+
+class LatePort(VirtualPort):
+    """A port whose bytes are read late, in bunches, by up to 60 ms: a busy host."""
+
+    world: World
+    dice = random.Random(5)
+    ready_ns = 0
+    held: list[bytes]
+
+    def feed(self, received: Received) -> None:
+        self.held.append(received.data)
+
+    def take(self) -> tuple[Received, ...]:
+        now = self.world.instant
+        if now.mono_ns < self.ready_ns or not self.held:
+            return ()
+        got = Received(now, b"".join(self.held))
+        self.held.clear()
+        self.ready_ns = now.mono_ns + self.dice.choice((0, 3, 20, 60)) * MS
+        return (got,)
+
+
+def jittery_drive(check: str, counts: int) -> World:
+    world = World(config(check, counts))
+    port = LatePort(115200, world.port._stop)
+    port.world, port.held = world, []
+    port.plug(world.mcu)
+    world.port = world.loop._port = port
+    world.run(0.5)
+    for turn in (0.8, -0.8, 1.5, -1.5, 0.4):
+        world.drive(0.5, turn, seconds=3.0)
+    world.send(0.0)
+    world.run(1.5)
+    assert "fault" not in {event.name for event in world.events}
+    return world
+
+
+def test_when_the_host_reads_the_lines_does_not_bend_the_pose() -> None:
+    by_speeds, by_counts = off_by(jittery_drive("off", 0)), off_by(jittery_drive("require", 3200))
+    print(f"\n  late reads: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
+    assert by_counts < min(0.001, by_speeds)
+
+
+def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
+    fine = replace(config("require", 40_000), sim=SimConfig(encoder_counts=40_000))
+    world = World(fine)
+    world.mcu._on_ns -= 60 * NS_PER_S  # on for a minute: the clock wraps 5 s from now
+    world.run(0.3)
+    world.bus.wanted = set()
+    last = (0.0, 0.0)
+    for _ in range(15):
+        world.drive(0.9, 0.9, seconds=1.0)
+        here = (world.state.x, world.state.y)
+        assert math.dist(here, last) < 1.0
+        last = here
+    world.send(0.0)
+    world.run(1.5)
+    true, state = world.mcu.vehicle.pose, world.state
+    assert world.mcu._counted[0] > 20 * 65536
+    assert math.dist((state.x, state.y), (true.x, true.y)) < 0.001
+    assert math.remainder(state.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.001)
+    assert world.state.counters.get("line_count_leap", 0) == 0
+
+
+def test_when_samples_stop_the_speeds_go_on_without_a_jump() -> None:
+    world = started(config("require", 3200))
+    for stop in (False, True, False):
+        world.drive(0.5, seconds=1.0)
+        x = world.state.x
+        if stop:
+            with world.mcu.no_sample():
+                world.hold(0.5, seconds=0.3)
+                assert check_of(world) == "checked"
+                assert world.state.x == pytest.approx(x + 0.15, abs=0.02)
+                world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+    world.send(0.0)
+    world.run(1.0)
+    assert off_by(world) < 0.01
+
+
+def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
+    world = started(config("require", 3200))
+    world.drive(0.5, seconds=1.0)
+    world.send(0.5)
+    world.stall(0.2)
+    world.hold(0.5, seconds=0.5)
+    world.send(0.0)
+    world.run(1.5)
+    assert off_by(world) < 0.001
+
+
+@pytest.mark.parametrize("motor", range(4))
+def test_a_lying_encoder_is_still_found_out_with_counts(motor: int) -> None:
+    world = started(config("require", 3200))
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.stuck_encoder(motor):
+        world.hold(0.5, seconds=1.5)
+        assert world.state.mode == "fault"
+    assert stopped(world)
+
+
+def test_one_impossible_line_costs_no_distance_with_counts() -> None:
+    world = started(config("require", 3200))
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.bias(1, 5.0):
+        world.hold(0.5, seconds=0.011, hz=100.0)
+    world.hold(0.5, seconds=1.0)
+    world.send(0.0)
+    world.run(1.0)
+    assert world.state.counters["line_impossible"] >= 1
+    assert world.state.mode == "ready"
+    assert off_by(world) < 0.04  # that encoder did count too much
+
+
+# anything
+
+TROUBLE = ("mute", "noise", "partial_line", "slow_reply", "no_check", "no_sample", "lost_replies",
+           "lost_commands", "bit_errors", "reset", "replug", "stall", "blocked")  # fmt: skip
+
+
+def trouble(world: World, dice: random.Random) -> None:
+    """Something goes wrong for a while, under a commander that does not let go."""
+    name, seconds = dice.choice(TROUBLE), dice.choice((0.03, 0.12, 0.4, 1.3))
+    match name:
+        case "reset":
+            world.mcu.reset(world.now_ns, int(seconds * NS_PER_S))
+        case "replug":
+            world.port.unplug()
+            world.hold(0.5, 0.3, seconds=seconds)
+            world.mcu = FakeMcu(world.config, world.now_ns)
+            world.port.plug(world.mcu)
+        case "stall":
+            world.stall(seconds)
+        case "blocked":
+            world.port.blocked = True
+            world.hold(0.5, 0.3, seconds=seconds)
+            world.port.blocked = False
+        case _:
+            with getattr(world.mcu, name)():
+                world.hold(0.5, 0.3, seconds=seconds, hz=50.0)
+
+
+@pytest.mark.parametrize(
+    "stories", [4, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(3600)])]
+)
+def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jumps(
+    stories: int,
+) -> None:
+    for seed in range(stories):
+        dice = random.Random(seed)
+        world = started(config("require", 3200))
+        last = [0.0, 0.0]
+
+        def watch(outputs: Outputs, world: World = world, last: list[float] = last) -> None:
+            line = outputs.line
+            if line is not None and not line.startswith(ZERO):
+                assert outputs.linked
+                assert protocol.whole(line)
+                assert b"#" in line
+                assert world.loop.robot.session.check.state == "checked"
+            for sample in outputs.samples:
+                here = [sample.pose.x, sample.pose.y]
+                # 0.6 m/s for as long as counts bridge at most, and what the motors run on
+                assert math.dist(here, last) < 0.6
+                last[:] = here
+
+        world.watch = watch
+        for _ in range(6):
+            world.drive(0.5, 0.3, seconds=0.5)
+            trouble(world, dice)
+            world.hold(0.5, 0.3, seconds=0.4)
+        world.run(3.0)
+        assert stopped(world)
+        assert world.state.link == "up", seed
+        assert "fault" not in {event.name for event in world.events}, (seed, world.events)

@@ -1,0 +1,36 @@
+"""The checked link in the real process: the simulator on a pty, real bytes, real time."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from acsard.client import connect
+from tests.system.harness import Bus, Daemon, Program, acsard, until
+
+
+def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path: Path) -> None:
+    config = {"mcu": {"port": "sim", "link_check": "require", "encoder_counts": 3200}}
+    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["link"] == "up", 5.0, "link up")
+        (outcome,) = daemon.events("link_check")
+        assert outcome["text"] == "the serial lines are checked with samples"
+        with connect(daemon.endpoint) as robot:
+            robot.drive(0.5, seconds=0.5)
+            until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
+            assert robot.pose().x == pytest.approx(0.25, abs=0.05)
+        assert "(serial lines checked with samples)" in bus.state()["reason"]
+        assert {name for name in bus.state()["counters"] if name.startswith("line_")} == set()
+        daemon.signal(signal.SIGTERM)
+        assert daemon.ended(2.0) == 0
+
+
+def test_firmware_without_the_check_is_not_driven_where_it_is_required(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--fault", "no_check"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        config = {"mcu": {"link_check": "require"}}
+        with Daemon(tmp_path, port, config) as daemon, Bus(daemon.endpoint) as bus:
+            until(lambda: "link_check" in bus.state()["reason"], 5.0, "the reason")
+            assert bus.state()["mode"] == "waiting"

@@ -1,0 +1,61 @@
+"""The switches of the fake MCU: on in their block, off after it."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.faults import FAULTS, Faults
+
+
+def switches(faults: Faults) -> dict[str, object]:
+    return {k: v for k, v in vars(faults).items() if not k.startswith("_")}
+
+
+def test_every_fault_that_needs_no_argument_is_offered_by_its_name() -> None:
+    methods = vars(Faults) | vars(FakeMcu)
+    free = {
+        name
+        for name, method in methods.items()
+        if callable(method) and not name.startswith("_")
+        if inspect.signature(method).return_annotation in ("Fault", "Iterator[None]")
+        if all(
+            p.default is not p.empty
+            for p in list(inspect.signature(method).parameters.values())[1:]
+        )
+    }
+    assert sorted(FAULTS) == sorted(free)
+
+
+@pytest.mark.parametrize("name", [name for name in FAULTS if name != "unprompted"])
+def test_a_fault_turns_its_switch_and_turns_it_back(name: str) -> None:
+    faults = Faults()
+    before = switches(faults)
+    with getattr(faults, name)():
+        assert switches(faults) != before
+    assert switches(faults) == before
+
+
+def test_every_fifth_is_every_fifth() -> None:
+    faults = Faults()
+    with faults.lost_replies(every=5):
+        hits = [faults._hit("reply", faults.lose_reply) for _ in range(10)]
+    assert hits == [False, False, False, False, True] * 2
+    assert not any(faults._hit("reply", faults.lose_reply) for _ in range(10))
+
+
+def test_a_bit_error_turns_one_bit_and_another_each_time() -> None:
+    faults, data = Faults(), bytes(40)
+    with faults.bit_errors(every=1):
+        turned = [int.from_bytes(faults._damaged(data), "big") for _ in range(320)]
+    assert all(number.bit_count() == 1 for number in turned)
+    assert len(set(turned)) == 320
+    assert faults._damaged(data) == data
+
+
+def test_no_data_cannot_be_damaged() -> None:
+    faults = Faults()
+    with faults.bit_errors(every=1):
+        assert faults._damaged(b"") == b""
