@@ -57,6 +57,7 @@ ORDER = (
     "guard",
     "sim.vehicle",
     "sim.fake_mcu",
+    "matching",
     # the shell
     "runtime.exits",
     "runtime.clock",
@@ -78,6 +79,8 @@ ORDER = (
     "runtime.certificates",
     "runtime.host",
     "runtime.daemon",
+    "runtime.bench_wire",
+    "runtime.bench_rig",
     "client",
     "cli.common",
     "cli.run",
@@ -93,6 +96,8 @@ ORDER = (
     "cli.doctor",
     "cli.certificates",
     "cli.lan",
+    "cli.bench_table",
+    "cli.bench",
     "cli",
     "__main__",
 )

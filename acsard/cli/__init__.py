@@ -13,14 +13,28 @@ import traceback
 from typing import NoReturn
 
 from acsard import __version__
-from acsard.cli import call, check, doctor, drive, echo, hz, lan, ports, run, service, sim, topics
+from acsard.cli import (
+    bench,
+    call,
+    check,
+    doctor,
+    drive,
+    echo,
+    hz,
+    lan,
+    ports,
+    run,
+    service,
+    sim,
+    topics,
+)
 from acsard.runtime.exits import Exit, ExitError
 
-VERBS = (run, sim, check, topics, echo, hz, drive, call, doctor, ports, lan, service)
+VERBS = (run, sim, check, topics, echo, hz, drive, call, bench, doctor, ports, lan, service)
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address
-or robot id in use, 77 no permission, 78 bad configuration
+exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
+bus address or robot id in use, 77 no permission, 78 bad configuration
 
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)

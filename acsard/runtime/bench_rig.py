@@ -1,0 +1,334 @@
+"""A daemon under measurement: started as a user starts it, with both its ends in our hands.
+
+    bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  bench_wire (simulated MCU)
+
+Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
+taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
+what they mean (`matching.py`). Any program that takes `--config` and `--port` and speaks the same
+keys can stand in the daemon's place.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import msgspec
+import zenoh
+
+from acsard.config import effective
+from acsard.drive.kinematics import Kinematics
+from acsard.mcu.frames import Codec
+from acsard.matching import Chunk, Fed, commands_to_lines, lines_of, lines_to_samples
+from acsard.messages.encodings import Decoder, encode, encoding_name
+from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
+from acsard.messages.topics import full_key
+from acsard.runtime import clock
+from acsard.runtime.bench_wire import Part, Seen
+from acsard.runtime.exits import Exit, ExitError
+from acsard.runtime.outlets import direct
+from acsard.runtime.zenoh_session import client_session
+from acsard.settings import Config
+from acsard.values import NS_PER_S, Instant, WheelSpeeds
+
+T = TypeVar("T")
+
+ACSARD = (sys.executable, "-m", "acsard", "run")
+
+START_S, END_S = 15.0, 5.0
+"""A start takes 0.3 s, an end 0.2 s; a board that is reset by opening its port takes 2 s more."""
+
+SETTLED = 10
+"""Odometry samples after which the link is up and the start is over."""
+
+SPACING_S = (0.02, 0.06)
+"""Between two commands, evenly spread: they fall anywhere within a period."""
+
+
+class Sent(msgspec.Struct, frozen=True):
+    """A command, when it was put, and the line it must become."""
+
+    at_ns: int
+    line: bytes
+
+
+class Sample(msgspec.Struct, frozen=True):
+    """An odometry sample, when it came, and what it says."""
+
+    at: Instant
+    stamp_ns: int
+    """Wall clock."""
+    speed: float
+    """m/s."""
+
+
+class Record(msgspec.Struct, frozen=True):
+    """The raw times of one run."""
+
+    began_ns: int
+    """Before the program was started."""
+    window_ns: tuple[int, int]
+    """From the end of the start to the beginning of the end: what counts."""
+    seen: Seen | None
+    """None on a real port, whose wire cannot be seen."""
+    sent: list[Sent]
+    samples: list[Sample]
+
+    @property
+    def said(self) -> list[Chunk]:
+        """The feedback lines that count."""
+        first_ns, last_ns = self.window_ns
+        lines = lines_of(self.seen.said) if self.seen else []
+        return [line for line in lines if first_ns <= line[0] < last_ns]
+
+
+def command_waits(record: Record) -> list[int]:
+    """ns from each command to its line on the wire; one that never came is left out."""
+    if record.seen is None:
+        return []
+    sent = [(sent.at_ns, sent.line) for sent in record.sent]
+    return commands_to_lines(sent, lines_of(record.seen.heard))
+
+
+def feedback_fates(config: Config, record: Record) -> list[Fed]:
+    """What became of the feedback lines that were heard of."""
+    codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
+    kinematics = Kinematics(config.drive)
+    said = [
+        (at_ns, kinematics.twist(codec.decode(line)).linear)
+        for at_ns, line in record.said
+    ]
+    samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
+    return lines_to_samples(said, samples)
+
+
+def free_endpoint() -> str:
+    """A loopback address nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def processor_ns(pid: int) -> int:
+    """Processor time of all threads of a process so far."""
+    return sum(
+        int(task.joinpath("schedstat").read_text().split()[0])
+        for task in Path(f"/proc/{pid}/task").iterdir()
+    )
+
+
+def resident_mb(pid: int) -> float:
+    """Memory in use."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+class Rig:
+    """Enter it to have the program up and linked; `end` gives what was recorded."""
+
+    def __init__(
+        self,
+        config: Config,
+        file: Path,
+        *,
+        words: Sequence[str] = ACSARD,
+        port: str = "",
+        unprompted: float = 0.0,
+    ) -> None:
+        self._config, self._file, self._words, self._port = config, file, words, port
+        self._unprompted = unprompted
+        self._endpoint = config.bus.listen[0]
+        self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
+        self._kinematics = Kinematics(config.drive)
+        self._stack = ExitStack()
+        self._wire: subprocess.Popen[bytes] | None = None
+        self._arrived: list[tuple[Instant, bytes]] = []
+        self._sent: list[Sent] = []
+        self._began_ns = self._settled_ns = 0
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            where = Path(stack.enter_context(TemporaryDirectory(prefix="acsard-bench-")))
+            self._log = where / "log"
+            port = self._port or self._start_wire(stack, where)
+            self._start_program(stack, port)
+            self.session = self._wait(self._connect, f"an answer at {self._endpoint}")
+            stack.callback(self.session.close)
+            key = full_key(self._config.robot.id, "odom")
+            self._kept = self.session.declare_subscriber(key, direct(self._odometry))
+            self._publisher = self.session.declare_publisher(
+                full_key(self._config.robot.id, f"cmd/{self._config.commands.sources[0].name}"),
+                encoding=encoding_name("msgpack", "Twist"),
+                express=True,
+            )
+            self._wait(lambda: len(self._arrived) >= SETTLED or None, "odometry on the bus")
+            self._settled_ns = clock.mono_ns()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    # starting
+
+    def _start_wire(self, stack: ExitStack, where: Path) -> str:
+        part = where / "part.json"
+        part.write_bytes(msgspec.json.encode(Part(effective(self._config), self._unprompted)))
+        wire = self._wire = subprocess.Popen(
+            [sys.executable, "-m", "acsard.runtime.bench_wire", str(part)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        stack.callback(_leave, wire)
+        assert wire.stdout is not None
+        return wire.stdout.readline().decode().strip()
+
+    def _start_program(self, stack: ExitStack, port: str) -> None:
+        hidden = ("INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG")
+        words = [*self._words, "--config", str(self._file), "--port", port]
+        with self._log.open("wb") as log:
+            self._began_ns = clock.mono_ns()
+            self.process = subprocess.Popen(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                env={key: value for key, value in os.environ.items() if key not in hidden},
+                start_new_session=True,
+            )
+        stack.callback(_leave, self.process)
+
+    def _connect(self) -> zenoh.Session | None:
+        try:
+            return client_session(self._endpoint)
+        except ExitError:
+            return None
+
+    def _wait(self, look: Callable[[], T | None], what: str) -> T:
+        deadline_ns = clock.mono_ns() + int(START_S * NS_PER_S)
+        while True:
+            self._alive()
+            found = look()
+            if found is not None:
+                return found
+            if clock.mono_ns() > deadline_ns:
+                raise ExitError(
+                    Exit.FAILURE, f"no {what} within {START_S:g} s; is the microcontroller there?"
+                )
+            time.sleep(0.01)
+
+    def _alive(self) -> None:
+        """Raises the program's own end as ours."""
+        code = self.process.poll()
+        if code is not None:
+            said = self._log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
+            known = code in Exit.__members__.values()
+            text = said[-1].removeprefix("acsard: ")
+            raise ExitError(
+                Exit(code) if known and code else Exit.FAILURE,
+                text if known and code else f"the daemon ended with {code}: {text}",
+            )
+
+    # measuring
+
+    def _odometry(self, sample: zenoh.Sample) -> None:
+        self._arrived.append((clock.now(), sample.payload.to_bytes()))
+
+    def follow(self, seconds: float) -> float:
+        """Only listen for so long; the share of a core the program took."""
+        began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
+        time.sleep(seconds)
+        return self._share(began_ns, used_ns)
+
+    def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
+        """Command at random phases for so long; the share of a core the program took.
+
+        `wheel_speed` gives the speed of all wheels of the n-th command, rad/s.
+        """
+        phases = random.Random(seed)
+        self._put(0.0)  # neutral first
+        time.sleep(0.2)
+        began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
+        number = 0
+        while clock.mono_ns() - began_ns < seconds * NS_PER_S:
+            time.sleep(phases.uniform(*SPACING_S))
+            self._sent.append(self._put(wheel_speed(number)))
+            number += 1
+        share = self._share(began_ns, used_ns)
+        time.sleep(0.1)  # the last one's line
+        self._put(0.0)
+        return share
+
+    def _share(self, began_ns: int, used_ns: int) -> float:
+        self._alive()
+        used_ns = processor_ns(self.process.pid) - used_ns
+        return used_ns / (clock.mono_ns() - began_ns)
+
+    def _put(self, wheel_speed: float) -> Sent:
+        speeds = WheelSpeeds(wheel_speed, wheel_speed, wheel_speed, wheel_speed)
+        twist = self._kinematics.twist(speeds)
+        message = Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+        payload, line = encode(message, "msgpack"), self._codec.encode(speeds).rstrip(b",\r\n")
+        at_ns = clock.mono_ns()
+        self._publisher.put(payload)
+        return Sent(at_ns, line)
+
+    def state(self) -> RobotState:
+        """What the daemon says of itself."""
+        key = full_key(self._config.robot.id, "state")
+        for reply in self.session.get(key, timeout=3.0):
+            if reply.ok is not None:
+                sample: Any = reply.ok
+                return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
+        raise ExitError(Exit.UNREACHABLE, f"no answer on {key}")
+
+    def end(self) -> Record:
+        """End the program and tell what was recorded; the rig is used up."""
+        window_ns = (self._settled_ns, clock.mono_ns())
+        time.sleep(0.1)  # what was under way
+        _leave(self.process)
+        seen = None
+        if self._wire is not None:
+            assert self._wire.stdin is not None
+            assert self._wire.stdout is not None
+            self._wire.stdin.close()
+            seen = msgspec.msgpack.decode(self._wire.stdout.read(), type=Seen)
+            self._wire.wait(END_S)
+        decoder = Decoder(Odometry)
+        samples = []
+        for at, payload in self._arrived:
+            if at.mono_ns < self._settled_ns:
+                continue
+            odometry = decoder.decode(encoding_name("msgpack"), payload)
+            stamp = odometry.header.stamp
+            stamp_ns = stamp.sec * NS_PER_S + stamp.nanosec
+            samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
+        return Record(self._began_ns, window_ns, seen, self._sent, samples)
+
+
+def _leave(process: subprocess.Popen[bytes]) -> None:
+    """End a child: it is asked first."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
