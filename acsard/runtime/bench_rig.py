@@ -290,6 +290,10 @@ class Rig:
         self._publisher.put(payload)
         return Sent(at_ns, line)
 
+    def deaf(self) -> None:
+        """Listen to the odometry no longer."""
+        self._kept.undeclare()
+
     def state(self) -> RobotState:
         """What the daemon says of itself."""
         key = full_key(self._config.robot.id, "state")
@@ -299,11 +303,15 @@ class Rig:
                 return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
         raise ExitError(Exit.UNREACHABLE, f"no answer on {key}")
 
+    def leave(self) -> None:
+        """End the program."""
+        _leave(self.process)
+
     def end(self) -> Record:
         """End the program and tell what was recorded; the rig is used up."""
         window_ns = (self._settled_ns, clock.mono_ns())
         time.sleep(0.1)  # what was under way
-        _leave(self.process)
+        self.leave()
         seen = None
         if self._wire is not None:
             assert self._wire.stdin is not None
