@@ -12,7 +12,7 @@ from acsard.runtime.exits import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.cli.bench_table import Result
-    from acsard.runtime.bench_rig import Record, Rig
+    from acsard.runtime.bench_rig import Rig
     from acsard.settings import Config
 
 _DESCRIPTION = """\
@@ -200,8 +200,10 @@ def _result(
         seconds=seconds,
         realtime=realtime,
         outside=outside,
-        own={n: Summary(f.count, round(f.p50, 1), round(f.p99, 1), round(f.max, 1))
-             for n, f in figures.items()},
+        own={
+            n: Summary(f.count, round(f.p50, 1), round(f.p99, 1), round(f.max, 1))
+            for n, f in figures.items()
+        },
         commands_sent=len(record.sent),
         commands_seen=seen,
         lines_said=lines_said,

@@ -29,8 +29,8 @@ import zenoh
 
 from acsard.config import effective
 from acsard.drive.kinematics import Kinematics
-from acsard.mcu.frames import Codec
 from acsard.matching import Chunk, Fed, commands_to_lines, lines_of, lines_to_samples
+from acsard.mcu.frames import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.messages.topics import full_key
@@ -105,10 +105,7 @@ def feedback_fates(config: Config, record: Record) -> list[Fed]:
     """What became of the feedback lines that were heard of."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
-    said = [
-        (at_ns, kinematics.twist(codec.decode(line)).linear)
-        for at_ns, line in record.said
-    ]
+    said = [(at_ns, kinematics.twist(codec.decode(line)).linear) for at_ns, line in record.said]
     samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
     return lines_to_samples(said, samples)
 
@@ -145,9 +142,10 @@ class Rig:
         words: Sequence[str] = ACSARD,
         port: str = "",
         unprompted: float = 0.0,
+        wire_baud_rate: int = 0,
     ) -> None:
         self._config, self._file, self._words, self._port = config, file, words, port
-        self._unprompted = unprompted
+        self._part = Part(effective(config), unprompted, wire_baud_rate)
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)
@@ -189,7 +187,7 @@ class Rig:
 
     def _start_wire(self, stack: ExitStack, where: Path) -> str:
         part = where / "part.json"
-        part.write_bytes(msgspec.json.encode(Part(effective(self._config), self._unprompted)))
+        part.write_bytes(msgspec.json.encode(self._part))
         wire = self._wire = subprocess.Popen(
             [sys.executable, "-m", "acsard.runtime.bench_wire", str(part)],
             stdin=subprocess.PIPE,

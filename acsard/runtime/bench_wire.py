@@ -18,6 +18,7 @@ import tty
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from acsard.config import from_builtins
 from acsard.matching import Chunk, staircase
@@ -25,7 +26,6 @@ from acsard.runtime import clock
 from acsard.runtime.timerfd import TimerFd
 from acsard.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S
 
 PRIORITY = 80
 """Of real-time scheduling: a microcontroller waits for no host."""
@@ -37,6 +37,8 @@ class Part(msgspec.Struct, frozen=True):
     config: dict[str, object]
     unprompted: float = 0.0
     """s between reports by its own clock; 0 for an answer to each line."""
+    baud_rate: int = 0
+    """Of this end, when it shall be another than the configuration may say."""
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -59,6 +61,9 @@ class NumberedMcu(FakeMcu):
         self._number += 1
         speed = staircase(self._number)
         return [forward * speed for _, forward in self._wiring]
+
+    def _pass(self, now_ns: int) -> None:
+        self._now_ns = max(self._now_ns, now_ns)  # nothing here moves
 
 
 class FarEnd:
@@ -121,9 +126,13 @@ def main(part: Part) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError:
         pass  # its times are then as good as the machine is idle
-    mcu = NumberedMcu(from_builtins(part.config), clock.mono_ns())
+    config = from_builtins(part.config)
+    if part.baud_rate:
+        config = replace(config, mcu=replace(config.mcu, baud_rate=part.baud_rate))
+    mcu = NumberedMcu(config, clock.mono_ns())
     end = FarEnd(mcu)
-    print(end.path, flush=True)
+    sys.stdout.write(end.path + "\n")
+    sys.stdout.flush()
     gc.disable()
     if part.unprompted:
         with mcu.unprompted(part.unprompted):

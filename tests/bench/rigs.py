@@ -42,12 +42,24 @@ def sibling(one: Config, number: int) -> Config:
 
 @contextmanager
 def rig(
-    one: Config, words: Sequence[str] = ACSARD, *, port: str = "", unprompted: float = 0.0
+    one: Config,
+    words: Sequence[str] = ACSARD,
+    *,
+    port: str = "",
+    unprompted: float = 0.0,
+    wire_baud_rate: int = 0,
 ) -> Iterator[Rig]:
     """The program up and linked."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(one, Path(where))
-        with Rig(one, file, words=words, port=port, unprompted=unprompted) as running:
+        with Rig(
+            one,
+            file,
+            words=words,
+            port=port,
+            unprompted=unprompted,
+            wire_baud_rate=wire_baud_rate,
+        ) as running:
             yield running
 
 
