@@ -79,6 +79,7 @@ ORDER = (
     "runtime.certificates",
     "runtime.host",
     "runtime.daemon",
+    "runtime.bench_record",
     "runtime.bench_wire",
     "runtime.bench_rig",
     "client",

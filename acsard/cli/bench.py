@@ -12,6 +12,8 @@ from acsard.runtime.exits import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.cli.bench_table import Result
+    from acsard.matching import Summary
+    from acsard.messages.schema import RobotState
     from acsard.runtime.bench_rig import Rig
     from acsard.settings import Config
 
@@ -165,14 +167,25 @@ def measure(config: Config, port: str, seconds: float) -> Result:
             return _result(config, port, seconds, rig, (followed, commanded))
 
 
+def _own(state: RobotState) -> dict[str, Summary]:
+    from acsard.matching import Summary
+
+    spreads = {name: figure.since_start for name, figure in state.figures.items()}
+    return {
+        name: Summary(s.count, round(s.p50, 1), round(s.p99, 1), round(s.max, 1))
+        for name, s in spreads.items()
+    }
+
+
 def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
     import os
 
     from acsard.cli.bench_table import Result, this_machine
-    from acsard.matching import Summary, lines_of, summary
-    from acsard.runtime.bench_rig import command_waits, feedback_fates, resident_mb
+    from acsard.matching import lines_of, summary
+    from acsard.runtime.bench_record import command_waits, feedback_fates
+    from acsard.runtime.bench_rig import resident_mb
 
     state, pid = rig.state(), rig.process.pid
     realtime = os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR)
@@ -190,7 +203,7 @@ def _result(
         seen, lines_said, lines_told = len(waits), len(record.said), len(fed)
         lines_waiting = max((one.waiting for one in fed), default=0)
         start_up = round((heard[0][0] - record.began_ns) / 1e6, 1)
-    figures = {name: figure.since_start for name, figure in state.figures.items()}
+    figures = _own(state)
     return Result(
         machine=this_machine(),
         port=port or "simulator",
@@ -200,10 +213,7 @@ def _result(
         seconds=seconds,
         realtime=realtime,
         outside=outside,
-        own={
-            n: Summary(f.count, round(f.p50, 1), round(f.p99, 1), round(f.max, 1))
-            for n, f in figures.items()
-        },
+        own=figures,
         commands_sent=len(record.sent),
         commands_seen=seen,
         lines_said=lines_said,

@@ -4,7 +4,7 @@
 
 Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
 taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
-what they mean (`matching.py`). Any program that takes `--config` and `--port` and speaks the same
+what they mean (`bench_record.py`). Any program that takes `--config` and `--port` and speaks the same
 keys can stand in the daemon's place.
 """
 
@@ -29,13 +29,13 @@ import zenoh
 
 from acsard.config import effective
 from acsard.drive.kinematics import Kinematics
-from acsard.matching import Chunk, Fed, commands_to_lines, lines_of, lines_to_samples
 from acsard.mcu.frames import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.messages.topics import full_key
 from acsard.runtime import clock
-from acsard.runtime.bench_wire import Part, Seen
+from acsard.runtime.bench_record import Record, Sample, Seen, Sent
+from acsard.runtime.bench_wire import Part
 from acsard.runtime.exits import Exit, ExitError
 from acsard.runtime.outlets import direct
 from acsard.runtime.zenoh_session import client_session
@@ -54,60 +54,6 @@ SETTLED = 10
 
 SPACING_S = (0.02, 0.06)
 """Between two commands, evenly spread: they fall anywhere within a period."""
-
-
-class Sent(msgspec.Struct, frozen=True):
-    """A command, when it was put, and the line it must become."""
-
-    at_ns: int
-    line: bytes
-
-
-class Sample(msgspec.Struct, frozen=True):
-    """An odometry sample, when it came, and what it says."""
-
-    at: Instant
-    stamp_ns: int
-    """Wall clock."""
-    speed: float
-    """m/s."""
-
-
-class Record(msgspec.Struct, frozen=True):
-    """The raw times of one run."""
-
-    began_ns: int
-    """Before the program was started."""
-    window_ns: tuple[int, int]
-    """From the end of the start to the beginning of the end: what counts."""
-    seen: Seen | None
-    """None on a real port, whose wire cannot be seen."""
-    sent: list[Sent]
-    samples: list[Sample]
-
-    @property
-    def said(self) -> list[Chunk]:
-        """The feedback lines that count."""
-        first_ns, last_ns = self.window_ns
-        lines = lines_of(self.seen.said) if self.seen else []
-        return [line for line in lines if first_ns <= line[0] < last_ns]
-
-
-def command_waits(record: Record) -> list[int]:
-    """ns from each command to its line on the wire; one that never came is left out."""
-    if record.seen is None:
-        return []
-    sent = [(sent.at_ns, sent.line) for sent in record.sent]
-    return commands_to_lines(sent, lines_of(record.seen.heard))
-
-
-def feedback_fates(config: Config, record: Record) -> list[Fed]:
-    """What became of the feedback lines that were heard of."""
-    codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
-    kinematics = Kinematics(config.drive)
-    said = [(at_ns, kinematics.twist(codec.decode(line)).linear) for at_ns, line in record.said]
-    samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
-    return lines_to_samples(said, samples)
 
 
 def free_endpoint() -> str:

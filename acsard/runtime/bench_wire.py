@@ -21,8 +21,9 @@ import msgspec
 from msgspec.structs import replace
 
 from acsard.config import from_builtins
-from acsard.matching import Chunk, staircase
+from acsard.matching import staircase
 from acsard.runtime import clock
+from acsard.runtime.bench_record import Seen
 from acsard.runtime.timerfd import TimerFd
 from acsard.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
@@ -39,15 +40,6 @@ class Part(msgspec.Struct, frozen=True):
     """s between reports by its own clock; 0 for an answer to each line."""
     baud_rate: int = 0
     """Of this end, when it shall be another than the configuration may say."""
-
-
-class Seen(msgspec.Struct, frozen=True):
-    """All that went over the wire, monotonic times in ns."""
-
-    heard: list[Chunk] = []
-    """Bytes from the host, and when they were there to be read."""
-    said: list[Chunk] = []
-    """Lines to the host, and when the last byte was handed over."""
 
 
 class NumberedMcu(FakeMcu):

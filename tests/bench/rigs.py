@@ -14,14 +14,8 @@ from msgspec.structs import replace
 
 from acsard.cli.bench import bench_config, write
 from acsard.matching import staircase
-from acsard.runtime.bench_rig import (
-    ACSARD,
-    Record,
-    Rig,
-    command_waits,
-    feedback_fates,
-    free_endpoint,
-)
+from acsard.runtime.bench_record import Record, command_waits, feedback_fates
+from acsard.runtime.bench_rig import ACSARD, Rig, free_endpoint
 from acsard.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")

@@ -13,7 +13,8 @@ from statistics import median
 
 import pytest
 
-from acsard.runtime.bench_rig import ACSARD, feedback_fates
+from acsard.runtime.bench_record import feedback_fates
+from acsard.runtime.bench_rig import ACSARD
 from tests.bench.rigs import POLLED, config, driven, rig, share, waits_us
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
