@@ -4,8 +4,8 @@
 
 Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
 taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
-what they mean (`bench_record.py`). Any program that takes `--config` and `--port` and speaks the same
-keys can stand in the daemon's place.
+what they mean (`bench_record.py`). Any program that takes `--config` and `--port` and speaks the
+same keys can stand in the daemon's place.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """The way of the original, for comparison: poll, update, write, sleep; a line each way per cycle.
 
-    python -m tests.bench.polled --config FILE --port DEVICE
+    python -m tests.bench.polled --config FILE --port DEVICE [--drain]
 
 A ros2_control hardware interface in small: every cycle takes at most one line from the port and
-leaves the rest in its buffer, publishes the odometry, writes the newest command on the tick. It
+leaves the rest in its buffer, publishes the odometry, writes the newest command on the tick. With
+--drain every cycle takes all lines and keeps the newest: the obvious mend of the original. It
 has nothing of what a robot needs (no limits, no timeouts, no checks), only what takes time. The
 wire format and the keys are acsard's, so that the same rig measures both.
 """
@@ -50,17 +51,18 @@ class Robot:
         linear = message.get("linear", {}).get("x", 0.0)
         self.line = line_for(linear, message.get("angular", {}).get("z", 0.0))
 
-    def read(self) -> None:
+    def read(self) -> bool:
         """One line, if there is a whole one."""
         line, end, rest = self.buffer.partition(b"\n")
         if not end:
-            return
+            return False
         self.buffer = rest
         found = TOKEN.findall(line)
         if len(found) == 4:
             a, b, c, d = [float(size) * (1 if sign == b"p" else -1) for sign, size in found]
             right, left = RADIUS * (a + d) / 2, RADIUS * (b + c) / 2
             self.linear, self.angular = (right + left) / 2, (right - left) / SEPARATION
+        return True
 
     def update(self, dt: float) -> dict[str, object]:
         """Integrate and tell."""
@@ -84,6 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--config", type=Path)
     parser.add_argument("--port")
+    parser.add_argument("--drain", action="store_true")
     args = parser.parse_args()
     config = tomllib.loads(args.config.read_text())
     robot, root = Robot(), f"acsard/{config['robot']['id']}"
@@ -99,8 +102,9 @@ def main() -> None:
         period = 1.0 / config["control"]["rate"]
         due = time.monotonic()
         while kept:
-            robot.buffer += port.read(max(0, 128 - len(robot.buffer)))
-            robot.read()
+            robot.buffer += port.read(4096 if args.drain else max(0, 128 - len(robot.buffer)))
+            while robot.read() and args.drain:
+                pass
             odometry.put(msgspec.msgpack.encode(robot.update(period)))
             port.write(robot.line)
             due += period

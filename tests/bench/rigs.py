@@ -21,6 +21,9 @@ from acsard.settings import BusConfig, Config, ControlConfig, McuConfig, RobotCo
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original's way."""
 
+DRAINING = (*POLLED, "--drain")
+"""The same with its obvious mend."""
+
 
 def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
     """As `acsard bench` measures with."""
