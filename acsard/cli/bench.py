@@ -56,7 +56,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--port",
         metavar="DEVICE",
         help="measure with the microcontroller on this serial port, at zero speed "
-        "(default: a simulated one, whatever the configuration says)",
+        "(default: sim, a simulated one, whatever the configuration says)",
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="control rate, else as configured")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.cli.bench_table import table
 
-    port = args.port or ""
+    port = "" if args.port in (None, "sim") else args.port
     if port and not Path(port).exists():
         raise ExitError(Exit.NO_PORT, f"{port} is not there; `acsard ports` lists what is")
     given: Overrides = {"control": {"rate": args.rate}} if args.rate is not None else {}

@@ -10,6 +10,7 @@ same keys can stand in the daemon's place.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import random
 import signal
@@ -48,6 +49,9 @@ ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S, END_S = 15.0, 5.0
 """A start takes 0.3 s, an end 0.2 s; a board that is reset by opening its port takes 2 s more."""
+
+PR_SET_PDEATHSIG = 1
+"""From linux/prctl.h."""
 
 SETTLED = 10
 """Odometry samples after which the link is up and the start is over."""
@@ -97,6 +101,7 @@ class Rig:
         self._kinematics = Kinematics(config.drive)
         self._stack = ExitStack()
         self._wire: subprocess.Popen[bytes] | None = None
+        self._session: zenoh.Session | None = None
         self._arrived: list[tuple[Instant, bytes]] = []
         self._sent: list[Sent] = []
         self._began_ns = self._settled_ns = 0
@@ -107,11 +112,11 @@ class Rig:
             self._log = where / "log"
             port = self._port or self._start_wire(stack, where)
             self._start_program(stack, port)
-            self.session = self._wait(self._connect, f"an answer at {self._endpoint}")
-            stack.callback(self.session.close)
+            session = self._session = self._wait(self._connect, f"answer at {self._endpoint}")
+            stack.callback(session.close)
             key = full_key(self._config.robot.id, "odom")
-            self._kept = self.session.declare_subscriber(key, direct(self._odometry))
-            self._publisher = self.session.declare_publisher(
+            self._kept = session.declare_subscriber(key, direct(self._odometry))
+            self._publisher = session.declare_publisher(
                 full_key(self._config.robot.id, f"cmd/{self._config.commands.sources[0].name}"),
                 encoding=encoding_name("msgpack", "Twist"),
                 express=True,
@@ -156,6 +161,7 @@ class Rig:
                 stderr=log,
                 env={key: value for key, value in os.environ.items() if key not in hidden},
                 start_new_session=True,
+                preexec_fn=_end_with_us,
             )
         stack.callback(_leave, self.process)
 
@@ -173,10 +179,15 @@ class Rig:
             if found is not None:
                 return found
             if clock.mono_ns() > deadline_ns:
-                raise ExitError(
-                    Exit.FAILURE, f"no {what} within {START_S:g} s; is the microcontroller there?"
-                )
+                raise ExitError(Exit.FAILURE, f"no {what} within {START_S:g} s{self._why()}")
             time.sleep(0.01)
+
+    def _why(self) -> str:
+        """What the daemon waits for, if it can be asked."""
+        try:
+            return f": {self.state().reason}"
+        except ExitError:
+            return ""
 
     def _alive(self) -> None:
         """Raises the program's own end as ours."""
@@ -241,7 +252,7 @@ class Rig:
     def state(self) -> RobotState:
         """What the daemon says of itself."""
         key = full_key(self._config.robot.id, "state")
-        for reply in self.session.get(key, timeout=3.0):
+        for reply in self._session.get(key, timeout=3.0) if self._session else ():
             if reply.ok is not None:
                 sample: Any = reply.ok
                 return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
@@ -273,6 +284,11 @@ class Rig:
             stamp_ns = stamp.sec * NS_PER_S + stamp.nanosec
             samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
+
+
+def _end_with_us() -> None:
+    """In the child: a parent that is killed leaves no daemon behind."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _leave(process: subprocess.Popen[bytes]) -> None:

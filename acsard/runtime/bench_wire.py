@@ -131,8 +131,11 @@ def main(part: Part) -> None:
             end.play(sys.stdin.fileno())
     else:
         end.play(sys.stdin.fileno())
-    sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))
-    sys.stdout.flush()
+    try:
+        sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os._exit(1)  # who asked has been killed
 
 
 if __name__ == "__main__":
