@@ -203,7 +203,7 @@ def _result(
         seen, lines_said, lines_told = len(waits), len(record.said), len(fed)
         lines_waiting = max((one.waiting for one in fed), default=0)
         start_up = round((heard[0][0] - record.began_ns) / 1e6, 1)
-    figures = _own(state)
+    figures, missed = _own(state), state.counters.get("missed_periods", 0)
     return Result(
         machine=this_machine(),
         port=port or "simulator",
@@ -219,8 +219,8 @@ def _result(
         lines_said=lines_said,
         lines_told=lines_told,
         lines_waiting_max=lines_waiting,
-        periods=figures["period_lateness"].count,
-        missed_periods=state.counters.get("missed_periods", 0),
+        periods=figures["period_lateness"].count + missed,
+        missed_periods=missed,
         cpu_percent_following=round(100 * shares[0], 2),
         cpu_percent_commanded=round(100 * shares[1], 2),
         resident_mb=round(resident, 1),

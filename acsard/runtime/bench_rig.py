@@ -48,10 +48,9 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S, END_S = 15.0, 5.0
-"""A start takes 0.3 s, an end 0.2 s; a board that is reset by opening its port takes 2 s more."""
+"""A start takes 0.3 s, and 2 s more where opening the port resets the board; an end 0.2 s."""
 
-PR_SET_PDEATHSIG = 1
-"""From linux/prctl.h."""
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 SETTLED = 10
 """Odometry samples after which the link is up and the start is over."""
@@ -217,19 +216,17 @@ class Rig:
 
         `wheel_speed` gives the speed of all wheels of the n-th command, rad/s.
         """
-        phases = random.Random(seed)
+        phases, number = random.Random(seed), 0
         self._put(0.0)  # neutral first
         time.sleep(0.2)
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
-        number = 0
         while clock.mono_ns() - began_ns < seconds * NS_PER_S:
             time.sleep(phases.uniform(*SPACING_S))
             self._sent.append(self._put(wheel_speed(number)))
             number += 1
-        share = self._share(began_ns, used_ns)
         time.sleep(0.1)  # the last one's line
         self._put(0.0)
-        return share
+        return self._share(began_ns, used_ns)
 
     def _share(self, began_ns: int, used_ns: int) -> float:
         self._alive()

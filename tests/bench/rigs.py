@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
@@ -82,15 +82,13 @@ def share(values: Sequence[float], part: float) -> float:
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
 
-def in_turns(
-    ways: dict[str, Callable[[int], float]], rounds: int
-) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """The median of each way, all taken in turn in each round; and all the values."""
+def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, float]:
+    """The median of each way, all taken in turn in each round."""
     values: dict[str, list[float]] = {name: [] for name in ways}
-    for number in range(rounds):
+    for _ in range(rounds):
         for name, measure in ways.items():
-            values[name].append(measure(number))
-    return {name: median(found) for name, found in values.items()}, values
+            values[name].append(measure())
+    return {name: median(found) for name, found in values.items()}
 
 
 def schedule(pid: int, policy: int, priority: int = 0) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -54,7 +53,6 @@ def missed_share(rate: float, realtime: bool) -> float:
     words = (sys.executable, "-m", "tests.bench.unlimited", "--rate", str(rate))
     with rig(config(), words, wire_baud_rate=BAUD_RATE) as running:
         scheduled(running, realtime)
-        time.sleep(1.2)  # what `state` tells is up to a second old
         before = periods_and_missed(running)
         used = running.follow(SECONDS)
         begun, missed, lines = (
@@ -107,7 +105,6 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
         with rig(config()) as running, all_cores_busy(busy):
             scheduled(running, realtime)
             running.follow(10.0)
-            time.sleep(1.0)  # the figures are up to a second old
             state = running.state()
             running.leave()
         late = state.figures["period_lateness"].since_start

@@ -75,17 +75,17 @@ def test_the_cost_of_each_transport() -> None:
     with rig(one) as running:
         running.deaf()
 
-        def cost(keys: tuple[str, ...], _: int) -> float:
+        def cost(keys: tuple[str, ...]) -> float:
             with listening(one, keys, 1 if keys else 0):
                 return cycle_us(running, one, 3.0)
 
-        ways: dict[str, Callable[[int], float]] = {
+        ways: dict[str, Callable[[], float]] = {
             "nobody": partial(cost, ()),
             "native msgpack": partial(cost, native(one)),
             "bridge CDR": partial(cost, ON_THE_BRIDGE),
             "both": partial(cost, (*native(one), *ON_THE_BRIDGE)),
         }
-        costs, _ = in_turns(ways, 4)
+        costs = in_turns(ways, 4)
         running.end()
     print("\nodom, tf and wheel states to one client; us of processor time per 10 ms cycle")
     for name, us in costs.items():
@@ -101,13 +101,13 @@ def test_the_cost_of_more_subscribers() -> None:
     with rig(one) as running:
         running.deaf()
 
-        def cost(sessions: int, _: int) -> float:
+        def cost(sessions: int) -> float:
             with listening(one, native(one)[:1], sessions):
                 return cycle_us(running, one, 3.0)
 
         numbers = (0, 1, 4, 16)
-        ways: dict[str, Callable[[int], float]] = {str(n): partial(cost, n) for n in numbers}
-        costs, _ = in_turns(ways, 3)
+        ways: dict[str, Callable[[], float]] = {str(n): partial(cost, n) for n in numbers}
+        costs = in_turns(ways, 3)
         running.end()
     print("\nodometry to so many clients; us of processor time per 10 ms cycle")
     for name, us in costs.items():
