@@ -115,4 +115,4 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
             f"p99 {late.p99:.0f}, max {late.max:.0f} us; {missed} of {late.count} missed"
         )
         # What was asked for is what was measured.
-        assert late.count > 900
+        assert late.count + missed > 900
