@@ -29,8 +29,9 @@ Where to look, in the order the modules may import each other:
     access.py         who may do what: the topic table -> Zenoh's access rules
     robot.py          the order; guard.py: the last look at every outgoing line
     sim/              the vehicle and the fake microcontroller
+    matching.py       which message belongs to which line: what `acsard bench` measures
     runtime/          clock, ticker, real_time, serial device and port, Zenoh bus (inbox, outlets,
-                      replies), systemd and its journal, logs, control loop, daemon
+                      replies), systemd and its journal, logs, control loop, daemon, the bench's rig
     client.py         drive and follow a robot from Python
     cli/              one verb per file
 

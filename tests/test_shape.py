@@ -63,6 +63,7 @@ ORDER = (
     "sim.protocol",
     "sim.faults",
     "sim.fake_mcu",
+    "matching",
     # the shell
     "runtime.exits",
     "runtime.clock",
@@ -85,6 +86,9 @@ ORDER = (
     "runtime.certificates",
     "runtime.host",
     "runtime.daemon",
+    "runtime.bench_record",
+    "runtime.bench_wire",
+    "runtime.bench_rig",
     "client",
     "cli.common",
     "cli.run",
@@ -103,6 +107,8 @@ ORDER = (
     "cli.doctor",
     "cli.certificates",
     "cli.lan",
+    "cli.bench_table",
+    "cli.bench",
     "cli",
     "__main__",
 )

@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from acsard import __version__
 from acsard.cli import (
+    bench,
     call,
     check,
     doctor,
@@ -30,11 +31,26 @@ from acsard.cli import (
 )
 from acsard.runtime.exits import Exit, ExitError
 
-VERBS = (run, sim, check, topics, echo, hz, top, drive, call, doctor, ports, lan, service)
+VERBS = (
+    run,
+    sim,
+    check,
+    topics,
+    echo,
+    hz,
+    top,
+    drive,
+    call,
+    bench,
+    doctor,
+    ports,
+    lan,
+    service,
+)
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address
-or robot id in use, 77 no permission, 78 bad configuration
+exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
+bus address or robot id in use, 77 no permission, 78 bad configuration
 
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)

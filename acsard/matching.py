@@ -1,0 +1,119 @@
+"""Which message belongs to which line: how `acsard bench` pairs what went in with what came out.
+
+Every command and every feedback line of a benchmark says a speed of its own, so that each is
+recognised by what it says and not by when it came. Times are monotonic, ns.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
+
+from msgspec import Struct
+
+STEPS = 1000
+"""So many speeds differ; lines further apart than this are told apart by their time."""
+
+LOWEST, STEP = 5.0, 0.02
+"""rad/s; neighbours are so close that no limit on acceleration comes between them."""
+
+PATIENCE_NS = 1_000_000_000
+"""A command that is not on the wire by then never comes."""
+
+Chunk = tuple[int, bytes]
+"""Bytes as they came or went, and when."""
+
+
+class Summary(Struct, frozen=True):
+    """Median, 99th percentile and maximum of `count` durations, us."""
+
+    count: int
+    p50: float
+    p99: float
+    max: float
+
+
+class Fed(Struct, frozen=True):
+    """A feedback line that became an odometry sample."""
+
+    delay_ns: int
+    """From its last byte to the sample."""
+    waiting: int
+    """Newer lines handed over by the time of the sample."""
+
+
+def staircase(number: int) -> float:
+    """The wheel speed that stands for `number`, rad/s: up in even steps, down in odd ones."""
+    half = STEPS // 2
+    place = number % STEPS
+    rung = 2 * place if place < half else 2 * (STEPS - place) - 1
+    return round(LOWEST + rung * STEP / 2, 2)
+
+
+def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
+    """The lines without their ends, each with the time of its first byte; empty ones left out."""
+    lines, held, began_ns = [], b"", 0
+    for at_ns, data in chunks:
+        if not held:
+            began_ns = at_ns
+        *whole, held = (held + data).split(b"\n")
+        for line in whole:
+            if line.strip():
+                lines.append((began_ns, line.rstrip(b",\r")))
+            began_ns = at_ns
+    return lines
+
+
+def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
+    """ns from each command to the first line that says it; one that never came is left out.
+
+    `sent` has each command's time and the line it must become.
+    """
+    times: dict[bytes, list[int]] = {}
+    for at_ns, line in lines:
+        times.setdefault(line, []).append(at_ns)
+    found = []
+    for at_ns, line in sent:
+        all_ns = times.get(line, [])
+        place = bisect_left(all_ns, at_ns)
+        if place < len(all_ns) and all_ns[place] - at_ns < PATIENCE_NS:
+            found.append(all_ns[place] - at_ns)
+    return found
+
+
+def lines_to_samples(
+    said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
+) -> list[Fed]:
+    """What became of each feedback line that was heard of: by its linear speed, m/s.
+
+    `said` has each line's time and speed, `samples` each odometry sample's. A sample that repeats
+    a line is left out.
+    """
+    all_ns = [at_ns for at_ns, _ in said]
+    places: dict[int, list[int]] = {}
+    for index, (_, speed) in enumerate(said):
+        places.setdefault(_key(speed), []).append(index)
+    found, told = [], -1
+    for at_ns, speed in samples:
+        before = bisect_right(all_ns, at_ns)
+        indices = places.get(_key(speed), [])
+        place = bisect_left(indices, before) - 1
+        if place >= 0 and indices[place] > told:
+            told = indices[place]
+            found.append(Fed(at_ns - all_ns[told], before - 1 - told))
+    return found
+
+
+def _key(speed: float) -> int:
+    return round(speed * 1e6)
+
+
+def summary(durations_ns: Sequence[int]) -> Summary | None:
+    """Exact percentiles, each a duration that was measured; None of nothing."""
+    if not durations_ns:
+        return None
+    import numpy as np
+
+    us = np.asarray(durations_ns, dtype=float) / 1000
+    p50, p99 = np.percentile(us, (50, 99), method="higher")
+    return Summary(len(us), round(float(p50), 1), round(float(p99), 1), round(float(us.max()), 1))

@@ -1,0 +1,115 @@
+"""The way of the original, for comparison: poll, update, write, sleep; a line each way per cycle.
+
+    python -m tests.bench.polled --config FILE --port DEVICE [--drain]
+
+A ros2_control hardware interface in small: every cycle takes at most one line from the port and
+leaves the rest in its buffer, publishes the odometry, writes the newest command on the tick. With
+--drain every cycle takes all lines and keeps the newest: the obvious mend of the original. It
+has nothing of what a robot needs (no limits, no timeouts, no checks), only what takes time. The
+wire format and the keys are acsard's, so that the same rig measures both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import time
+import tomllib
+from pathlib import Path
+
+import msgspec
+import serial
+import zenoh
+
+TOKEN = re.compile(rb"[abcd]([pn])(\d+\.\d+)")
+
+RADIUS, SEPARATION = 0.05, 0.30
+
+
+def line_for(linear: float, angular: float) -> bytes:
+    """What one command says on the wire."""
+    right = (linear + angular * SEPARATION / 2) / RADIUS
+    left = (linear - angular * SEPARATION / 2) / RADIUS
+    wheels = zip("abcd", (right, left, left, right), strict=True)
+    tokens = [f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}" for motor, speed in wheels]
+    return (",".join(tokens) + "\r\n").encode()
+
+
+class Robot:
+    """Pose, the newest command, and the bytes nobody has looked at yet."""
+
+    def __init__(self) -> None:
+        self.x = self.y = self.yaw = self.linear = self.angular = 0.0
+        self.line = line_for(0.0, 0.0)
+        self.buffer = b""
+
+    def on_command(self, sample: zenoh.Sample) -> None:
+        """The newest wins; it waits for the next tick."""
+        message = msgspec.msgpack.decode(sample.payload.to_bytes())
+        linear = message.get("linear", {}).get("x", 0.0)
+        self.line = line_for(linear, message.get("angular", {}).get("z", 0.0))
+
+    def read(self) -> bool:
+        """One line, if there is a whole one."""
+        line, end, rest = self.buffer.partition(b"\n")
+        if not end:
+            return False
+        self.buffer = rest
+        found = TOKEN.findall(line)
+        if len(found) == 4:
+            a, b, c, d = [float(size) * (1 if sign == b"p" else -1) for sign, size in found]
+            right, left = RADIUS * (a + d) / 2, RADIUS * (b + c) / 2
+            self.linear, self.angular = (right + left) / 2, (right - left) / SEPARATION
+        return True
+
+    def update(self, dt: float) -> dict[str, object]:
+        """Integrate and tell."""
+        self.x += self.linear * math.cos(self.yaw) * dt
+        self.y += self.linear * math.sin(self.yaw) * dt
+        self.yaw += self.angular * dt
+        sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
+        position, turn = {"x": self.x, "y": self.y}, {"z": math.sin(self.yaw / 2)}
+        pose = {"position": position, "orientation": turn | {"w": math.cos(self.yaw / 2)}}
+        twist = {"linear": {"x": self.linear}, "angular": {"z": self.angular}}
+        return {
+            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "odom"},
+            "child_frame_id": "base_link",
+            "pose": {"pose": pose, "covariance": [0.0] * 36},
+            "twist": {"twist": twist, "covariance": [0.0] * 36},
+        }
+
+
+def main() -> None:
+    """Until it is killed."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--port")
+    parser.add_argument("--drain", action="store_true")
+    args = parser.parse_args()
+    config = tomllib.loads(args.config.read_text())
+    robot, root = Robot(), f"acsard/{config['robot']['id']}"
+    settings = zenoh.Config()
+    settings.insert_json5("mode", '"peer"')
+    settings.insert_json5("listen/endpoints", json.dumps(config["bus"]["listen"]))
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    with serial.Serial(args.port, config["mcu"]["baud_rate"], timeout=0) as port:
+        session = zenoh.open(settings)
+        source = config["commands"]["sources"][0]["name"]
+        kept = session.declare_subscriber(f"{root}/cmd/{source}", robot.on_command)
+        odometry = session.declare_publisher(f"{root}/odom")
+        period = 1.0 / config["control"]["rate"]
+        due = time.monotonic()
+        while kept:
+            robot.buffer += port.read(4096 if args.drain else max(0, 128 - len(robot.buffer)))
+            while robot.read() and args.drain:
+                pass
+            odometry.put(msgspec.msgpack.encode(robot.update(period)))
+            port.write(robot.line)
+            due += period
+            time.sleep(max(0.0, due - time.monotonic()))
+
+
+if __name__ == "__main__":
+    main()

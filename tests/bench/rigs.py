@@ -1,0 +1,97 @@
+"""What the benchmarks share: a program on the rig of `acsard bench`, and its figures."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+from msgspec.structs import replace
+
+from acsard.cli.bench import bench_config, write
+from acsard.matching import staircase
+from acsard.runtime.bench_record import Record, command_waits, feedback_fates
+from acsard.runtime.bench_rig import ACSARD, Rig, free_endpoint
+from acsard.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+
+POLLED = (sys.executable, "-m", "tests.bench.polled")
+"""The original's way."""
+
+DRAINING = (*POLLED, "--drain")
+"""The same with its obvious mend."""
+
+
+def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
+    """As `acsard bench` measures with."""
+    wanted = Config(control=ControlConfig(rate=rate), mcu=McuConfig(reply_period=reply_period))
+    return bench_config(wanted, simulated=True)
+
+
+def sibling(one: Config, number: int) -> Config:
+    """The same robot under another name and address."""
+    name, bus = RobotConfig(f"{one.robot.id}-{number}"), BusConfig(listen=(free_endpoint(),))
+    return replace(one, robot=name, bus=bus)
+
+
+@contextmanager
+def rig(
+    one: Config,
+    words: Sequence[str] = ACSARD,
+    *,
+    port: str = "",
+    unprompted: float = 0.0,
+    wire_baud_rate: int = 0,
+) -> Iterator[Rig]:
+    """The program up and linked."""
+    with TemporaryDirectory(prefix="acsard-bench-") as where:
+        file = write(one, Path(where))
+        with Rig(
+            one,
+            file,
+            words=words,
+            port=port,
+            unprompted=unprompted,
+            wire_baud_rate=wire_baud_rate,
+        ) as running:
+            yield running
+
+
+def driven(one: Config, words: Sequence[str], seconds: float, seed: int) -> Record:
+    """Commanded for so long."""
+    with rig(one, words) as running:
+        running.command(seconds, staircase, seed)
+        return running.end()
+
+
+def waits_us(record: Record) -> list[float]:
+    """Command -> first byte on the port."""
+    return [wait / 1000 for wait in command_waits(record)]
+
+
+def delays_us(one: Config, record: Record) -> list[float]:
+    """Feedback line's last byte -> its odometry in this process."""
+    return [fed.delay_ns / 1000 for fed in feedback_fates(one, record)]
+
+
+def share(values: Sequence[float], part: float) -> float:
+    """The value that `part` of all do not exceed."""
+    return sorted(values)[min(len(values) - 1, int(part * len(values)))]
+
+
+def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, float]:
+    """The median of each way, all taken in turn in each round."""
+    values: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, measure in ways.items():
+            values[name].append(measure())
+    return {name: median(found) for name, found in values.items()}
+
+
+def schedule(pid: int, policy: int, priority: int = 0) -> None:
+    """Give every thread of a process this policy; raises PermissionError where that is not ours."""
+    for task in os.listdir(f"/proc/{pid}/task"):
+        os.sched_setscheduler(int(task), policy, os.sched_param(priority))

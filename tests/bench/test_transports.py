@@ -1,0 +1,211 @@
+"""What the feedback costs the daemon: by transport, by number of subscribers, by number of robots.
+
+pytest -s -m bench tests/bench/test_transports.py
+
+Processor time of the daemon's process per control cycle, by the kernel's own account; the ways
+take turns within one daemon. The simulated microcontroller is another process, except where many
+robots run: there each daemon has its own inside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from statistics import median
+
+import pytest
+
+from acsard.access import access_control
+from acsard.messages import encodings
+from acsard.messages.schema import Message
+from acsard.messages.topics import full_key
+from acsard.ros.trees import left_out
+from acsard.runtime import clock, outlets
+from acsard.runtime.bench_rig import Rig, processor_ns
+from acsard.runtime.daemon import SIMULATOR
+from acsard.runtime.outlets import direct
+from acsard.runtime.zenoh_bus import ZenohBus
+from acsard.runtime.zenoh_session import client_session
+from acsard.settings import Config
+from tests.bench.rigs import config, in_turns, rig, sibling
+from tests.unit.messages.test_cdr import odometry
+
+FEEDBACK = ("odom", "tf", "wheel_states")
+ON_THE_BRIDGE = ("odom", "tf", "joint_states")
+"""The same three, under their ROS names."""
+
+
+@contextmanager
+def listening(one: Config, keys: Sequence[str], sessions: int = 1) -> Iterator[None]:
+    """So many clients that subscribe to all the keys, each with a connection of its own."""
+    with ExitStack() as stack:
+        for _ in range(sessions):
+            session = client_session(one.bus.listen[0])
+            stack.callback(session.close)
+            for key in keys:
+                session.declare_subscriber(key, direct(lambda _: None))
+            # On one link all is in order: what is answered now was asked behind the subscription.
+            alive = session.liveliness().get(full_key(one.robot.id, "alive"), timeout=3.0)
+            assert len(list(alive)) == 1
+        yield
+
+
+def cycle_us(running: Rig, one: Config, seconds: float) -> float:
+    """Processor time of the daemon per control period."""
+    pid = running.process.pid
+    began_ns, used_ns = clock.mono_ns(), processor_ns(pid)
+    time.sleep(seconds)
+    periods = (clock.mono_ns() - began_ns) / 1e9 * one.rate_hz
+    return (processor_ns(pid) - used_ns) / 1000 / periods
+
+
+def native(one: Config) -> tuple[str, ...]:
+    return tuple(full_key(one.robot.id, key) for key in FEEDBACK)
+
+
+@pytest.mark.bench
+@pytest.mark.timeout(300)
+def test_the_cost_of_each_transport() -> None:
+    one = config()
+    with rig(one) as running:
+        running.deaf()
+
+        def cost(keys: tuple[str, ...]) -> float:
+            with listening(one, keys, 1 if keys else 0):
+                return cycle_us(running, one, 3.0)
+
+        ways: dict[str, Callable[[], float]] = {
+            "nobody": partial(cost, ()),
+            "native msgpack": partial(cost, native(one)),
+            "bridge CDR": partial(cost, ON_THE_BRIDGE),
+            "both": partial(cost, (*native(one), *ON_THE_BRIDGE)),
+        }
+        costs = in_turns(ways, 4)
+        running.end()
+    print("\nodom, tf and wheel states to one client; us of processor time per 10 ms cycle")
+    for name, us in costs.items():
+        more = f"{us - costs['nobody']:+7.0f}" if name != "nobody" else ""
+        print(f"  {name:16}{us:7.0f}{more}   {us / 100:.1f} % of a core")
+    assert costs["both"] > costs["nobody"]
+
+
+@pytest.mark.bench
+@pytest.mark.timeout(300)
+def test_the_cost_of_more_subscribers() -> None:
+    one = config()
+    with rig(one) as running:
+        running.deaf()
+
+        def cost(sessions: int) -> float:
+            with listening(one, native(one)[:1], sessions):
+                return cycle_us(running, one, 3.0)
+
+        numbers = (0, 1, 4, 16)
+        ways: dict[str, Callable[[], float]] = {str(n): partial(cost, n) for n in numbers}
+        costs = in_turns(ways, 3)
+        running.end()
+    print("\nodometry to so many clients; us of processor time per 10 ms cycle")
+    for name, us in costs.items():
+        print(f"  {name:>3}{us:7.0f}   {us / 100:.1f} % of a core")
+    each = (costs["16"] - costs["1"]) / 15
+    print(f"  each further client {each:.0f} us")
+    # It is built and encoded once for all of them.
+    assert costs["16"] < 16 * costs["1"]
+
+
+def missed_and_periods(running: Rig) -> tuple[int, int]:
+    state = running.state()
+    periods = state.figures["period_lateness"].since_start.count
+    return state.counters.get("missed_periods", 0), periods
+
+
+@pytest.mark.bench
+@pytest.mark.timeout(300)
+def test_the_cost_of_more_robots() -> None:
+    one, seconds = config(), 8.0
+    print("\nrobots on this machine, each with its simulator inside and one subscriber, 100 Hz")
+    shares: dict[int, float] = {}
+    for number in (1, 4, 16):
+        with ExitStack() as stack:
+            robots = [
+                stack.enter_context(rig(sibling(one, which), port=SIMULATOR))
+                for which in range(number)
+            ]
+            before = [missed_and_periods(robot) for robot in robots]
+            used = [processor_ns(robot.process.pid) for robot in robots]
+            began_ns = clock.mono_ns()
+            time.sleep(seconds)
+            took_ns = clock.mono_ns() - began_ns
+            costs = [
+                (processor_ns(robot.process.pid) - ns) / took_ns
+                for robot, ns in zip(robots, used, strict=True)
+            ]
+            after = [missed_and_periods(robot) for robot in robots]
+            for robot in robots:
+                robot.leave()
+        missed = sum(b[0] - a[0] for a, b in zip(before, after, strict=True))
+        periods = sum(b[1] - a[1] for a, b in zip(before, after, strict=True)) + missed
+        shares[number] = median(costs)
+        print(
+            f"  {number:3} robots: {100 * median(costs):.1f} % of a core each "
+            f"(most {100 * max(costs):.1f} %), {100 * sum(costs):.0f} % of "
+            f"{100 * len(os.sched_getaffinity(0))} % together; "
+            f"{missed} of {periods} periods missed ({100 * missed / periods:.2f} %)"
+        )
+    # They share nothing: each costs about what one alone costs.
+    assert shares[4] < 3 * shares[1]
+
+
+# what nobody listens to
+
+
+def encoded(
+    monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], one: Config, count: int
+) -> Counter[str]:
+    """How often each encoding was made for `count` odometry messages with such listeners."""
+    made: Counter[str] = Counter()
+
+    def counting(message: Message, form: encodings.Format) -> bytes:
+        made[form] += 1
+        return encodings.encode(message, form)
+
+    monkeypatch.setattr(outlets, "encode", counting)
+
+    async def publish() -> None:
+        sources = tuple(source.name for source in one.commands.sources)
+        bus = ZenohBus(
+            one.bus,
+            one.ros,
+            left_out(one),
+            one.robot.id,
+            sources,
+            access_control(one),
+            lambda: None,
+        )
+        async with bus:
+            with listening(one, keys, 1 if keys else 0):
+                made.clear()  # what is kept for late comers
+                for _ in range(count):
+                    bus.publish("odom", odometry("odom", "base_link"))
+
+    asyncio.run(publish())
+    return made
+
+
+def test_a_tree_nobody_listens_to_encodes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, ros = full_key(config().robot.id, "odom"), "odom"
+    cases: list[tuple[tuple[str, ...], dict[str, int]]] = [
+        ((), {}),
+        ((ours,), {"msgpack": 50}),
+        ((ros,), {"cdr": 50}),
+        ((ours, ros), {"msgpack": 50, "cdr": 50}),
+    ]
+    for keys, wanted in cases:
+        made = encoded(monkeypatch, keys, config(), 50)
+        print(f"{' and '.join(keys) or 'nobody'}: {dict(made)} encodings of 50 messages")
+        assert made == wanted

@@ -1,0 +1,42 @@
+"""The daemon at any control rate: for finding the highest, not for driving.
+
+    python -m tests.bench.unlimited --config FILE --port DEVICE --rate HZ
+
+The configuration file is read and checked as always; the rate and the baud rate are put in
+afterwards, where no check sees them (a frozen struct checks its values when it is decoded, not
+when it is copied). All that runs then is the product.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+
+from msgspec.structs import replace
+
+from acsard.cli.common import load
+from acsard.runtime import daemon
+from acsard.runtime.logs import Log
+
+BAUD_RATE = 4_000_000
+"""The fastest a terminal can be set to: 33 bytes in 0.08 ms."""
+
+
+def main() -> None:
+    """Until a signal."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--config")
+    parser.add_argument("--port")
+    parser.add_argument("--rate", type=float)
+    args = parser.parse_args()
+    _, config = load(args.config, {"mcu": {"port": args.port}})
+    config = replace(
+        config,
+        control=replace(config.control, rate=args.rate),
+        mcu=replace(config.mcu, baud_rate=BAUD_RATE),
+    )
+    asyncio.run(daemon.run(config, Log(config.log), lambda device, trouble: None))
+
+
+if __name__ == "__main__":
+    main()
