@@ -24,6 +24,9 @@ SLACK_COUNTS = 4
 ROUNDING_MS = 2
 """What two readings rounded to whole milliseconds may be off."""
 
+LATEST_MS = 1000.0
+"""A line that waited longer comes after a gap that starts the session over anyway."""
+
 DRIFT = 0.01
 """By which share the two clocks may go apart; a ceramic resonator has half of it."""
 
@@ -77,7 +80,7 @@ class Encoders:
         host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
         mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
         late_ms = self._late_ms + host_ms - mcu_ms
-        self._late_ms = max(0.0, late_ms - DRIFT * host_ms)
+        self._late_ms = min(max(0.0, late_ms - DRIFT * host_ms), LATEST_MS)
         if late_ms < -self._early_ms:
             self._late_ms = 0.0
             return "restarted"

@@ -157,6 +157,13 @@ def test_a_reading_read_late_does_not_make_the_next_one_a_restart(bench: Bench) 
     assert bench.read(3, host_ms=10.0) == "restarted"
 
 
+def test_minutes_without_a_reading_hide_no_later_restart(bench: Bench) -> None:
+    assert bench.read(200_000) == "unknown"
+    assert bench.read(10, (5, 5, 5, 5)) == turned(5, 5, 5, 5)
+    bench.mcu_ms = 0.0
+    assert bench.read(3, host_ms=10.0) == "restarted"
+
+
 @pytest.mark.parametrize("drift", [0.995, 1.005])
 def test_clocks_that_go_apart_are_no_restart_and_hide_none(bench: Bench, drift: float) -> None:
     for _ in range(5000):
