@@ -28,8 +28,8 @@ TRIES = 3
 WINDOW = 64
 """Lines whose answers may still come; far fewer than the sequence can tell apart."""
 
-LATE_NS = NS_PER_S // 2
-"""An answer later than this is not one to the driving of now."""
+LATE_NS = 3 * NS_PER_S // 10
+"""An answer later than this is to a line that the MCU's own watchdog has outlived."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
 """Zero lines go out at 10 Hz while nothing comes back: enough to wake the MCU, little to queue."""

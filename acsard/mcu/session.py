@@ -71,6 +71,7 @@ class McuSession:
         is back from a long gap."""
         self.events: list[Event] = []
         """What the last `update` found worth a log line."""
+        self._starting_over = False
         self._told = ("down", self.check.in_force, False)
         self._opened = 0
         self._good_in_row = self._bad_in_row = 0
@@ -90,7 +91,7 @@ class McuSession:
         `opened` counts the port's openings; a new number starts a new session. `unsent` says that
         the last line did not go out.
         """
-        self.restarted, self.events = False, []
+        self.restarted, self._starting_over, self.events = False, False, []
         if unsent:
             self.check.unsent()
         if not port_open or opened != self._opened:
@@ -176,7 +177,7 @@ class McuSession:
             self.link = "booting"
         self._good_in_row = 0
         self._heard_ns = None
-        self.restarted = True
+        self.restarted = self._starting_over = True
         self._timeline.forget()
         self.check.begin()
 
@@ -185,7 +186,8 @@ class McuSession:
         if self.link == "up" and silent:
             self.link = "stale"
             self._good_in_row = 0
-        elif self.link in ("booting", "stale") and self._good_in_row >= GOOD_LINES and not silent:
+        elif self._good_in_row >= GOOD_LINES and not (silent or self._starting_over):
+            # Never in the update that saw a restart: who drives has to see the link go first.
             self.link = "up"
         settled = self.check.state in ("plain", "checked")
         if settled and silent and now_ns - self.check.settled_ns > self.quiet_ns:
@@ -269,4 +271,7 @@ class McuSession:
             self.rejects["count_leap"] = self._timeline.leaps
         if self._timeline.restarted:
             self._restart("has started again: its clock went back")
+        doubt = self._timeline.doubt()
+        if doubt:
+            self.events.append(Event("encoder_counts", doubt, "warning"))
         return feedback

@@ -33,7 +33,15 @@ from tests.mutation.equivalent import EQUIVALENT
 from tests.mutation.mutants import Mutant, mutants
 
 ROOT = Path(__file__).parents[2]
-CORE = ("acsard/drive", "acsard/guard.py", "acsard/mcu/frames.py", "acsard/robot.py")
+CORE = (
+    "acsard/drive",
+    "acsard/guard.py",
+    "acsard/mcu/check.py",
+    "acsard/mcu/encoders.py",
+    "acsard/mcu/frames.py",
+    "acsard/mcu/negotiation.py",
+    "acsard/robot.py",
+)
 ENOUGH = 0.95
 QUICK = [
     "tests/unit/drive",

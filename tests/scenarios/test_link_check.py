@@ -127,6 +127,18 @@ def test_auto_drives_old_firmware_plainly_and_unharmed(
     assert not [name for name in world.state.counters if name.startswith("line_")]
 
 
+def test_auto_drives_a_sketch_that_reports_by_its_own_clock() -> None:
+    world = World(config(reply_period=0.1, trailing_comma=True))
+    with world.mcu.comma_latched(), world.mcu.unprompted(0.1):
+        world.run(1.0)
+        world.drive(0.5, seconds=3.0)
+        assert world.state.mode == "driving"
+        assert check_of(world) == "plain"
+        world.run(1.5)
+        assert stopped(world)
+        assert off_by(world) < 0.03
+
+
 @pytest.mark.parametrize(
     ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
 )
@@ -443,6 +455,15 @@ def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
     world.send(0.0)
     world.run(1.5)
     assert off_by(world) < 0.001
+
+
+@pytest.mark.parametrize(("counts", "told"), [(3200, 0), (1600, 1)])
+def test_wrong_encoder_counts_are_told_within_metres(counts: int, told: int) -> None:
+    world = started(config("require", counts))
+    world.drive(0.5, seconds=4.0)
+    doubts = texts(world, "encoder_counts")
+    assert len(doubts) == told
+    assert all("mcu.encoder_counts = 1600 looks like 3200;" in text for text in doubts)
 
 
 @pytest.mark.parametrize("motor", range(4))

@@ -231,6 +231,7 @@ def test_an_answer_makes_those_before_it_stale() -> None:
 
 def test_an_answer_may_be_late_but_not_from_another_time() -> None:
     bench = Bench().checked()
+    assert LATE_NS == 300 * MS  # the MCU's own watchdog
     first, second = bench.drive(2)
     bench.now_ns += LATE_NS
     bench.reply(first)

@@ -640,3 +640,11 @@ def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
 
 def test_zero_is_the_stop_line() -> None:
     assert Bench().up().line(STILL) == ZERO + b"\r\n"
+
+
+def test_the_link_is_seen_to_go_when_the_mcu_restarts_within_one_read() -> None:
+    bench = Bench().up()
+    bench.wait(10, BOOTED + GOOD * 4)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
