@@ -27,13 +27,14 @@
 #define MOTOR_REVERSED 0x0     /* the motor turns backwards for `p`: swap its wires, or set its bit */
 #define ENCODER_REVERSED 0x0   /* it counts down when the motor turns in its `p` direction */
 #define FREE_SPEED 50.0f       /* rad/s of a lifted wheel at full duty */
+#define MOTOR_LAG 0.05f        /* s until it has 63 % of its speed */
 
-/* The control law: duty = target / FREE_SPEED + KP * error + the integral of KI * error,
- * with duty 1 = full voltage. Critically damped for a motor lag of 50 ms. */
+/* The control law: PI. These gains cancel the motor's lag with the controller's zero, so that a wheel
+ * follows like a first-order system as quick as the motor itself, without overshoot. */
 
 #define CONTROL_HZ 200
-#define KP 0.02f               /* duty per rad/s */
-#define KI 0.4f                /* duty per rad/s and second */
+#define KP (1.0f / FREE_SPEED) /* duty (1 = full voltage) per rad/s */
+#define KI (KP / MOTOR_LAG)    /* duty per rad/s and second */
 
 /* The power stage */
 

@@ -15,7 +15,7 @@ void pi_reset(struct pi *pi)
 float pi_step(struct pi *pi, float target, float speed, bool limited)
 {
     float error = target - speed;
-    float direct = target * (1.0f / FREE_SPEED) + KP * error;
+    float direct = KP * error;
     float integral = clamped(pi->integral + error * (KI / CONTROL_HZ));
     float duty = direct + integral;
     bool saturated = limited || duty > 1.0f || duty < -1.0f;

@@ -1,4 +1,4 @@
-/* Velocity control of one wheel: feed-forward plus PI, output as a share of full voltage. */
+/* Velocity control of one wheel: PI, its output a share of full voltage. */
 #ifndef PI_H
 #define PI_H
 
