@@ -197,6 +197,7 @@ int main(void)
         speed_start(&wheels[i].report, 0, 0);
     }
     sei();
+    serial_write("\r\n", 2); /* a reset may have cut a reply in two: end it */
     serial_write(IDENTITY, sizeof IDENTITY - 1);
     for (;;) {
         uint8_t byte, length = 0;

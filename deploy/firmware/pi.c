@@ -17,12 +17,16 @@ float pi_step(struct pi *pi, float target, float speed, bool limited)
     float error = target - speed;
     float direct = KP * error;
     float integral = clamped(pi->integral + error * (KI / CONTROL_HZ));
-    float duty = direct + integral;
-    bool saturated = limited || duty > 1.0f || duty < -1.0f;
+    float duty = clamped(direct + integral);
 
-    /* Anti-windup: at a limit the integral may only shrink what is asked for. */
-    if (saturated && (error > 0.0f) == (duty > 0.0f)) {
+    /* Anti-windup: where more is asked for than can be given, the integral grows no further than
+     * what just fills the limit. */
+    if ((error > 0.0f) == (duty > 0.0f) && (limited || duty == 1.0f || duty == -1.0f)) {
+        float fill = duty - direct;
+
         integral = pi->integral;
+        if (!limited && (error > 0.0f ? fill > integral : fill < integral))
+            integral = fill;
         duty = direct + integral;
     }
     /* A wheel that shall stand and stands gets no current: what is left in the integral leaks away,

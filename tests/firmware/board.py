@@ -142,7 +142,7 @@ class Status(NamedTuple):
 
 
 class Board:
-    """A running board. Entering starts it; leaving ends it, whatever happened."""
+    """A board that is powered on and has booted when entered; leaving ends it, whatever happened."""
 
     def __init__(self, runner: Path, firmware: Path, *options: str) -> None:
         self._words = [str(runner), *options, str(firmware)]
@@ -156,6 +156,8 @@ class Board:
         )
         try:
             self.path = self._answer()["pty"]
+            # Whoever opens the port in the middle of the boot line gets the end of it.
+            until(lambda: self.status().from_board.last, ANSWER_S, "it has booted")
         except BaseException:
             self.__exit__()
             raise
@@ -276,6 +278,8 @@ class Host:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         self._held = b""
         self._sequence = 0
+        self.sent_ns = 0
+        """Monotonic time when the last line was handed to the port."""
 
     def __enter__(self) -> Host:
         return self
@@ -292,6 +296,7 @@ class Host:
         while data:
             select.select([], [self._fd], [], ANSWER_S)
             data = data[os.write(self._fd, data) :]
+        self.sent_ns = time.monotonic_ns()
 
     def lines(self, wait: float = 0.0) -> list[tuple[float, bytes]]:
         """The lines that have come, without their ends; waits that long for the first."""

@@ -389,13 +389,6 @@ static void unplug(void)
     outgoing_length = 0;
 }
 
-static void reset(unsigned boot_ms)
-{
-    if (boot_ms)
-        held_until = avr->cycle + (avr_cycle_count_t)boot_ms * (F_CPU / 1000);
-    avr_reset(avr);
-}
-
 /* What both the reset pin and the hardware watchdog do to what is around the chip. */
 static void after_reset(void)
 {
@@ -411,6 +404,14 @@ static void after_reset(void)
         avr_cycle_timer_register(avr, 16, on_motor, (void *)(intptr_t)i);
     }
     look_at_bridges();
+}
+
+static void reset(unsigned boot_ms)
+{
+    if (boot_ms)
+        held_until = avr->cycle + (avr_cycle_count_t)boot_ms * (F_CPU / 1000);
+    avr_reset(avr);
+    after_reset();
 }
 
 static void (*core_reset)(avr_t *);

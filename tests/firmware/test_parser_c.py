@@ -220,8 +220,8 @@ def test_only_a_lone_question_mark_asks(parser: Parser) -> None:
 
 
 SUFFIXES = [
-    b"#", b"*", b"#07", b"*1234", b"#07*", b"#07*123", b"#7*1234", b"#07S", b"#07s*1234", b"#07F*1234",
-    b"#07 *1234", b"#07*1234 ", b"#07*1234*1234", b"#07#07*1234", b"@0000", b"#07S\x00*1234",
+    b"#", b"*", b"#07", b"*1234", b"#07*", b"#07*123", b"#7*1234", b"#07S", b"#07s*1234",
+    b"#07F*1234", b"#07 *1234", b"#07*1234 ", b"#07*1234*1234", b"#07#07*1234", b"@0000", b"#07S\x00*1234",
 ]  # fmt: skip
 
 
@@ -230,8 +230,10 @@ def test_a_suffix_that_is_not_whole_spoils_the_line(parser: Parser, suffix: byte
     assert parser.parse(ZERO + suffix) is None
 
 
-BEFORE_CHECK = [b"", b"#", b"#0", b"#7", b"#007", b"#0a", b"#07F", b"#07s", b"#07 ", b"#07S0", b"#07*",
-                b" #07", b"#07#07", b"#07S\x00", b",,#07", b"@0000", b"#07@0000", b",ap00.00#07"]  # fmt: skip
+BEFORE_CHECK = [
+    b"", b"#", b"#0", b"#7", b"#007", b"#0a", b"#07F", b"#07s", b"#07 ", b"#07S0", b"#07*", b" #07",
+    b"#07#07", b"#07S\x00", b",,#07", b"@0000", b"#07@0000", b",ap00.00#07",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("suffix", BEFORE_CHECK)
