@@ -37,6 +37,9 @@ def missing() -> str:
     tools = [tool for tool in ("make", "gcc", "avr-gcc", "avr-size") if shutil.which(tool) is None]
     if tools:
         return f"no {', '.join(tools)} (Debian: make gcc gcc-avr avr-libc binutils-avr)"
+    words = ["avr-gcc", "-mmcu=atmega2560", "-include", "avr/io.h", "-E", "-x", "c", "/dev/null"]
+    if subprocess.run(words, capture_output=True, timeout=20).returncode:
+        return "no avr/io.h (Debian: avr-libc)"
     if not any(Path(place, "simavr/sim_avr.h").exists() for place in _INCLUDES):
         return "no simavr/sim_avr.h (Debian: libsimavr-dev libelf-dev)"
     return ""
@@ -142,7 +145,7 @@ class Status(NamedTuple):
 
 
 class Board:
-    """A board that is powered on and has booted when entered; leaving ends it, whatever happened."""
+    """A board that has booted when entered; leaving ends it, whatever happened."""
 
     def __init__(self, runner: Path, firmware: Path, *options: str) -> None:
         self._words = [str(runner), *options, str(firmware)]
