@@ -61,9 +61,9 @@ void hardware_start(void)
  * edge was missed while another interrupt ran; the wheel cannot have turned round that quickly, so it
  * is two steps on in the direction of its last one.
  *
- * In assembly, because this is what limits the speed: about 6 us, half of what the compiler makes of
- * it. 100 000 edges a second of all wheels together leave time for the rest; with more of them it
- * still counts right, but the main loop starves and the hardware watchdog resets the board.
+ * In assembly, because this is what limits the speed: about 6 us, two thirds of what the compiler
+ * makes of it. 120 000 edges a second of all wheels together leave time for all the rest; with more
+ * of them it still counts right, but lines are answered late or not at all.
  *
  *   r24 pins, then scratch   r25 forward   r30 moved   r31 scratch   r27:r26 the time
  */

@@ -138,6 +138,8 @@ class Status(NamedTuple):
     """When they last lost it all."""
     heard_ns: int
     """When the board last received a byte."""
+    answer_ns: int
+    """From a byte it received to the first of its next line: how long it took to answer."""
     open: bool
     motors: tuple[Motor, ...]
     to_board: Wire

@@ -108,7 +108,9 @@ static double byte_cycles = F_CPU * 10.0 / 115200;
 static bool supply = true, muted, paused, quitting, was_reset, stop_bytes;
 static unsigned resets, auto_reset_ms;
 static avr_cycle_count_t held_until, slept;
-static int64_t base_ns, skipped_ns, on_ns, off_ns, heard_ns; /* the last three in virtual time */
+static int64_t base_ns, skipped_ns;
+static int64_t on_ns, off_ns, heard_ns; /* in virtual time, as is this: from the last byte heard */
+static int64_t answer_ns;               /* to the first byte of the line that came then */
 static bool motors_run;
 
 static int master = -1;
@@ -332,6 +334,8 @@ static void on_byte_from_board(avr_irq_t *irq, uint32_t value, void *unused)
 
     (void)irq;
     (void)unused;
+    if (!from_board.length)
+        answer_ns = virtual_ns() - heard_ns;
     byte = carried(&from_board, (uint8_t)value);
     if (byte < 0)
         return;
@@ -519,9 +523,10 @@ static void print_status(void)
         advance(&motors[i], avr->cycle);
     printf("{\"virtual_ns\":%" PRId64 ",\"wall_ns\":%" PRId64 ",\"base_ns\":%" PRId64
            ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
-           ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64 ",\"open\":%s,\"motors\":[",
+           ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
+           ",\"answer_ns\":%" PRId64 ",\"open\":%s,\"motors\":[",
            virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
-           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns,
+           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns,
            opened ? "true" : "false");
     for (i = 0; i < MOTORS; i++)
         printf("%s{\"duty\":%.6f,\"speed\":%.6f,\"counts\":%" PRId64 ",\"since_reset\":%" PRId64
