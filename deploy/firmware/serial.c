@@ -35,12 +35,15 @@ ISR(USART0_RX_vect)
         lost = true;
     if (status & _BV(FE0))
         byte = '\0';
-    if (room < 2) {
+    if (room < 3) {
         lost = true;
         return;
     }
     if (lost) {
+        /* Ends the line with the hole. What follows stands alone: the rest of a line is never a
+         * line, and a line that begins here is whole. */
         received[received_head++] = '\0';
+        received[received_head++] = '\n';
         lost = false;
     }
     received[received_head++] = byte;

@@ -7,7 +7,8 @@
 
 void serial_start(void);
 
-/* The next byte received. Where bytes were lost or damaged there is a NUL, which no line holds. */
+/* The next byte received. A damaged one is a NUL, which no line holds; where bytes were lost there are
+ * a NUL and a line end, so that the pieces do not make a line together. */
 bool serial_read(uint8_t *byte);
 
 /* Interrupts off: is there nothing to read? */
