@@ -516,9 +516,9 @@ def test_it_does_not_watch_over_its_encoders(board: Board, host: Host, fault: st
 def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: int) -> None:
     slow = build_firmware(tmp_path, f"-DBAUD_RATE={baud_rate}UL")
     with Board(runner, slow, "--baud", str(baud_rate)) as board, Host(board.path) as host:
-        began = time.monotonic()
+        began = board.status().virtual_ns
         host.ask(checked(ZERO, 1, "S"))
-        took = 1000 * (time.monotonic() - began)
+        took = (board.status().virtual_ns - began) / MS
         wire = (42 + 62) * 10 / baud_rate * 1000
         print(f"{baud_rate} baud: there and back in {took:.1f} ms, of it {wire:.1f} ms on the wire")
         assert took > 0.9 * wire
@@ -547,4 +547,4 @@ def test_the_bench_is_faster_than_the_real_board(board: Board, host: Host) -> No
         told = board.command("bench 200")
         factors[what] = told["ms"] * MS / told["took_ns"]
     print("real-time factor:", {what: round(factor, 1) for what, factor in factors.items()})
-    assert min(factors.values()) > 1.0
+    assert factors["at rest"] > 5.0, "so that there is time to catch up"
