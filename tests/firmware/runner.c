@@ -130,12 +130,17 @@ static void fail(const char *format, ...)
     exit(1);
 }
 
-static int64_t wall_ns(void)
+static int64_t clock_ns(clockid_t clock)
 {
     struct timespec now;
 
-    clock_gettime(CLOCK_MONOTONIC, &now);
+    clock_gettime(clock, &now);
     return now.tv_sec * NS_PER_S + now.tv_nsec;
+}
+
+static int64_t wall_ns(void)
+{
+    return clock_ns(CLOCK_MONOTONIC);
 }
 
 static int64_t virtual_ns(void)
@@ -542,7 +547,7 @@ static void print_status(void)
 
 static void bench(long ms)
 {
-    int64_t began = wall_ns(), took;
+    int64_t began = wall_ns(), took, cpu_ns = clock_ns(CLOCK_PROCESS_CPUTIME_ID);
     long slices = ms * 2;
 
     while (slices-- > 0) {
@@ -551,7 +556,8 @@ static void bench(long ms)
     }
     took = wall_ns() - began;
     base_ns += took - ms * 1000000;
-    printf("{\"ms\":%ld,\"took_ns\":%" PRId64 "}\n", ms, took);
+    printf("{\"ms\":%ld,\"took_ns\":%" PRId64 ",\"cpu_ns\":%" PRId64 "}\n", ms, took,
+           clock_ns(CLOCK_PROCESS_CPUTIME_ID) - cpu_ns);
 }
 
 static bool set_wire(const char *direction, unsigned long n, bool noise)

@@ -545,6 +545,6 @@ def test_the_bench_is_faster_than_the_real_board(board: Board, host: Host) -> No
     for what, speeds in (("at rest", STOPPED), ("40 rad/s", (40.0, -40.0, 40.0, -40.0))):
         host.drive(speeds, 0.3)
         told = board.command("bench 200")
-        factors[what] = told["ms"] * MS / told["took_ns"]
+        factors[what] = told["ms"] * MS / told["cpu_ns"]
     print("real-time factor:", {what: round(factor, 1) for what, factor in factors.items()})
-    assert factors["at rest"] > 5.0, "so that there is time to catch up"
+    assert min(factors.values()) > 2.0, "on a processor of its own"
