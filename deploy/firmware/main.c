@@ -136,13 +136,17 @@ static void on_command(const struct command *command)
 }
 
 #ifdef TEST_HANG
-/* Never in a real build: the ways to hang that the hardware watchdog must catch. */
+#include <util/delay.h>
+
+/* Never in a real build: the ways to hang that the hardware watchdog must catch, and one it must not. */
 static void hang(const char *text, uint8_t length)
 {
     if (length != 2 || text[0] != '!')
         return;
     if (text[1] == 'c')
         TIMSK0 = 0; /* the clock: no control tick any more, the loop goes on */
+    if (text[1] == 'p')
+        _delay_ms(60.0);
     if (text[1] == 'i')
         cli();
     while (text[1] == 'i' || text[1] == 'l')
