@@ -1,0 +1,88 @@
+/* Everything that depends on the robot: pins, encoders, motors, gains, times, the serial line.
+ *
+ * Written for the ATmega2560 at 16 MHz (Arduino Mega 2560). README.md says what to measure and
+ * which of these to change; nothing else needs a change for another robot with the same wiring.
+ */
+#ifndef CONFIG_H
+#define CONFIG_H
+
+#ifndef F_CPU
+#define F_CPU 16000000UL
+#endif
+
+/* The line */
+
+#ifndef BAUD_RATE
+#define BAUD_RATE 115200UL     /* as baud_rate in acsard.toml: 9600 to 115200 */
+#endif
+#define COMMAND_WATCHDOG_MS 300 /* without a valid line for this long the motors stop; at most 500 */
+#ifndef REQUIRE_CHECK
+#define REQUIRE_CHECK 0        /* 1: once a checked line was taken, plain ones are refused until reset.
+                                * A host restarted with link_check = "off" then cannot drive. */
+#endif
+
+/* The wheels. Bit 0 is motor a, bit 3 motor d. */
+
+#define COUNTS_PER_TURN 3200   /* encoder edges (both edges of both channels) per turn of the WHEEL */
+#define MOTOR_REVERSED 0x0     /* the motor turns backwards for `p`: swap its wires, or set its bit */
+#define ENCODER_REVERSED 0x0   /* it counts down when the motor turns in its `p` direction */
+#define FREE_SPEED 50.0f       /* rad/s of a lifted wheel at full duty */
+#define MOTOR_LAG 0.05f        /* s until it has 63 % of its speed */
+
+/* The control law: PI. These gains cancel the motor's lag with the controller's zero, so that a wheel
+ * follows like a first-order system as quick as the motor itself, without overshoot. */
+
+#define CONTROL_HZ 200
+#define KP (1.0f / FREE_SPEED) /* duty (1 = full voltage) per rad/s */
+#define KI (KP / MOTOR_LAG)    /* duty per rad/s and second */
+
+/* The power stage */
+
+#define PWM_HZ 20000UL         /* above hearing; check what your driver takes (L298: 2000 or less) */
+#define RISE_TICKS 10          /* control ticks from zero to full duty; falling is immediate */
+#define REVERSE_TICKS 2        /* control ticks at zero duty before a bridge changes direction */
+
+/* Pins. The eight encoder channels share one port, so that one short interrupt reads all wheels at
+ * one moment: channel A of motors a to d on bits 0, 2, 4, 6, channel B on bits 1, 3, 5, 7. */
+
+#define ENCODER_IN PINK        /* Mega pins A8 to A15 */
+#define ENCODER_PULL_UPS PORTK
+#define ENCODER_MASK PCMSK2
+#define ENCODER_GROUP _BV(PCIE2)
+#define ENCODER_VECTOR PCINT2_vect
+
+/* Direction: forward of motors a to d on bits 0, 2, 4, 6, reverse on bits 1, 3, 5, 7. A driver with
+ * one direction input takes the forward pin only. */
+
+#define DIRECTION_OUT PORTA    /* Mega pins 22 to 29 */
+#define DIRECTION_DDR DDRA
+
+/* PWM: compare registers of the 16-bit timers 3 and 4, and where their outputs are. */
+
+#define PWM_A OCR3A            /* Mega pin 5, PE3 */
+#define PWM_B OCR4A            /* Mega pin 6, PH3 */
+#define PWM_C OCR4B            /* Mega pin 7, PH4 */
+#define PWM_D OCR4C            /* Mega pin 8, PH5 */
+#define PWM_DDR_3 DDRE
+#define PWM_PINS_3 _BV(PE3)
+#define PWM_DDR_4 DDRH
+#define PWM_PINS_4 (_BV(PH3) | _BV(PH4) | _BV(PH5))
+
+/* What follows is derived. */
+
+#define MOTORS 4
+#define PWM_TOP ((int16_t)(F_CPU / (2UL * PWM_HZ))) /* phase correct: up and down */
+#define CONTROL_MS (1000 / CONTROL_HZ)
+#define STAMP_HZ (F_CPU / 8UL) /* the clock of the encoder edges: 0.5 us */
+
+#if PWM_HZ < 250
+#error "the PWM period must fit its timer"
+#endif
+#if COMMAND_WATCHDOG_MS > 500
+#error "the motors must stop within 500 ms of silence"
+#endif
+#if 1000 % CONTROL_HZ
+#error "a control period is whole milliseconds"
+#endif
+
+#endif

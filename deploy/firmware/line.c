@@ -1,0 +1,210 @@
+#include "line.h"
+
+#include "crc.h"
+
+#define FASTEST 99990L /* thousandths of a rad/s: what the reply can say too */
+
+uint8_t line_feed(struct line_reader *reader, uint8_t byte)
+{
+    uint8_t length = reader->length;
+
+    if (byte != '\n') {
+        /* Noise without a line end: forget it all, up to the next line end. */
+        if (length >= LINE_MAX - 1)
+            reader->discarding = true;
+        else
+            reader->text[reader->length++] = (char)byte;
+        return 0;
+    }
+    reader->length = 0;
+    if (reader->discarding) {
+        reader->discarding = false;
+        return 0;
+    }
+    if (length && reader->text[length - 1] == '\r')
+        length--;
+    return length;
+}
+
+struct cursor {
+    const char *at;
+    const char *end;
+};
+
+static bool take(struct cursor *cursor, char wanted)
+{
+    if (cursor->at == cursor->end || *cursor->at != wanted)
+        return false;
+    cursor->at++;
+    return true;
+}
+
+static bool is_digit(const struct cursor *cursor)
+{
+    return cursor->at != cursor->end && *cursor->at >= '0' && *cursor->at <= '9';
+}
+
+/* One or two digits, a point, one to three digits; at most 99.99. */
+static bool take_number(struct cursor *cursor, int32_t *thousandths)
+{
+    int32_t value = 0;
+    uint8_t digits = 0;
+
+    for (; digits < 2 && is_digit(cursor); digits++)
+        value = value * 10 + (*cursor->at++ - '0');
+    if (!digits || !take(cursor, '.') || !is_digit(cursor))
+        return false;
+    for (digits = 0; digits < 3; digits++)
+        value = value * 10 + (is_digit(cursor) ? *cursor->at++ - '0' : 0);
+    *thousandths = value;
+    return value <= FASTEST;
+}
+
+static bool take_wheel(struct cursor *cursor, struct command *command, uint8_t *seen)
+{
+    uint8_t motor, bit;
+    int32_t value;
+    bool negative;
+
+    if (cursor->at == cursor->end || *cursor->at < 'a' || *cursor->at > 'd')
+        return false;
+    motor = (uint8_t)(*cursor->at++ - 'a');
+    bit = (uint8_t)(1u << motor);
+    if (*seen & bit)
+        return false;
+    *seen |= bit;
+    negative = take(cursor, 'n');
+    if (!negative && !take(cursor, 'p'))
+        return false;
+    if (!take_number(cursor, &value))
+        return false;
+    command->thousandths[motor] = negative ? -value : value;
+    return true;
+}
+
+static bool take_comma(struct cursor *cursor)
+{
+    if (!take(cursor, ','))
+        return false;
+    while (take(cursor, ' '))
+        ;
+    return true;
+}
+
+static bool take_hex(struct cursor *cursor, uint8_t digits, uint16_t *value)
+{
+    *value = 0;
+    while (digits--) {
+        char c = cursor->at == cursor->end ? '\0' : *cursor->at++;
+
+        if (c >= '0' && c <= '9')
+            *value = (uint16_t)(*value << 4 | (c - '0'));
+        else if (c >= 'A' && c <= 'F')
+            *value = (uint16_t)(*value << 4 | (c - 'A' + 10));
+        else
+            return false;
+    }
+    return true;
+}
+
+/* `#SS`, request letters, `*HHHH` over all before it. Letters that mean nothing to us are ignored,
+ * so that a newer host may ask for more. */
+static bool take_suffix(struct cursor *cursor, const char *text, struct command *command)
+{
+    uint16_t sequence, said, right;
+
+    if (!take(cursor, '#') || !take_hex(cursor, 2, &sequence))
+        return false;
+    while (cursor->at != cursor->end && *cursor->at >= 'G' && *cursor->at <= 'Z')
+        command->sample |= *cursor->at++ == 'S';
+    right = crc_of(text, (uint8_t)(cursor->at - text));
+    if (!take(cursor, '*') || !take_hex(cursor, 4, &said) || said != right)
+        return false;
+    command->checked = true;
+    command->sequence = (uint8_t)sequence;
+    return true;
+}
+
+bool line_parse(const char *text, uint8_t length, struct command *out)
+{
+    struct cursor cursor = {text, text + length};
+    struct command command = {{0, 0, 0, 0}, false, false, 0};
+    uint8_t seen = 0, motor;
+
+    for (motor = 0; motor < 4; motor++) {
+        if (motor && !take_comma(&cursor))
+            return false;
+        if (!take_wheel(&cursor, &command, &seen))
+            return false;
+    }
+    (void)take_comma(&cursor);
+    if (cursor.at != cursor.end && !take_suffix(&cursor, text, &command))
+        return false;
+    if (cursor.at != cursor.end)
+        return false;
+    *out = command;
+    return true;
+}
+
+bool line_asks(const char *text, uint8_t length)
+{
+    return length == 1 && text[0] == '?';
+}
+
+static char *put_hex(char *at, uint16_t value, uint8_t digits)
+{
+    uint8_t i = digits;
+
+    while (i--) {
+        uint8_t nibble = (uint8_t)(value & 0xF);
+
+        at[i] = (char)(nibble < 10 ? '0' + nibble : 'A' + nibble - 10);
+        value >>= 4;
+    }
+    return at + digits;
+}
+
+static char *put_speed(char *at, char letter, int16_t hundredths)
+{
+    uint16_t value = (uint16_t)(hundredths < 0 ? -hundredths : hundredths);
+    uint8_t whole = (uint8_t)(value / 100), part = (uint8_t)(value % 100);
+
+    *at++ = letter;
+    *at++ = hundredths < 0 ? 'n' : 'p';
+    *at++ = (char)('0' + whole / 10);
+    *at++ = (char)('0' + whole % 10);
+    *at++ = '.';
+    *at++ = (char)('0' + part / 10);
+    *at++ = (char)('0' + part % 10);
+    return at;
+}
+
+uint8_t line_reply(char *out, const struct command *command, const struct reading *reading)
+{
+    char *at = out;
+    uint8_t motor;
+
+    for (motor = 0; motor < 4; motor++) {
+        if (motor)
+            *at++ = ',';
+        at = put_speed(at, LETTERS[motor], reading->hundredths[motor]);
+    }
+    if (command->checked) {
+        uint16_t crc;
+
+        *at++ = '#';
+        at = put_hex(at, command->sequence, 2);
+        if (command->sample) {
+            *at++ = '@';
+            at = put_hex(at, reading->milliseconds, 4);
+            for (motor = 0; motor < 4; motor++)
+                at = put_hex(at, reading->counts[motor], 4);
+        }
+        crc = crc_of(out, (uint8_t)(at - out));
+        *at++ = '*';
+        at = put_hex(at, crc, 4);
+    }
+    *at++ = '\r';
+    *at++ = '\n';
+    return (uint8_t)(at - out);
+}

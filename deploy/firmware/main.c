@@ -1,0 +1,218 @@
+/* The robot's microcontroller: a line comes in, four wheels turn at its speeds, a line goes out.
+ *
+ * It keeps the motors stopped from boot until a whole valid line came, stops them when none came for
+ * COMMAND_WATCHDOG_MS, and is reset by its own hardware watchdog when this loop or the control in it
+ * hangs; after a reset they are stopped again.
+ *
+ * The interrupts only count edges, milliseconds and bytes; all else happens in the loop below, so
+ * nothing but its own data needs a guard.
+ */
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <avr/sleep.h>
+#include <avr/wdt.h>
+
+#include "bridge.h"
+#include "config.h"
+#include "hardware.h"
+#include "line.h"
+#include "pi.h"
+#include "serial.h"
+#include "speed.h"
+#include "watchdog.h"
+
+#define TEXT(value) TEXT_OF(value)
+#define TEXT_OF(value) #value
+
+static const char IDENTITY[] = "!acsard-mcu 1 counts=" TEXT(COUNTS_PER_TURN) //
+    " watchdog_ms=" TEXT(COMMAND_WATCHDOG_MS) " check=1 sample=1\r\n";
+
+/* A reading is sent again within REPORT_MS, and renewed without being asked after RENEW_MS, so that
+ * the speed in a reply is of a window of 5 to 25 ms, whatever the host's rate. */
+#define REPORT_MS 5
+#define RENEW_MS 20
+
+static struct {
+    struct pi pi;
+    struct bridge bridge;
+    struct speed control, report; /* over one control period; since the last report */
+    float target;                 /* rad/s */
+    bool limited;
+} wheels[MOTORS];
+
+static struct watchdog watchdog;
+static struct snapshot latest;
+static struct reading report;
+static uint32_t report_ms, control_ms;
+static bool checked_seen;
+
+/* The hardware watchdog survives the reset it causes, with 16 ms: off before anything else. */
+void watchdog_off(void) __attribute__((naked, used, section(".init3")));
+void watchdog_off(void)
+{
+    MCUSR = 0;
+    wdt_disable();
+}
+
+static void motors_off(void)
+{
+    uint8_t i;
+
+    hardware_motors_off();
+    for (i = 0; i < MOTORS; i++) {
+        wheels[i].target = 0.0f;
+        wheels[i].limited = false;
+        pi_reset(&wheels[i].pi);
+        bridge_off(&wheels[i].bridge);
+    }
+}
+
+static void renew_report(void)
+{
+    uint8_t i;
+
+    report_ms = latest.milliseconds;
+    report.milliseconds = (uint16_t)latest.milliseconds;
+    for (i = 0; i < MOTORS; i++) {
+        float speed =
+            speed_update(&wheels[i].report, latest.counts[i], latest.edges[i], latest.now);
+
+        report.counts[i] = latest.counts[i];
+        report.hundredths[i] = speed_hundredths(speed);
+    }
+}
+
+static void control(bool allowed)
+{
+    uint8_t i;
+
+    for (i = 0; i < MOTORS; i++) {
+        float speed =
+            speed_update(&wheels[i].control, latest.counts[i], latest.edges[i], latest.now);
+        struct bridge *bridge = &wheels[i].bridge;
+        float duty;
+
+        if (!allowed)
+            continue;
+        duty = pi_step(&wheels[i].pi, wheels[i].target, speed, wheels[i].limited);
+        wheels[i].limited = !bridge_step(bridge, (int16_t)(duty * PWM_TOP));
+        hardware_motor(i, bridge->duty, bridge->direction);
+    }
+}
+
+static void on_millisecond(void)
+{
+    bool allowed;
+
+    hardware_snapshot(&latest);
+    allowed = watchdog_allows(&watchdog, latest.milliseconds);
+    if (!allowed)
+        motors_off();
+    if (latest.milliseconds - report_ms >= RENEW_MS)
+        renew_report();
+    if (latest.milliseconds - control_ms >= CONTROL_MS) {
+        control_ms += CONTROL_MS;
+        if (latest.milliseconds - control_ms >= CONTROL_MS)
+            control_ms = latest.milliseconds; /* late: go on from here, do not catch up */
+        control(allowed);
+        wdt_reset(); /* only here: neither a dead loop nor dead control may live on */
+    }
+}
+
+static void on_command(const struct command *command)
+{
+    char text[REPLY_MAX];
+    uint8_t i;
+
+    if (REQUIRE_CHECK && checked_seen && !command->checked)
+        return;
+    checked_seen |= command->checked;
+    for (i = 0; i < MOTORS; i++)
+        wheels[i].target = (float)command->thousandths[i] * 0.001f;
+    watchdog_feed(&watchdog, latest.milliseconds);
+    if (latest.milliseconds - report_ms >= REPORT_MS)
+        renew_report();
+    serial_write(text, line_reply(text, command, &report));
+}
+
+#ifdef TEST_HANG
+#include <util/delay.h>
+
+/* Never in a real build: the ways to hang that the hardware watchdog must catch, and one it must not. */
+static void hang(const char *text, uint8_t length)
+{
+    if (length != 2 || text[0] != '!')
+        return;
+    if (text[1] == 'c')
+        TIMSK0 = 0; /* the clock: no control tick any more, the loop goes on */
+    if (text[1] == 'p')
+        _delay_ms(60.0);
+    if (text[1] == 'i')
+        cli();
+    while (text[1] == 'i' || text[1] == 'l')
+        ;
+}
+#else
+static void hang(const char *text, uint8_t length)
+{
+    (void)text;
+    (void)length;
+}
+#endif
+
+static void on_line(const char *text, uint8_t length)
+{
+    struct command command;
+
+    if (line_parse(text, length, &command))
+        on_command(&command);
+    else if (line_asks(text, length))
+        serial_write(IDENTITY, sizeof IDENTITY - 1);
+    else
+        hang(text, length);
+}
+
+/* Sleep is left by any interrupt; testing and falling asleep cannot be split by one. */
+static void wait(void)
+{
+    cli();
+    if (!hardware_ticked() && serial_idle()) {
+        sleep_enable();
+        sei(); /* takes effect after the next instruction */
+        sleep_cpu();
+        sleep_disable();
+    }
+    sei();
+}
+
+int main(void)
+{
+    static struct line_reader reader;
+    uint8_t i;
+
+    hardware_start();
+    serial_start();
+    set_sleep_mode(SLEEP_MODE_IDLE);
+    wdt_enable(WDTO_120MS);
+    watchdog_start(&watchdog);
+    motors_off();
+    for (i = 0; i < MOTORS; i++) {
+        speed_start(&wheels[i].control, 0, 0);
+        speed_start(&wheels[i].report, 0, 0);
+    }
+    sei();
+    serial_write("\r\n", 2); /* a reset may have cut a reply in two: end it */
+    serial_write(IDENTITY, sizeof IDENTITY - 1);
+    for (;;) {
+        uint8_t byte, length = 0;
+
+        wait();
+        if (hardware_ticked())
+            on_millisecond();
+        /* One line at most, so that a flood of them cannot keep the control waiting. */
+        while (!length && serial_read(&byte))
+            length = line_feed(&reader, byte);
+        if (length)
+            on_line(reader.text, length);
+    }
+}

@@ -1,0 +1,365 @@
+"""The board on the bench: the firmware's machine code in libsimavr, and a host at its port.
+
+Nothing of acsard is imported here. Every wait has a deadline; the process is ended by its own id.
+"""
+
+from __future__ import annotations
+
+import binascii
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+T = TypeVar("T")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+FIRMWARE = ROOT / "deploy" / "firmware"
+
+ANSWER_S = 10.0
+"""A command to the runner takes a millisecond; this is for a machine that is busy."""
+
+LATE_S = 0.1
+"""A host this late has not kept its pace."""
+
+Speeds = tuple[float, float, float, float]
+
+
+class UnavailableError(Exception):
+    """This machine cannot do it; why."""
+
+
+def missing() -> str:
+    """What the real firmware needs and is not here; "" when nothing is."""
+    tools = [tool for tool in ("make", "gcc", "avr-gcc", "avr-size") if shutil.which(tool) is None]
+    if tools:
+        return f"no {', '.join(tools)} (Debian: make gcc gcc-avr avr-libc binutils-avr)"
+    words = ["avr-gcc", "-mmcu=atmega2560", "-include", "avr/io.h", "-E", "-x", "c", "/dev/null"]
+    if subprocess.run(words, capture_output=True, timeout=20).returncode:
+        return "no avr/io.h (Debian: avr-libc)"
+    if not any(Path(place, "simavr/sim_avr.h").exists() for place in _INCLUDES):
+        return "no simavr/sim_avr.h (Debian: libsimavr-dev libelf-dev)"
+    return ""
+
+
+_INCLUDES = ("/usr/include", "/usr/local/include")
+
+
+def _run(words: Sequence[str | Path], cwd: Path) -> str:
+    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, timeout=100)
+    if done.returncode:
+        raise AssertionError(f"{words}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def build_firmware(where: Path, *defines: str) -> Path:
+    """The ELF, made as the README says; prints its size."""
+    out = _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}"], FIRMWARE)
+    print(*(line for line in out.splitlines() if "Full" in line), sep="\n")
+    return where / "firmware.elf"
+
+
+def build_library(where: Path) -> Path:
+    """What of the firmware is not hardware, for this machine."""
+    _run(["make", f"BUILD={where}", "host"], FIRMWARE)
+    return where / "libfirmware.so"
+
+
+def build_runner(where: Path) -> Path:
+    """The bench."""
+    source = Path(__file__).with_name("runner.c")
+    flags = ["-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror"]
+    flags += [f"-I{place}/simavr" for place in _INCLUDES if Path(place, "simavr").exists()]
+    binary = where / "runner"
+    _run(["gcc", *flags, "-o", binary, source, "-lsimavr", "-lelf", "-lm"], where)
+    return binary
+
+
+def until(look: Callable[[], T | None], within: float, what: str) -> T:
+    """The first true value of `look`; fails with `what` was awaited."""
+    deadline = time.monotonic() + within
+    while True:
+        got = look()
+        if got:
+            return got
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {within:g} s: {what}")
+        time.sleep(0.002)
+
+
+class Motor(NamedTuple):
+    """The truth of one motor."""
+
+    duty: float
+    """-1 to 1, as the bridge gives it."""
+    speed: float
+    """rad/s"""
+    counts: int
+    """Of its encoder since power on, 64 bits."""
+    since_reset: int
+    """The same since the firmware began to count."""
+    flips: int
+    """How often the bridge changed direction."""
+    flip_duty: float
+    """The highest duty at which it ever did, 0 to 1."""
+
+
+class Wire(NamedTuple):
+    """One direction of the serial line."""
+
+    bytes: int
+    lost: int
+    damaged: int
+    last: str
+    """The last whole line on it."""
+
+
+class Status(NamedTuple):
+    """The true state of the board; `*_ns` of the board's own time unless it says otherwise."""
+
+    virtual_ns: int
+    wall_ns: int
+    """The monotonic clock of this machine, now."""
+    base_ns: int
+    """Add this to a virtual time to have the monotonic clock's."""
+    skipped_ns: int
+    """What this machine was too slow for."""
+    load: float
+    """Share of its time the processor did not sleep."""
+    resets: int
+    running: bool
+    """Some motor has voltage."""
+    on_ns: int
+    """When the motors last got voltage after having had none."""
+    off_ns: int
+    """When they last lost it all."""
+    heard_ns: int
+    """When the board last received a byte."""
+    answer_ns: int
+    """From a byte it received to the first of its next line: how long it took to answer."""
+    open: bool
+    motors: tuple[Motor, ...]
+    to_board: Wire
+    from_board: Wire
+
+
+class Board:
+    """A board that has booted when entered; leaving ends it, whatever happened."""
+
+    def __init__(self, runner: Path, firmware: Path, *options: str) -> None:
+        self._words = [str(runner), *options, str(firmware)]
+        self._held = b""
+        self.path = ""
+        """Its port."""
+
+    def __enter__(self) -> Board:
+        self._errors = tempfile.TemporaryFile()
+        self.process = subprocess.Popen(
+            self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
+        )
+        try:
+            self.path = self._answer()["pty"]
+            # Whoever opens the port in the middle of the boot line gets the end of it.
+            until(lambda: self.status().from_board.last, ANSWER_S, "it has booted")
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        process = self.process
+        process.terminate()
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait(5.0)
+        for stream in (process.stdin, process.stdout, self._errors):
+            if stream is not None:
+                stream.close()
+
+    def command(self, words: str) -> dict[str, Any]:
+        """Tell the runner something; its commands are listed in runner.c."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(words.encode() + b"\n")
+        self.process.stdin.flush()
+        answer = self._answer()
+        assert answer.get("ok", True), f"the runner does not know {words!r}"
+        return answer
+
+    def plug(self) -> str:
+        """A new port, instead of the old one if there is one; its path."""
+        self.path = self.command("plug")["pty"]
+        return self.path
+
+    def status(self) -> Status:
+        """The truth."""
+        told = self.command("status")
+        told["motors"] = tuple(Motor(**motor) for motor in told["motors"])
+        told["to_board"] = Wire(**told["to_board"])
+        told["from_board"] = Wire(**told["from_board"])
+        return Status(**told)
+
+    def _answer(self) -> dict[str, Any]:
+        # libsimavr prints what it loads on the same standard output: not ours.
+        stdout = self.process.stdout
+        assert stdout is not None
+        deadline = time.monotonic() + ANSWER_S
+        while True:
+            line, end, rest = self._held.partition(b"\n")
+            if end:
+                self._held = rest
+                if line.startswith(b"{"):
+                    answer: dict[str, Any] = json.loads(line)
+                    return answer
+                continue
+            left = deadline - time.monotonic()
+            if left <= 0 or not select.select([stdout], [], [], left)[0]:
+                raise AssertionError("the runner does not answer")
+            data = os.read(stdout.fileno(), 65536)
+            if not data:
+                self._errors.seek(0)
+                raise AssertionError(f"the runner ended: {self._errors.read()!r}")
+            self._held += data
+
+
+def speeds_line(speeds: Sequence[float]) -> bytes:
+    """A plain line without its end."""
+    return ",".join(
+        f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+        for letter, speed in zip("abcd", speeds, strict=True)
+    ).encode()
+
+
+def checked(line: bytes, sequence: int, letters: str = "") -> bytes:
+    """The line with its suffix."""
+    line += b"#%02X" % sequence + letters.encode()
+    return line + b"*%04X" % binascii.crc_hqx(line, 0)
+
+
+class Reply(NamedTuple):
+    """What the board said."""
+
+    at: float
+    """Monotonic s when it was read here."""
+    line: bytes
+    speeds: Speeds
+    """rad/s of motors a to d."""
+    sequence: int | None
+    milliseconds: int | None
+    counts: tuple[int, ...]
+    """Modulo 65536; none without the sample fields."""
+
+
+def read_reply(line: bytes, at: float = 0.0) -> Reply:
+    """The reply in a line; fails unless it is right to the byte."""
+    plain, mark, suffix = line.partition(b"#")
+    assert len(plain) == 31, line
+    speeds = [float(plain[i + 2 : i + 7]) for i in range(0, 32, 8)]
+    signed = [s if plain[8 * i + 1 : 8 * i + 2] == b"p" else -s for i, s in enumerate(speeds)]
+    a, b, c, d = signed
+    assert speeds_line((a, b, c, d)) == plain, line
+    if not mark:
+        return Reply(at, line, (a, b, c, d), None, None, ())
+    body, star, crc = suffix.rpartition(b"*")
+    assert star, line
+    assert crc == b"%04X" % binascii.crc_hqx(line[: -len(crc) - 1], 0), line
+    sequence, at_sign, sample = body.partition(b"@")
+    assert sequence == b"%02X" % int(sequence, 16), line
+    if not at_sign:
+        return Reply(at, line, (a, b, c, d), int(sequence, 16), None, ())
+    assert len(sample) == 20, line
+    words = [int(sample[i : i + 4], 16) for i in range(0, 20, 4)]
+    assert sample == b"".join(b"%04X" % word for word in words), line
+    return Reply(at, line, (a, b, c, d), int(sequence, 16), words[0], tuple(words[1:]))
+
+
+class Host:
+    """A program at the board's port, as a test wants it."""
+
+    def __init__(self, path: str) -> None:
+        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        self._held = b""
+        self._sequence = 0
+        self.sent_ns = 0
+        """Monotonic time when the last line was handed to the port."""
+
+    def __enter__(self) -> Host:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        os.close(self._fd)
+
+    def send(self, line: bytes, end: bytes = b"\r\n") -> None:
+        """One line."""
+        self.write(line + end)
+
+    def write(self, data: bytes) -> None:
+        """Bytes as they are."""
+        while data:
+            select.select([], [self._fd], [], ANSWER_S)
+            data = data[os.write(self._fd, data) :]
+        self.sent_ns = time.monotonic_ns()
+
+    def lines(self, wait: float = 0.0) -> list[tuple[float, bytes]]:
+        """The lines that have come, without their ends; waits that long for the first."""
+        while select.select([self._fd], [], [], wait)[0]:
+            data = os.read(self._fd, 65536)
+            if not data:
+                break
+            self._held += data
+            wait = 0.0
+        *ends, self._held = self._held.split(b"\n")
+        now = time.monotonic()
+        return [(now, line.removesuffix(b"\r")) for line in ends]
+
+    def says(self, text: bytes, within: float = 3.0) -> bytes:
+        """The first line that comes and holds `text`."""
+        deadline = time.monotonic() + within
+        heard: list[bytes] = []
+        while time.monotonic() < deadline:
+            for _, line in self.lines(0.05):
+                if text in line:
+                    return line
+                heard.append(line)
+        raise AssertionError(f"not within {within:g} s: {text!r}; heard {heard[-5:]}")
+
+    def ask(self, line: bytes, within: float = 3.0) -> Reply:
+        """Send a line and wait for its answer, which is the next line to come."""
+        self.lines()
+        self.send(line)
+        deadline = time.monotonic() + within
+        while time.monotonic() < deadline:
+            for at, got in self.lines(0.05):
+                return read_reply(got, at)
+        raise AssertionError(f"no answer within {within:g} s to {line!r}")
+
+    def drive(
+        self, speeds: Speeds, seconds: float, letters: str = "S", period: float = 0.01
+    ) -> list[Reply]:
+        """Send checked lines at an even pace for that long; all replies that came.
+
+        Begins again when other work of this machine kept us from it: the board would stop.
+        """
+        replies: list[Reply] = []
+        began = time.monotonic()
+        sent, again = 0, 0
+        while sent < round(seconds / period):
+            self.send(checked(speeds_line(speeds), self._sequence, letters))
+            self._sequence = (self._sequence + 1) % 256
+            sent += 1
+            due = began + sent * period
+            late = time.monotonic() - due
+            if late > LATE_S and again < 5:
+                began, sent, again = time.monotonic(), 0, again + 1
+                continue
+            while (left := due - time.monotonic()) > 0:
+                replies += [read_reply(line, at) for at, line in self.lines(left)]
+        return replies

@@ -1,0 +1,69 @@
+"""The firmware, its host library and the bench, each built once a session."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.firmware.board import (
+    Board,
+    Host,
+    build_firmware,
+    build_library,
+    build_runner,
+    missing,
+)
+
+FREE_SPEEDS = "50,45,55,48"
+"""rad/s: no motor is as the firmware's constants say."""
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """The firmware's logic, compiled for this machine."""
+    lacking = [tool for tool in ("make", "gcc") if shutil.which(tool) is None]
+    if lacking:
+        pytest.skip(f"no {' and no '.join(lacking)}")
+    return ctypes.CDLL(str(build_library(tmp_path_factory.mktemp("host"))))
+
+
+@pytest.fixture(scope="session")
+def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ELF as a user builds it."""
+    lacking = missing()
+    if lacking:
+        pytest.skip(lacking)
+    return build_firmware(tmp_path_factory.mktemp("firmware"))
+
+
+@pytest.fixture(scope="session")
+def hanging_firmware(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with lines that hang it."""
+    return build_firmware(tmp_path_factory.mktemp("hanging"), "-DTEST_HANG")
+
+
+@pytest.fixture(scope="session")
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bench."""
+    lacking = missing()
+    if lacking:
+        pytest.skip(lacking)
+    return build_runner(tmp_path_factory.mktemp("runner"))
+
+
+@pytest.fixture
+def board(runner: Path, firmware: Path) -> Iterator[Board]:
+    """The board, just powered on, with four unlike motors."""
+    with Board(runner, firmware, "--free-speed", FREE_SPEEDS) as board:
+        yield board
+
+
+@pytest.fixture
+def host(board: Board) -> Iterator[Host]:
+    """A host at its port."""
+    with Host(board.path) as host:
+        yield host

@@ -1,0 +1,805 @@
+/* A board on the bench: runs the firmware's machine code in libsimavr, behind a pty, with four motors.
+ *
+ * runner [--baud N] [--free-speed A,B,C,D] [--lag SECONDS] [--deadband DUTY] [--counts N] FIRMWARE.elf
+ *
+ * It is wired as deploy/firmware/README.md says, from numbers of its own: an error in the firmware's
+ * pins is not repeated here. Time is the wall clock's, in slices of half a millisecond; a machine too
+ * slow for that is not caught up with for more than CATCH_UP_NS, the rest is skipped and counted.
+ *
+ * The first line on standard output and the answer to each command on standard input is one JSON
+ * object in a line. Commands (MOTOR is a to d):
+ *
+ *   status                       the true state of everything
+ *   reset                        the reset pin
+ *   pause, resume                virtual time stands still
+ *   mute, unmute                 what the board says is lost
+ *   drop to|from N               every Nth byte to or from the board is lost; 0 = none
+ *   noise to|from N              one bit of every Nth byte is wrong; 0 = none
+ *   unplug, plug                 the port vanishes; a new one appears
+ *   auto_reset MS                opening the port resets the board, which boots for that long; 0 = no
+ *   supply on|off                the motors' supply
+ *   encoder MOTOR ok|dead|swapped
+ *   load MOTOR SHARE             the motor turns slower by this share; 1 = it is jammed
+ *   push MOTOR SPEED             the wheel has this speed now, rad/s
+ *   bench MS                     that much virtual time as fast as it goes
+ *   quit
+ */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <fcntl.h>
+#include <inttypes.h>
+#include <math.h>
+#include <poll.h>
+#include <stdarg.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <termios.h>
+#include <time.h>
+#include <unistd.h>
+
+#include <avr_ioport.h>
+#include <avr_uart.h>
+#include <sim_avr.h>
+#include <sim_elf.h>
+
+#define F_CPU 16000000u
+#define SLICE (F_CPU / 2000)
+#define NS_PER_S 1000000000ll
+#define CATCH_UP_NS (100 * 1000000ll)
+#define MOTORS 4
+#define QUEUE 16384
+
+/* Registers of the ATmega2560, as data addresses (data sheet, register summary). */
+enum {
+    DDRA = 0x21, PORTA = 0x22,
+    DDRE = 0x2D, DDRH = 0x101,
+    PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
+    TCCR3A = 0x90, TCCR3B = 0x91, ICR3 = 0x96, OCR3A = 0x98,
+    TCCR4A = 0xA0, TCCR4B = 0xA1, ICR4 = 0xA6, OCR4A = 0xA8, OCR4B = 0xAA, OCR4C = 0xAC,
+    UCSR0A = 0xC0, UBRR0 = 0xC4,
+    PINK = 0x106
+};
+enum { PCINT2 = 11 };
+
+/* Where the PWM of each motor comes from: Mega pins 5, 6, 7, 8. */
+static const struct pwm {
+    uint16_t control_a, control_b, top, compare, ddr;
+    uint8_t mode_shift, pin;
+} PWM[MOTORS] = {
+    {TCCR3A, TCCR3B, ICR3, OCR3A, DDRE, 6, 3},
+    {TCCR4A, TCCR4B, ICR4, OCR4A, DDRH, 6, 3},
+    {TCCR4A, TCCR4B, ICR4, OCR4B, DDRH, 4, 4},
+    {TCCR4A, TCCR4B, ICR4, OCR4C, DDRH, 2, 5},
+};
+
+enum encoder { OK, DEAD, SWAPPED };
+
+static struct motor {
+    double free_speed, load;
+    double duty;             /* -1 to 1, as the bridge gives it */
+    uint8_t pins;            /* the bridge's inputs: 1 forward, 2 reverse */
+    double speed;            /* rad/s */
+    double position;         /* counts */
+    int64_t counts;          /* whole ones, as the encoder has shown them */
+    int64_t counts_at_reset; /* where the firmware began to count */
+    avr_cycle_count_t at;    /* how far this is worked out */
+    double flip_duty;        /* the highest duty at which the bridge ever changed direction */
+    unsigned flips;
+    enum encoder encoder;
+} motors[MOTORS];
+
+static struct wire {
+    uint64_t bytes, lost, damaged;
+    unsigned drop, noise, drop_at, noise_at;
+    char line[160], last[160];
+    size_t length;
+} to_board, from_board;
+
+static avr_t *avr;
+static avr_uart_t *uart;
+static avr_ioport_t *port_k;
+static avr_irq_t *uart_input;
+static avr_int_vector_t pin_change;
+
+static double lag = 0.05, deadband, counts_per_turn = 3200;
+static double byte_cycles = F_CPU * 10.0 / 115200;
+static bool supply = true, muted, paused, quitting, was_reset, stop_bytes;
+static unsigned resets, auto_reset_ms;
+static avr_cycle_count_t held_until, slept;
+static int64_t base_ns, skipped_ns;
+static int64_t on_ns, off_ns, heard_ns; /* in virtual time, as is this: from the last byte heard */
+static int64_t answer_ns;               /* to the first byte of the line that came then */
+static bool motors_run;
+
+static int master = -1;
+static bool opened; /* somebody has the port open */
+static uint8_t incoming[QUEUE], outgoing[QUEUE];
+static size_t incoming_head, incoming_tail, outgoing_length;
+static bool receiving;
+
+static void fail(const char *format, ...)
+{
+    va_list arguments;
+
+    va_start(arguments, format);
+    vfprintf(stderr, format, arguments);
+    va_end(arguments);
+    fputc('\n', stderr);
+    exit(1);
+}
+
+static int64_t clock_ns(clockid_t clock)
+{
+    struct timespec now;
+
+    clock_gettime(clock, &now);
+    return now.tv_sec * NS_PER_S + now.tv_nsec;
+}
+
+static int64_t wall_ns(void)
+{
+    return clock_ns(CLOCK_MONOTONIC);
+}
+
+static int64_t virtual_ns(void)
+{
+    return (int64_t)((__int128)avr->cycle * NS_PER_S / F_CPU);
+}
+
+/* motors */
+
+static double goal(const struct motor *motor)
+{
+    double size = fabs(motor->duty);
+
+    if (!supply || size <= deadband)
+        return 0.0;
+    return copysign((size - deadband) / (1.0 - deadband), motor->duty) * motor->free_speed *
+           (1.0 - motor->load);
+}
+
+/* The first-order lag worked out exactly, so that the steps do not matter. */
+static void advance(struct motor *motor, avr_cycle_count_t to)
+{
+    double dt, rest, aim, error;
+
+    if (to <= motor->at)
+        return;
+    dt = (double)(to - motor->at) / F_CPU;
+    motor->at = to;
+    aim = goal(motor);
+    if (motor->load >= 1.0) {
+        motor->speed = 0.0;
+        return;
+    }
+    if (aim == 0.0 && motor->speed == 0.0)
+        return;
+    rest = lag > 0.0 ? exp(-dt / lag) : 0.0;
+    error = motor->speed - aim;
+    motor->position += (aim * dt + error * lag * (1.0 - rest)) * counts_per_turn / (2.0 * M_PI);
+    motor->speed = aim + error * rest;
+    if (fabs(motor->speed) < 1e-4 && aim == 0.0)
+        motor->speed = 0.0;
+}
+
+/* Channel A leads when the motor turns forward. */
+static uint8_t levels(const struct motor *motor)
+{
+    static const uint8_t gray[4] = {0, 1, 3, 2};
+    static const uint8_t swapped[4] = {0, 2, 3, 1};
+
+    return (motor->encoder == SWAPPED ? swapped : gray)[motor->counts & 3];
+}
+
+static void show_encoder(int index)
+{
+    uint8_t mask = (uint8_t)(3u << (2 * index)), was = avr->data[PINK], now;
+
+    if (motors[index].encoder == DEAD)
+        return;
+    now = (uint8_t)((was & ~mask) | levels(&motors[index]) << (2 * index));
+    if (now == was)
+        return;
+    avr->data[PINK] = now;
+    port_k->external.pull_value = now; /* or writing the pull-ups would set all pins */
+    if ((now ^ was) & avr->data[PCMSK2])
+        avr_raise_interrupt(avr, &pin_change);
+}
+
+/* Moves one motor and shows at most one edge; returns when to look again. */
+static avr_cycle_count_t on_motor(avr_t *unused, avr_cycle_count_t when, void *which)
+{
+    int index = (int)(intptr_t)which;
+    struct motor *motor = &motors[index];
+    double wait = SLICE, rate, ahead;
+
+    (void)unused;
+    advance(motor, when);
+    if (motor->position >= (double)(motor->counts + 1))
+        motor->counts++;
+    else if (motor->position < (double)motor->counts)
+        motor->counts--;
+    show_encoder(index);
+    rate = motor->speed * counts_per_turn / (2.0 * M_PI) / F_CPU;
+    ahead = rate > 0.0 ? (double)(motor->counts + 1) - motor->position
+                       : motor->position - (double)motor->counts;
+    if (rate != 0.0 && ahead / fabs(rate) < wait)
+        wait = ahead / fabs(rate);
+    return when + (wait < 16.0 ? 16 : (avr_cycle_count_t)wait + 1);
+}
+
+static uint16_t word(uint16_t address)
+{
+    return (uint16_t)(avr->data[address] | avr->data[address + 1] << 8);
+}
+
+/* What the PWM output of a motor gives, 0 to 1: phase correct with its top in ICR is all we know. */
+static double pwm(int index)
+{
+    const struct pwm *pwm = &PWM[index];
+    uint8_t a = avr->data[pwm->control_a], b = avr->data[pwm->control_b];
+    unsigned top = word(pwm->top), compare = word(pwm->compare);
+    bool running = (a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7);
+    bool connected = (a >> pwm->mode_shift & 3) == 2;
+
+    if (!running || !connected || !top || !(avr->data[pwm->ddr] >> pwm->pin & 1))
+        return 0.0;
+    return compare >= top ? 1.0 : (double)compare / top;
+}
+
+static void look_at_bridges(void)
+{
+    bool any = false;
+    int i;
+
+    for (i = 0; i < MOTORS; i++) {
+        struct motor *motor = &motors[i];
+        uint8_t pins = (avr->data[PORTA] & avr->data[DDRA]) >> (2 * i) & 3;
+        double size = pwm(i);
+        double duty = pins == 1 ? size : pins == 2 ? -size : 0.0;
+
+        if (pins != motor->pins) {
+            if (motor->pins + pins == 3)
+                motor->flips++;
+            if (size > motor->flip_duty)
+                motor->flip_duty = size;
+        }
+        if (duty != motor->duty || pins != motor->pins) {
+            advance(motor, avr->cycle);
+            motor->duty = duty;
+            motor->pins = pins;
+        }
+        any |= duty != 0.0;
+    }
+    if (any != motors_run) {
+        motors_run = any;
+        *(any ? &on_ns : &off_ns) = virtual_ns();
+    }
+}
+
+static void on_register(avr_irq_t *irq, uint32_t value, void *unused)
+{
+    (void)irq;
+    (void)value;
+    (void)unused;
+    look_at_bridges();
+}
+
+/* the wire */
+
+/* What becomes of a byte on it: -1 when it is lost. */
+static int carried(struct wire *wire, uint8_t byte)
+{
+    wire->bytes++;
+    if (wire->drop && ++wire->drop_at >= wire->drop) {
+        wire->drop_at = 0;
+        wire->lost++;
+        return -1;
+    }
+    if (wire->noise && ++wire->noise_at >= wire->noise) {
+        wire->noise_at = 0;
+        wire->damaged++;
+        byte ^= (uint8_t)(1u << (rand() & 7));
+    }
+    if (byte == '\n') {
+        memcpy(wire->last, wire->line, wire->length);
+        wire->last[wire->length] = '\0';
+        wire->length = 0;
+    } else if (byte != '\r' && wire->length < sizeof wire->line - 1) {
+        wire->line[wire->length++] = (char)byte;
+    }
+    return byte;
+}
+
+static avr_cycle_count_t on_byte_to_board(avr_t *unused, avr_cycle_count_t when, void *unused2)
+{
+    int byte;
+
+    (void)unused;
+    (void)unused2;
+    if (stop_bytes)
+        return when + 100;
+    if (incoming_head == incoming_tail) {
+        receiving = false;
+        return 0;
+    }
+    byte = carried(&to_board, incoming[incoming_tail++ % QUEUE]);
+    if (byte >= 0) {
+        heard_ns = virtual_ns();
+        avr_raise_irq(uart_input, (uint32_t)byte);
+    }
+    return when + (avr_cycle_count_t)byte_cycles;
+}
+
+static void on_byte_from_board(avr_irq_t *irq, uint32_t value, void *unused)
+{
+    int byte;
+
+    (void)irq;
+    (void)unused;
+    if (!from_board.length)
+        answer_ns = virtual_ns() - heard_ns;
+    byte = carried(&from_board, (uint8_t)value);
+    if (byte < 0)
+        return;
+    if (muted || !opened || outgoing_length == QUEUE)
+        from_board.lost++;
+    else
+        outgoing[outgoing_length++] = (uint8_t)byte;
+}
+
+static void on_stop_bytes(avr_irq_t *irq, uint32_t value, void *unused)
+{
+    (void)irq;
+    (void)unused;
+    stop_bytes = value;
+}
+
+/* The simulator takes eleven bits for a byte, and a doubled speed only when it is set first. */
+static void correct_baud_rate(void)
+{
+    unsigned divider = (word(UBRR0) & 0xFFF) + 1;
+
+    uart->cycles_per_byte = divider * (avr->data[UCSR0A] & 2 ? 8 : 16) * 10;
+}
+
+/* the port */
+
+static char *plug(void)
+{
+    static char path[64];
+    struct termios raw;
+    int slave;
+
+    master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
+    if (master < 0 || grantpt(master) || unlockpt(master) ||
+        ptsname_r(master, path, sizeof path))
+        fail("no pty: %s", strerror(errno));
+    /* Opened once and closed again: from then on the master is told when nobody has it open. */
+    slave = open(path, O_RDWR | O_NOCTTY);
+    if (slave < 0 || tcgetattr(slave, &raw))
+        fail("no pty: %s", strerror(errno));
+    cfmakeraw(&raw); /* like a serial port that echoes nothing */
+    tcsetattr(slave, TCSANOW, &raw);
+    close(slave);
+    opened = false;
+    return path;
+}
+
+static void unplug(void)
+{
+    if (master >= 0)
+        close(master);
+    master = -1;
+    opened = false;
+    incoming_tail = incoming_head;
+    outgoing_length = 0;
+}
+
+/* What both the reset pin and the hardware watchdog do to what is around the chip. */
+static void after_reset(void)
+{
+    int i;
+
+    was_reset = false;
+    resets++;
+    stop_bytes = false;
+    receiving = false;
+    for (i = 0; i < MOTORS; i++) {
+        motors[i].counts_at_reset = motors[i].counts;
+        show_encoder(i);
+        avr_cycle_timer_register(avr, 16, on_motor, (void *)(intptr_t)i);
+    }
+    look_at_bridges();
+}
+
+static void reset(unsigned boot_ms)
+{
+    if (boot_ms)
+        held_until = avr->cycle + (avr_cycle_count_t)boot_ms * (F_CPU / 1000);
+    avr_reset(avr);
+    after_reset();
+}
+
+static void (*core_reset)(avr_t *);
+
+static void on_reset(avr_t *core)
+{
+    if (core_reset)
+        core_reset(core);
+    was_reset = true;
+}
+
+static void look_at_port(void)
+{
+    struct pollfd port = {master, POLLIN, 0};
+    uint8_t buffer[512];
+    bool was_open = opened;
+
+    if (master < 0)
+        return;
+    poll(&port, 1, 0);
+    opened = !(port.revents & POLLHUP);
+    if (opened && !was_open && auto_reset_ms)
+        reset(auto_reset_ms);
+    if (!opened)
+        outgoing_length = 0;
+    while (port.revents & POLLIN && QUEUE - (incoming_head - incoming_tail) >= sizeof buffer) {
+        ssize_t got = read(master, buffer, sizeof buffer), i;
+
+        if (got <= 0)
+            break;
+        for (i = 0; i < got; i++)
+            incoming[incoming_head++ % QUEUE] = buffer[i];
+    }
+    if (outgoing_length) {
+        ssize_t put = write(master, outgoing, outgoing_length);
+
+        /* What the host does not fetch is lost, as on a real line without flow control. */
+        if (put < (ssize_t)outgoing_length)
+            from_board.lost += outgoing_length - (size_t)(put > 0 ? put : 0);
+        outgoing_length = 0;
+    }
+    if (incoming_head != incoming_tail && !receiving) {
+        receiving = true;
+        avr_cycle_timer_register(avr, (avr_cycle_count_t)byte_cycles, on_byte_to_board, NULL);
+    }
+}
+
+/* time */
+
+static void run_slice(void)
+{
+    avr_cycle_count_t end = avr->cycle + SLICE;
+
+    while (avr->cycle < end) {
+        if (avr->cycle < held_until) {
+            /* In reset or in its bootloader: the world goes on without it. */
+            avr->cycle += 500;
+            avr_cycle_timer_process(avr);
+        } else {
+            int state = avr_run(avr);
+
+            if (state == cpu_Done || state == cpu_Crashed)
+                fail("the firmware crashed at %#x", avr->pc);
+        }
+        if (was_reset)
+            after_reset();
+    }
+    correct_baud_rate();
+}
+
+/* The simulator would wait for the wall clock here; keep_pace does that. */
+static void on_sleep(avr_t *unused, avr_cycle_count_t cycles)
+{
+    (void)unused;
+    slept += cycles;
+}
+
+/* commands */
+
+static void print_text(const char *name, const char *text)
+{
+    printf(",\"%s\":\"", name);
+    for (; *text; text++) {
+        if (*text == '"' || *text == '\\' || (uint8_t)*text < 0x20 || (uint8_t)*text > 0x7E)
+            printf("\\u%04x", (uint8_t)*text);
+        else
+            putchar(*text);
+    }
+    putchar('"');
+}
+
+static void print_wire(const char *name, const struct wire *wire)
+{
+    printf(",\"%s\":{\"bytes\":%" PRIu64 ",\"lost\":%" PRIu64 ",\"damaged\":%" PRIu64, name,
+           wire->bytes, wire->lost, wire->damaged);
+    print_text("last", wire->last);
+    putchar('}');
+}
+
+static void print_status(void)
+{
+    int i;
+
+    for (i = 0; i < MOTORS; i++)
+        advance(&motors[i], avr->cycle);
+    printf("{\"virtual_ns\":%" PRId64 ",\"wall_ns\":%" PRId64 ",\"base_ns\":%" PRId64
+           ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
+           ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
+           ",\"answer_ns\":%" PRId64 ",\"open\":%s,\"motors\":[",
+           virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
+           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns,
+           opened ? "true" : "false");
+    for (i = 0; i < MOTORS; i++)
+        printf("%s{\"duty\":%.6f,\"speed\":%.6f,\"counts\":%" PRId64 ",\"since_reset\":%" PRId64
+               ",\"flips\":%u,\"flip_duty\":%.4f}",
+               i ? "," : "", motors[i].duty, motors[i].speed, motors[i].counts,
+               motors[i].counts - motors[i].counts_at_reset, motors[i].flips,
+               motors[i].flip_duty);
+    putchar(']');
+    print_wire("to_board", &to_board);
+    print_wire("from_board", &from_board);
+    printf("}\n");
+}
+
+static void bench(long ms)
+{
+    int64_t began = wall_ns(), took, cpu_ns = clock_ns(CLOCK_PROCESS_CPUTIME_ID);
+    long slices = ms * 2;
+
+    while (slices-- > 0) {
+        run_slice();
+        look_at_port();
+    }
+    took = wall_ns() - began;
+    base_ns += took - ms * 1000000;
+    printf("{\"ms\":%ld,\"took_ns\":%" PRId64 ",\"cpu_ns\":%" PRId64 "}\n", ms, took,
+           clock_ns(CLOCK_PROCESS_CPUTIME_ID) - cpu_ns);
+}
+
+static bool set_wire(const char *direction, unsigned long n, bool noise)
+{
+    struct wire *wire = !strcmp(direction, "to")     ? &to_board
+                        : !strcmp(direction, "from") ? &from_board
+                                                     : NULL;
+
+    if (!wire)
+        return false;
+    if (noise)
+        wire->noise = (unsigned)n;
+    else
+        wire->drop = (unsigned)n;
+    return true;
+}
+
+static bool set_motor(const char *what, const char *letter, const char *value)
+{
+    struct motor *motor = &motors[(letter[0] - 'a') & 3];
+
+    if (letter[0] < 'a' || letter[0] > 'd' || letter[1])
+        return false;
+    advance(motor, avr->cycle);
+    if (!strcmp(what, "load"))
+        motor->load = atof(value);
+    else if (!strcmp(what, "push"))
+        motor->speed = atof(value);
+    else if (!strcmp(value, "ok"))
+        motor->encoder = OK;
+    else if (!strcmp(value, "dead"))
+        motor->encoder = DEAD;
+    else if (!strcmp(value, "swapped"))
+        motor->encoder = SWAPPED;
+    else
+        return false;
+    return true;
+}
+
+static bool obeyed(const char *verb, const char *one, const char *two)
+{
+    if (!strcmp(verb, "reset"))
+        reset(0);
+    else if (!strcmp(verb, "pause") || !strcmp(verb, "resume"))
+        paused = verb[0] == 'p';
+    else if (!strcmp(verb, "mute") || !strcmp(verb, "unmute"))
+        muted = verb[0] == 'm';
+    else if (!strcmp(verb, "drop") || !strcmp(verb, "noise"))
+        return set_wire(one, strtoul(two, NULL, 10), verb[0] == 'n');
+    else if (!strcmp(verb, "unplug"))
+        unplug();
+    else if (!strcmp(verb, "auto_reset"))
+        auto_reset_ms = (unsigned)strtoul(one, NULL, 10);
+    else if (!strcmp(verb, "supply")) {
+        int i;
+
+        for (i = 0; i < MOTORS; i++)
+            advance(&motors[i], avr->cycle);
+        supply = !strcmp(one, "on");
+    } else if (!strcmp(verb, "encoder") || !strcmp(verb, "load") || !strcmp(verb, "push"))
+        return set_motor(verb, one, two);
+    else if (!strcmp(verb, "quit"))
+        quitting = true;
+    else
+        return false;
+    return true;
+}
+
+static void obey(char *line)
+{
+    char verb[32] = "", one[32] = "", two[32] = "";
+
+    sscanf(line, "%31s %31s %31s", verb, one, two);
+    if (!strcmp(verb, "status"))
+        print_status();
+    else if (!strcmp(verb, "bench"))
+        bench(atol(one));
+    else if (!strcmp(verb, "plug")) {
+        unplug();
+        printf("{\"pty\":\"%s\"}\n", plug());
+    } else
+        printf("{\"ok\":%s}\n", obeyed(verb, one, two) ? "true" : "false");
+}
+
+static void look_at_commands(void)
+{
+    static char held[1024];
+    static size_t length;
+    ssize_t got = read(STDIN_FILENO, held + length, sizeof held - length - 1);
+    char *line = held, *end;
+
+    if (got <= 0) {
+        quitting |= got == 0; /* whoever started us is gone */
+        return;
+    }
+    length += (size_t)got;
+    held[length] = '\0';
+    while ((end = strchr(line, '\n'))) {
+        *end = '\0';
+        obey(line);
+        line = end + 1;
+    }
+    length = strlen(line);
+    memmove(held, line, length + 1);
+    if (length == sizeof held - 1)
+        length = 0;
+    fflush(stdout);
+}
+
+/* Waits until the wall clock has caught up, taking commands and bytes meanwhile. */
+static void keep_pace(void)
+{
+    for (;;) {
+        struct pollfd fds[2] = {{STDIN_FILENO, POLLIN, 0}, {opened ? master : -1, POLLIN, 0}};
+        struct timespec wait = {0, 0};
+        int64_t left = base_ns + virtual_ns() - wall_ns();
+
+        if (left < -CATCH_UP_NS) {
+            skipped_ns -= left;
+            base_ns -= left;
+        }
+        if (left > 0)
+            wait.tv_nsec = left;
+        if (ppoll(fds, 2, &wait, NULL) > 0) {
+            if (fds[0].revents)
+                look_at_commands();
+            if (fds[1].revents)
+                look_at_port();
+            /* Bytes we have no room for, or a port just closed, would wake us at once again. */
+            if (fds[1].revents & (POLLHUP | POLLERR) ||
+                QUEUE - (incoming_head - incoming_tail) < 512)
+                return;
+        }
+        if (left <= 0 || quitting)
+            return;
+    }
+}
+
+static void *module(const char *kind, char name)
+{
+    avr_io_t *io;
+
+    for (io = avr->io_port; io; io = io->next) {
+        if (strcmp(io->kind, kind))
+            continue;
+        if (!strcmp(kind, "uart") ? ((avr_uart_t *)io)->name == name
+                                  : ((avr_ioport_t *)io)->name == name)
+            return io;
+    }
+    fail("this libsimavr has no %s %c", kind, name);
+    return NULL;
+}
+
+static void say_nothing(avr_t *unused, const int level, const char *format, va_list arguments)
+{
+    (void)unused;
+    if (level <= LOG_ERROR)
+        vfprintf(stderr, format, arguments);
+}
+
+static void power_on(const char *path)
+{
+    static const uint16_t watched[] = {PORTA, DDRA,  DDRE,  DDRH,  TCCR3A, TCCR3B, TCCR4A,
+                                       TCCR4B, OCR3A, OCR4A, OCR4B, OCR4C,  ICR3,   ICR4};
+    elf_firmware_t firmware;
+    uint32_t no_flags = 0;
+    size_t i;
+
+    memset(&firmware, 0, sizeof firmware);
+    if (elf_read_firmware(path, &firmware))
+        fail("%s: not a firmware", path);
+    avr = avr_make_mcu_by_name("atmega2560");
+    if (!avr)
+        fail("this libsimavr has no atmega2560");
+    avr_global_logger_set(say_nothing);
+    avr_init(avr);
+    firmware.frequency = F_CPU;
+    avr_load_firmware(avr, &firmware);
+    avr->sleep = on_sleep;
+    core_reset = avr->reset;
+    avr->reset = on_reset;
+
+    uart = module("uart", '0');
+    port_k = module("port", 'K');
+    port_k->external.pull_mask = 0xFF;
+    avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &no_flags);
+    uart_input = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT),
+                            on_byte_from_board, NULL);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XOFF),
+                            on_stop_bytes, NULL);
+
+    /* The simulator knows the pin change interrupt of port B only. */
+    pin_change.vector = PCINT2;
+    pin_change.enable = (avr_regbit_t)AVR_IO_REGBIT(PCICR, 2);
+    pin_change.raised = (avr_regbit_t)AVR_IO_REGBIT(PCIFR, 2);
+    avr_register_vector(avr, &pin_change);
+
+    for (i = 0; i < sizeof watched / sizeof *watched; i++)
+        avr_irq_register_notify(
+            avr_iomem_getirq(avr, watched[i], NULL, AVR_IOMEM_IRQ_ALL), on_register, NULL);
+    after_reset();
+    resets = 0;
+}
+
+int main(int count, char **words)
+{
+    int i;
+
+    for (i = 0; i < MOTORS; i++)
+        motors[i].free_speed = 50.0;
+    for (i = 1; i + 1 < count; i += 2) {
+        const char *value = words[i + 1];
+
+        if (!strcmp(words[i], "--baud"))
+            byte_cycles = F_CPU * 10.0 / atof(value);
+        else if (!strcmp(words[i], "--lag"))
+            lag = atof(value);
+        else if (!strcmp(words[i], "--deadband"))
+            deadband = atof(value);
+        else if (!strcmp(words[i], "--counts"))
+            counts_per_turn = atof(value);
+        else if (!strcmp(words[i], "--free-speed"))
+            sscanf(value, "%lf,%lf,%lf,%lf", &motors[0].free_speed, &motors[1].free_speed,
+                   &motors[2].free_speed, &motors[3].free_speed);
+        else
+            fail("unknown option %s", words[i]);
+    }
+    if (i != count - 1)
+        fail("usage: runner [OPTION VALUE]... FIRMWARE.elf");
+    power_on(words[count - 1]);
+    printf("{\"pty\":\"%s\"}\n", plug());
+    fflush(stdout);
+    base_ns = wall_ns();
+    while (!quitting) {
+        if (paused)
+            base_ns = wall_ns() - virtual_ns() + NS_PER_S / 2000;
+        else
+            run_slice();
+        look_at_port();
+        keep_pace();
+    }
+    unplug();
+    return 0;
+}

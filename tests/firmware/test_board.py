@@ -1,0 +1,549 @@
+"""The firmware's machine code on the bench: it keeps the contract, and says what is true.
+
+Judged by the board's own time; what the same takes by this machine's clock is printed beside it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.firmware.board import (
+    Board,
+    Host,
+    Reply,
+    Speeds,
+    Status,
+    build_firmware,
+    checked,
+    read_reply,
+    speeds_line,
+    until,
+)
+
+pytestmark = pytest.mark.firmware
+
+IDENTITY = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
+
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
+
+DRIVE: Speeds = (10.0, -5.0, 20.0, -30.0)
+
+STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
+
+COUNTS_PER_TURN = 3200
+
+MS = 1_000_000
+
+
+def is_off(status: Status) -> bool:
+    return not status.running and all(motor.duty == 0.0 for motor in status.motors)
+
+
+def stays_off(board: Board, ms: int) -> Status:
+    """For that long of the board's time no motor gets any voltage."""
+    before = board.status()
+    assert is_off(before)
+    end = before.virtual_ns + ms * MS
+    until(lambda: board.status().virtual_ns >= end, 10.0, "time passes")
+    after = board.status()
+    assert is_off(after)
+    assert after.on_ns == before.on_ns, "not for a moment"
+    return after
+
+
+def is_still(board: Board) -> Status:
+    """Wait until nothing turns any more."""
+
+    def look() -> Status | None:
+        status = board.status()
+        still = all(abs(motor.speed) < 0.001 for motor in status.motors)
+        return status if still and is_off(status) else None
+
+    return until(look, 10.0, "standstill")
+
+
+def wrapped(counts: Sequence[int]) -> tuple[int, ...]:
+    return tuple(count % 65536 for count in counts)
+
+
+def difference(before: int, after: int) -> int:
+    """Of two counts modulo 65536."""
+    return (after - before + 32768) % 65536 - 32768
+
+
+# the contract
+
+
+def test_it_boots_stopped_and_says_who_it_is(board: Board, host: Host) -> None:
+    stays_off(board, 400)
+    board.command("reset")
+    assert host.says(b"acsard") == IDENTITY
+    assert stays_off(board, 400).on_ns == 0, "since power on"
+
+
+def test_it_says_who_it_is_when_asked_and_stops_all_the_same(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.3)
+    fed = board.status().heard_ns
+    asked = 0
+    while board.status().running:
+        host.send(b"?")
+        assert host.says(b"!") == IDENTITY
+        asked += 1
+    silent = (board.status().off_ns - fed) / MS
+    print(f"stopped {silent:.1f} ms after the last command, asked {asked} times meanwhile")
+    assert 250 <= silent <= 350
+
+
+def test_the_motors_stop_300_ms_after_the_last_line(board: Board, host: Host) -> None:
+    by_board, by_wall = [], []
+    for _ in range(5):
+        host.drive(DRIVE, 0.25)
+        assert board.status().running
+        status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
+        by_board.append((status.off_ns - status.heard_ns) / MS)
+        by_wall.append((status.base_ns + status.off_ns - host.sent_ns) / MS)
+    print(f"silence -> motors off: {min(by_board):.1f} to {max(by_board):.1f} ms (board's time), "
+          f"{min(by_wall):.1f} to {max(by_wall):.1f} ms (wall)")  # fmt: skip
+    assert min(by_board) >= 250
+    assert max(by_board) <= 350
+    stays_off(board, 500)
+
+
+def test_what_wound_up_before_the_stop_does_not_come_back_with_the_next_line(
+    board: Board, host: Host
+) -> None:
+    for motor in "abcd":
+        board.command(f"load {motor} 1")
+    host.drive((20.0, 20.0, 20.0, 20.0), 0.6)
+    assert all(motor.duty == 1.0 for motor in board.status().motors), "as hard as they can"
+    status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
+    host.drive(STOPPED, 0.3)
+    assert board.status().on_ns == status.on_ns, "not for a moment"
+
+
+def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.3)
+    assert board.status().running
+    board.command("reset")
+    assert is_off(board.status())
+    assert host.says(b"acsard") == IDENTITY
+    stays_off(board, 400)
+    host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not whole yet
+    stays_off(board, 100)
+    host.write(b"\r\n")
+    until(lambda: board.status().running, 3.0, "it drives again")
+
+
+@pytest.mark.parametrize(
+    ("how", "what"), [("l", "the main loop"), ("i", "all, interrupts off"), ("c", "the clock")]
+)
+def test_the_hardware_watchdog_resets_it_when_something_hangs(
+    runner: Path, hanging_firmware: Path, how: str, what: str
+) -> None:
+    with Board(runner, hanging_firmware) as board, Host(board.path) as host:
+        host.drive(DRIVE, 0.3)
+        assert board.status().running
+        host.lines()
+        host.send(b"!" + how.encode())
+        status = until(lambda: s if (s := board.status()).resets else None, 3.0, "a reset")
+        took = (status.off_ns - status.heard_ns) / MS
+        print(f"{what} hangs -> motors off: {took:.1f} ms")
+        assert took <= 150
+        assert is_off(status)
+        assert host.says(b"acsard") == IDENTITY
+        assert stays_off(board, 300).resets == 1, "and it does not go on resetting"
+        host.drive(DRIVE, 0.2)
+        assert board.status().running
+
+
+BAD_LINES = [
+    b"", b"hello", b"ap10.00", b"ap10.00,bp10.00,cp10.00", b"ap10.00,bp10.00,cp10.00,",
+    b"ap10.00,ap10.00,cp10.00,dp10.00", b"ap10.00,bp10.00,cp10.00,dp100.00",
+    b"ap10.00,bp10.00,cp10.00,dp10", b"\x00ap10.00,bp10.00,cp10.00,dp10.00",
+    b" ap10.00,bp10.00,cp10.00,dp10.00", b"ap10.00,bp10.00,cp10.00,dp10.00 ",
+    b"ap10.00,bp10.00,cp10.00,dp99.999", b"ap10.00,bp10.00,cp10.00,dp10.00#07",
+    b"ap10.00,bp10.00,cp10.00,dp10.00#07*0000", b"ap10.00;bp10.00;cp10.00;dp10.00",
+    b"\xff" * 200, b"??", b"!",
+]  # fmt: skip
+
+
+def test_garbage_applies_nothing_and_is_not_answered(board: Board, host: Host) -> None:
+    for line in BAD_LINES:
+        host.send(line)
+    last = checked(speeds_line(DRIVE), 1)
+    host.send(last[:-1] + (b"0" if last[-1:] != b"0" else b"1"))
+    until(lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"), 3.0, "all heard")
+    assert stays_off(board, 100).on_ns == 0
+    assert host.lines() == []
+
+
+def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.3)
+    fed = board.status().heard_ns
+    while (status := board.status()).running:
+        host.send(BAD_LINES[-5])
+        host.lines(0.005)
+    print(f"stopped {(status.off_ns - fed) / MS:.1f} ms after the last good line, garbage since")
+    assert 250 <= (status.off_ns - fed) / MS <= 350
+
+
+# driving
+
+
+def reached(board: Board, host: Host, speeds: Speeds, seconds: float = 1.0) -> list[Reply]:
+    """Drive; the replies once there."""
+    host.drive(speeds, seconds)
+    return host.drive(speeds, 0.5)
+
+
+@pytest.mark.parametrize("speeds", [DRIVE, (-1.0, 2.0, -40.0, 0.5)])
+def test_a_commanded_speed_is_reached_and_reported(
+    board: Board, host: Host, speeds: Speeds
+) -> None:
+    replies = reached(board, host, speeds)
+    status = board.status()
+    for motor, wanted in enumerate(speeds):
+        said = [reply.speeds[motor] for reply in replies]
+        true = status.motors[motor].speed
+        mean, noise = statistics.mean(said), statistics.pstdev(said)
+        print(f"{'abcd'[motor]}: wanted {wanted}, turns {true:.3f}, says {mean:.3f} +- {noise:.3f}")
+        assert true == pytest.approx(wanted, rel=0.01, abs=0.02)
+        assert statistics.mean(said) == pytest.approx(wanted, rel=0.005, abs=0.02)
+        assert all(one == pytest.approx(wanted, rel=0.02, abs=0.1) for one in said)
+
+
+def test_at_low_speed_the_report_is_quieter_than_counting_edges(board: Board, host: Host) -> None:
+    replies = reached(board, host, (0.3, -0.3, 0.3, -0.3))
+    counted = 2 * 3.14159 / COUNTS_PER_TURN / 0.01
+    for i, sign in enumerate((1, -1, 1, -1)):
+        said = [sign * reply.speeds[i] for reply in replies]
+        noise = statistics.pstdev(said)
+        print(f"{'abcd'[i]}: 0.3 rad/s reported {statistics.mean(said):.3f} +- {noise:.3f}; "
+              f"one count in 10 ms would be {counted:.3f}")  # fmt: skip
+        assert statistics.mean(said) == pytest.approx(0.3, abs=0.02)
+        assert noise < counted / 4
+
+
+def test_a_step_has_no_overshoot_to_speak_of(runner: Path, firmware: Path) -> None:
+    with Board(runner, firmware) as board, Host(board.path) as host:
+        replies = host.drive((20.0, -20.0, 10.0, -10.0), 0.6)
+        most = max(reply.speeds[0] for reply in replies)
+        assert replies[0].milliseconds is not None
+        rising = [reply for reply in replies if reply.speeds[0] < 0.9 * 20.0]
+        print(f"0 -> 20 rad/s: 90 % after {10 * len(rising)} ms, at most {most:.2f} rad/s")
+        assert most < 20.0 * 1.05
+
+
+def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) -> None:
+    for speed in (30.0, -30.0, 5.0, -30.0, 30.0):
+        host.drive((speed, -speed, speed, -speed), 0.25)
+    motors = board.status().motors
+    print("changes of direction:", [motor.flips for motor in motors])
+    assert all(motor.flips >= 4 for motor in motors)
+    assert all(motor.flip_duty == 0.0 for motor in motors)
+
+
+def test_a_wheel_that_stands_by_command_gets_no_current(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.3)
+    host.drive(STOPPED, 0.8)
+    status = board.status()
+    assert all(motor.duty == 0.0 for motor in status.motors)
+    assert status.virtual_ns - status.heard_ns < 100 * MS, "and the host is there"
+
+
+# replies
+
+
+def test_each_line_is_answered_once_with_its_sequence(board: Board, host: Host) -> None:
+    for sequence in range(256):
+        letters = ("", "S", "Z")[sequence % 3]
+        reply = host.ask(checked(ZERO, sequence, letters))
+        assert reply.sequence == sequence
+        assert (reply.milliseconds is not None) == (letters == "S")
+    wire = board.status().from_board
+    assert wire.bytes - len(IDENTITY) - 4 == 86 * 41 + 85 * 62 + 85 * 41, "and nothing else"
+
+
+def test_a_plain_line_is_answered_plain(board: Board, host: Host) -> None:
+    host.ask(checked(ZERO, 1, "S"))
+    reply = host.ask(ZERO)
+    assert (reply.line, reply.sequence) == (ZERO, None)
+
+
+DIALECTS = [
+    b"ap10.00,bn05.00,cp20.00,dn30.00",
+    b"ap10.00,bn05.00,cp20.00,dn30.00,",
+    b"ap10.00, bn05.00, cp20.00, dn30.00",
+    b"ap10.0,bn5.0,cp20.000,dn30.0,",
+    b"dn30.00,cp20.00,ap10.00,bn05.00",
+]
+
+
+@pytest.mark.parametrize("line", DIALECTS)
+@pytest.mark.parametrize("end", [b"\r\n", b"\n"])
+def test_every_dialect_of_a_line_drives(board: Board, host: Host, line: bytes, end: bytes) -> None:
+    def there() -> bool:
+        host.send(line, end)
+        host.lines(0.01)
+        speeds = [motor.speed for motor in board.status().motors]
+        return all(abs(a - b) < 0.5 for a, b in zip(speeds, DRIVE, strict=True))
+
+    until(there, 5.0, "the speeds are reached")
+
+
+def test_a_line_is_answered_within_three_milliseconds(board: Board, host: Host) -> None:
+    took = []
+    for i in range(50):
+        host.ask(checked(speeds_line(DRIVE), i, "S"))
+        took.append(board.status().answer_ns / MS)
+    print(f"line end -> first byte of the answer: {min(took):.2f} to {max(took):.2f} ms")
+    assert max(took) < 3.0
+
+
+def test_negative_zero_is_zero(board: Board, host: Host) -> None:
+    assert host.ask(b"an00.00,bn00.00,cn00.00,dn00.00").line == ZERO
+
+
+def test_the_counts_are_the_true_counts(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.7)
+    status = is_still(board)
+    assert status.resets == 0
+    reply = host.ask(checked(ZERO, 7, "S"))
+    true = [motor.since_reset for motor in board.status().motors]
+    print("counts", reply.counts, "true", true)
+    assert reply.counts == wrapped(true)
+    # After a reset it counts from zero again.
+    board.command("reset")
+    host.says(b"acsard")
+    host.drive(DRIVE, 0.3)
+    is_still(board)
+    reply = host.ask(checked(ZERO, 7, "S"))
+    assert reply.counts == wrapped([motor.since_reset for motor in board.status().motors])
+
+
+def test_counts_and_time_give_the_speed_without_the_jitter_of_the_line(
+    board: Board, host: Host
+) -> None:
+    replies = reached(board, host, DRIVE)
+    turns = []
+    for before, after in itertools.pairwise(replies):
+        assert before.milliseconds is not None
+        assert after.milliseconds is not None
+        ms = (after.milliseconds - before.milliseconds) % 65536
+        if ms:  # within 5 ms the same reading is sent again
+            assert ms >= 5
+            step = difference(before.counts[3], after.counts[3])
+            turns.append(step / COUNTS_PER_TURN * 2 * 3.14159265 / ms * 1000)
+        else:
+            assert before.counts == after.counts
+            assert before.speeds == after.speeds
+    mean, noise = statistics.mean(turns), statistics.pstdev(turns)
+    print(f"-30 rad/s by counts and time: {mean:.3f} +- {noise:.3f}")
+    assert mean == pytest.approx(-30.0, rel=0.005)
+    assert all(turn == pytest.approx(-30.0, abs=0.8) for turn in turns)
+
+
+def test_the_milliseconds_are_the_board_s(board: Board, host: Host) -> None:
+    first, began = host.ask(checked(ZERO, 1, "S")), board.status()
+    until(lambda: board.status().virtual_ns > began.virtual_ns + 1000 * MS, 10.0, "a second")
+    second, ended = host.ask(checked(ZERO, 2, "S")), board.status()
+    assert first.milliseconds is not None
+    assert second.milliseconds is not None
+    said = (second.milliseconds - first.milliseconds) % 65536
+    assert said == pytest.approx((ended.virtual_ns - began.virtual_ns) / MS, abs=25)
+
+
+def test_the_counts_wrap_and_go_on(board: Board, host: Host) -> None:
+    replies = host.drive((40.0, -40.0, 40.0, -40.0), 4.0)
+    total = [0] * 4
+    for before, after in itertools.pairwise(replies):
+        for i in range(4):
+            total[i] += difference(before.counts[i], after.counts[i])
+    is_still(board)
+    last = host.ask(checked(ZERO, 7, "S"))
+    true = [motor.since_reset for motor in board.status().motors]
+    total = [
+        start + sum_ + difference(end, now)
+        for start, sum_, end, now in zip(
+            (difference(0, count) for count in replies[0].counts), total, replies[-1].counts,
+            last.counts, strict=True,
+        )
+    ]  # fmt: skip
+    print("counts", total, "true", true)
+    assert min(abs(count) for count in true) > 65536
+    assert total == true
+
+
+# under stress
+
+
+def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: Host) -> None:
+    """Every 83rd byte has a wrong bit, every 211th is lost: the checked rest drives on."""
+    board.command("noise to 83")
+    board.command("drop to 211")
+    replies = host.drive(DRIVE, 2.0)
+    status = board.status()
+    share = len(replies) / (status.to_board.bytes / 42)
+    print(f"{status.to_board.damaged} bytes damaged, {status.to_board.lost} lost; "
+          f"{share:.0%} of the lines answered")  # fmt: skip
+    assert 0.2 < share < 0.7
+    for motor, wanted in zip(status.motors, DRIVE, strict=True):
+        assert motor.speed == pytest.approx(wanted, rel=0.01, abs=0.02)
+
+
+def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host: Host) -> None:
+    """Lines back to back on the wire: more than it can answer, and still it keeps its time."""
+    line = checked(speeds_line(DRIVE), 0, "S") + b"\r\n"
+    replies: list[Reply] = []
+    end = time.monotonic() + 2.0
+    began = board.status()
+    while time.monotonic() < end:
+        ahead = began.to_board.bytes + (time.monotonic() - end + 2.0) * 11520 + 300
+        if board.status().to_board.bytes < ahead:
+            host.write(line * 4)
+        replies += [read_reply(got, at) for at, got in host.lines(0.002)]
+    status = board.status()
+    lines = (status.to_board.bytes - began.to_board.bytes) // len(line)
+    print(f"{lines} lines in 2 s, {len(replies)} answered; load {status.load:.0%}")
+    assert status.resets == 0
+    assert lines > 400
+    assert len(replies) > 300
+    assert all(
+        m.speed == pytest.approx(w, rel=0.01) for m, w in zip(status.motors, DRIVE, strict=True)
+    )
+
+
+@pytest.mark.parametrize("speed", [20.0, 40.0, 60.0])
+def test_it_keeps_up_with_fast_wheels(runner: Path, firmware: Path, speed: float) -> None:
+    with Board(runner, firmware, "--free-speed", "70,70,70,70") as board, Host(board.path) as host:
+        host.drive((speed, -speed, speed, -speed), 1.0)
+        before = board.status()
+        host.drive((speed, -speed, speed, -speed), 1.0)
+        after = board.status()
+        span = after.virtual_ns - before.virtual_ns
+        load = (after.load * after.virtual_ns - before.load * before.virtual_ns) / span
+        edges = sum(
+            abs(a.counts - b.counts) for a, b in zip(after.motors, before.motors, strict=True)
+        )
+        print(f"{speed} rad/s: {edges / span * 1e6:.0f} edges/ms, processor busy {load:.0%}")
+        assert after.resets == 0
+        is_still(board)
+        reply = host.ask(checked(ZERO, 7, "S"))
+        assert reply.counts == wrapped([motor.since_reset for motor in board.status().motors])
+
+
+def test_an_overflow_costs_its_lines_and_spares_the_next(
+    runner: Path, hanging_firmware: Path
+) -> None:
+    """The main loop pauses for 60 ms, in which twice as much comes as it can hold."""
+    with Board(runner, hanging_firmware) as board, Host(board.path) as host:
+        lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
+        host.write(b"!p\r\n" + lines)
+        until(lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all is heard")
+        host.says(b"#00")
+        host.send(checked(ZERO, 99))
+        host.says(b"#63")
+        assert board.status().resets == 0
+        answered = (board.status().from_board.bytes - len(IDENTITY) - 4) // 41 - 1
+        print(f"12 lines in a pause of 60 ms: {answered} answered")
+        assert 0 < answered < 12
+
+
+def test_a_port_that_vanishes_stops_it_and_a_new_one_works(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.3)
+    board.command("unplug")
+    status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
+    assert 250 <= (status.off_ns - status.heard_ns) / MS <= 350
+    with Host(board.plug()) as again:
+        again.drive(DRIVE, 0.3)
+        assert board.status().running
+
+
+def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Host) -> None:
+    until(lambda: board.status().open, 3.0, "it is seen that the port is open")
+    board.command("auto_reset 300")
+    with Host(board.path) as another:  # it is open already: nothing happens
+        another.drive(DRIVE, 0.1)
+    assert board.status().resets == 0
+    path = board.plug()
+    with Host(path) as again:
+        until(lambda: board.status().resets == 1, 3.0, "a reset")
+        began = time.monotonic()
+        assert again.says(b"acsard") == IDENTITY
+        print(f"boots for {1000 * (time.monotonic() - began):.0f} ms")
+        stays_off(board, 100)
+
+
+def test_the_bench_can_mute_and_freeze_the_board(board: Board, host: Host) -> None:
+    host.ask(ZERO)
+    board.command("mute")
+    before = board.status().from_board
+    host.send(checked(ZERO, 1))
+    until(lambda: board.status().from_board.bytes == before.bytes + 41, 3.0, "it has answered")
+    assert board.status().from_board.lost == before.lost + 41
+    assert host.lines() == []
+    board.command("unmute")
+    board.command("pause")
+    host.send(checked(ZERO, 2))
+    frozen = board.status().virtual_ns
+    end = time.monotonic() + 0.5
+    until(lambda: time.monotonic() > end, 3.0, "time passes here")
+    assert board.status().virtual_ns == frozen, "and not there"
+    assert host.lines() == []
+    board.command("resume")
+    assert read_reply(host.says(b"#02")).sequence == 2
+
+
+@pytest.mark.parametrize("fault", ["dead", "swapped"])
+def test_it_does_not_watch_over_its_encoders(board: Board, host: Host, fault: str) -> None:
+    """That is for the host, and for the check with lifted wheels."""
+    board.command(f"encoder b {fault}")
+    replies = host.drive((5.0, 5.0, 5.0, 5.0), 1.0)
+    motors = board.status().motors
+    assert motors[1].duty == 1.0
+    assert motors[0].speed == pytest.approx(5.0, rel=0.01)
+    assert replies[-1].speeds[1] == 0.0 if fault == "dead" else replies[-1].speeds[1] < -40.0
+
+
+@pytest.mark.parametrize("baud_rate", [9600, 57600])
+def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: int) -> None:
+    slow = build_firmware(tmp_path, f"-DBAUD_RATE={baud_rate}UL")
+    with Board(runner, slow, "--baud", str(baud_rate)) as board, Host(board.path) as host:
+        began = board.status().virtual_ns
+        host.ask(checked(ZERO, 1, "S"))
+        took = (board.status().virtual_ns - began) / MS
+        wire = (42 + 62) * 10 / baud_rate * 1000
+        print(f"{baud_rate} baud: there and back in {took:.1f} ms, of it {wire:.1f} ms on the wire")
+        assert took > 0.9 * wire
+        replies = host.drive(DRIVE, 2.0, period=2 * wire / 1000)
+        assert replies[-1].speeds == pytest.approx(DRIVE, rel=0.02)
+
+
+def test_with_require_check_a_plain_line_is_refused_after_a_checked_one(
+    runner: Path, tmp_path: Path
+) -> None:
+    strict = build_firmware(tmp_path, "-DREQUIRE_CHECK=1")
+    with Board(runner, strict) as board, Host(board.path) as host:
+        assert host.ask(ZERO).line == ZERO
+        host.ask(checked(ZERO, 1))
+        host.send(ZERO)
+        assert host.ask(checked(ZERO, 2)).sequence == 2, "and no answer before that"
+        board.command("reset")
+        host.says(b"acsard")
+        assert host.ask(ZERO).line == ZERO
+
+
+def test_the_bench_is_faster_than_the_real_board(board: Board, host: Host) -> None:
+    factors = {}
+    for what, speeds in (("at rest", STOPPED), ("40 rad/s", (40.0, -40.0, 40.0, -40.0))):
+        host.drive(speeds, 0.3)
+        told = board.command("bench 200")
+        factors[what] = told["ms"] * MS / told["cpu_ns"]
+    print("real-time factor:", {what: round(factor, 1) for what, factor in factors.items()})
+    assert min(factors.values()) > 2.0, "on a processor of its own"

@@ -1,0 +1,344 @@
+"""The firmware's parser, compiled for this machine, beside the host's: all of a line or nothing."""
+
+from __future__ import annotations
+
+import binascii
+import ctypes
+import random
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.lines import LineReader
+from acsard.settings import WheelMap
+from acsard.values import WheelSpeeds
+from tests.firmware.board import checked, read_reply, speeds_line
+from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
+
+
+class CommandC(ctypes.Structure):
+    _fields_ = (
+        ("thousandths", ctypes.c_int32 * 4),
+        ("checked", ctypes.c_bool),
+        ("sample", ctypes.c_bool),
+        ("sequence", ctypes.c_uint8),
+    )
+
+
+class ReaderC(ctypes.Structure):
+    _fields_ = (
+        ("text", ctypes.c_char * 128),
+        ("length", ctypes.c_uint8),
+        ("discarding", ctypes.c_bool),
+    )
+
+
+class ReadingC(ctypes.Structure):
+    _fields_ = (
+        ("milliseconds", ctypes.c_uint16),
+        ("counts", ctypes.c_uint16 * 4),
+        ("hundredths", ctypes.c_int16 * 4),
+    )
+
+
+class Command(NamedTuple):
+    """What a line said."""
+
+    thousandths: tuple[int, ...]
+    checked: bool = False
+    sample: bool = False
+    sequence: int = 0
+
+
+class Parser:
+    """The C functions with Python's types."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._parse = library.line_parse
+        self._parse.argtypes = (ctypes.c_char_p, ctypes.c_uint8, ctypes.c_void_p)
+        self._parse.restype = ctypes.c_bool
+        self._feed = library.line_feed
+        self._feed.argtypes = (ctypes.c_void_p, ctypes.c_uint8)
+        self._feed.restype = ctypes.c_uint8
+        self._reply = library.line_reply
+        self._reply.argtypes = (ctypes.c_char_p, ctypes.c_void_p, ctypes.c_void_p)
+        self._reply.restype = ctypes.c_uint8
+        self._asks = library.line_asks
+        self._asks.argtypes = (ctypes.c_char_p, ctypes.c_uint8)
+        self._asks.restype = ctypes.c_bool
+        self._reader = ReaderC()
+        self._pointer = ctypes.addressof(self._reader)
+        self._command = CommandC()
+
+    def parse(self, line: bytes) -> Command | None:
+        """The command in a line; a refused line leaves no trace in what was there before."""
+        command = self._command
+        before = bytes(command)
+        if not self._parse(line, len(line), ctypes.addressof(command)):
+            assert bytes(command) == before
+            return None
+        return Command(
+            tuple(command.thousandths), command.checked, command.sample, command.sequence
+        )
+
+    def lines(self, data: bytes) -> list[bytes]:
+        """The lines in a stream; the reader keeps what is not complete."""
+        got = []
+        for byte in data:
+            length = self._feed(self._pointer, byte)
+            if length:
+                got.append(ctypes.string_at(self._pointer, length))
+        return got
+
+    def stream(self, data: bytes) -> list[Command]:
+        """The commands in a stream that begins afresh."""
+        self._reader.length = 0
+        self._reader.discarding = False
+        found = [self.parse(line) for line in self.lines(data)]
+        return [command for command in found if command is not None]
+
+    def asks(self, line: bytes) -> bool:
+        return bool(self._asks(line, len(line)))
+
+    def reply(self, command: Command, ms: int, counts: list[int], hundredths: list[int]) -> bytes:
+        """The answer, with its end."""
+        asked = CommandC((0,) * 4, command.checked, command.sample, command.sequence)
+        reading = ReadingC(ms, tuple(counts), tuple(hundredths))
+        out = ctypes.create_string_buffer(64)
+        length = self._reply(out, ctypes.addressof(asked), ctypes.addressof(reading))
+        assert length <= 64
+        return out.raw[:length]
+
+
+@pytest.fixture(scope="session")
+def parser(library: ctypes.CDLL) -> Parser:
+    return Parser(library)
+
+
+def said(line: bytes) -> tuple[int, ...] | None:
+    """Thousandths of a rad/s the host's own parser takes from a plain line."""
+    try:
+        speeds = Codec(WheelMap()).decode(line)
+    except FrameError:
+        return None
+    return tuple(round(speed * 1000) for speed in speeds.as_tuple())
+
+
+# plain lines: the same language as the host's
+
+
+@pytest.mark.parametrize(("line", "motors"), ACCEPTED)
+def test_what_the_host_accepts_is_taken_with_the_same_values(
+    parser: Parser, line: bytes, motors: tuple[float, ...]
+) -> None:
+    assert parser.parse(line) == Command(tuple(round(speed * 1000) for speed in motors))
+
+
+@pytest.mark.parametrize("line", [line for line, _ in REFUSED])
+def test_what_the_host_refuses_changes_nothing(parser: Parser, line: bytes) -> None:
+    assert parser.parse(line) is None
+
+
+MUTATIONS: list[Callable[[random.Random, bytes], bytes]] = [
+    lambda r, line: line,
+    lambda r, line: line[: r.randrange(len(line) + 1)],
+    lambda r, line: line[r.randrange(len(line)) :],
+    lambda r, line: line.replace(b",", r.choice([b", ", b",  ", b" ,", b";", b",,"])),
+    lambda r, line: line + r.choice([b",", b", ", b" ", b",,", b"\r", b"0", b"\x00"]),
+    lambda r, line: line.replace(r.choice([b"a", b"p", b".", b"0"]), r.choice([b"b", b"n", b""])),
+    lambda r, line: _with(line, r.randrange(len(line)), r.randrange(256)),
+    lambda r, line: line[: (at := r.randrange(len(line)))] + b"0" + line[at:],
+    lambda r, line: b",".join(sorted(line.split(b","), key=lambda _: r.random())),
+]
+
+
+def _with(line: bytes, at: int, byte: int) -> bytes:
+    return line[:at] + bytes([byte]) + line[at + 1 :]
+
+
+def test_it_reads_the_host_s_language_and_no_other(parser: Parser) -> None:
+    """Valid lines with one to three changes: both parsers say the same of each."""
+    rng = random.Random(1)
+    taken = 0
+    for _ in range(50_000):
+        line = speeds_line([rng.choice([0.0, 9.99, -10.0, 99.99, -0.01, 12.5]) for _ in range(4)])
+        for _ in range(rng.randrange(1, 4)):
+            line = rng.choice(MUTATIONS)(rng, line) or line
+        if b"#" in line or b"*" in line:
+            continue
+        got = parser.parse(line)
+        assert (got and got.thousandths) == said(line), line
+        taken += got is not None
+    assert 5_000 < taken < 45_000, "both kinds"
+
+
+wheels = st.builds(WheelSpeeds, *[st.floats(-101.0, 101.0)] * 4)
+
+
+@given(wheels, st.booleans())
+def test_every_line_the_host_writes_is_taken_with_the_same_value(
+    parser: Parser, speeds: WheelSpeeds, comma: bool
+) -> None:
+    line = Codec(WheelMap(), trailing_comma=comma).encode(speeds)
+    (command,) = parser.stream(line)
+    assert command == Command(said(line.rstrip(b"\r\n")) or ())
+
+
+@given(wheels, st.booleans(), st.integers(0, 255), st.sampled_from(["", "S", "GS", "Z", "SS"]))
+def test_a_checked_line_is_taken_with_its_sequence_and_request(
+    parser: Parser, speeds: WheelSpeeds, comma: bool, sequence: int, letters: str
+) -> None:
+    line = Codec(WheelMap(), trailing_comma=comma).encode(speeds).rstrip(b"\r\n")
+    command = Command(said(line) or (), True, "S" in letters, sequence)
+    assert parser.parse(checked(line, sequence, letters)) == command
+
+
+@given(st.binary(max_size=300))
+def test_lines_are_cut_as_the_host_cuts_them(parser: Parser, data: bytes) -> None:
+    data = data.replace(b"\x07", b"\n")  # more of them than chance would give
+    reader = LineReader()
+    parser.stream(b"\n")
+    assert parser.lines(data) == [line for line, _ in reader.feed(data)]
+
+
+def test_noise_without_a_line_end_is_forgotten_and_the_next_line_counts(parser: Parser) -> None:
+    assert parser.stream(b"a" * 1000 + SEED_LINE + b"\n" + ZERO + b"\n") == [Command((0, 0, 0, 0))]
+    assert parser.stream(b" " * (127 - len(ZERO)) + ZERO + b"\r\n") == []
+
+
+def test_only_a_lone_question_mark_asks(parser: Parser) -> None:
+    assert parser.asks(b"?")
+    assert not any(parser.asks(line) for line in (b"??", b" ?", b"? ", ZERO + b"?", b"!"))
+    assert parser.parse(b"?") is None
+
+
+# checked lines
+
+
+SUFFIXES = [
+    b"#", b"*", b"#07", b"*1234", b"#07*", b"#07*123", b"#7*1234", b"#07S", b"#07s*1234",
+    b"#07F*1234", b"#07 *1234", b"#07*1234 ", b"#07*1234*1234", b"#07#07*1234", b"@0000",
+    b"#07S\x00*1234",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_suffix_that_is_not_whole_spoils_the_line(parser: Parser, suffix: bytes) -> None:
+    assert parser.parse(ZERO + suffix) is None
+
+
+BEFORE_CHECK = [
+    b"", b"#", b"#0", b"#7", b"#007", b"#0a", b"#07F", b"#07s", b"#07 ", b"#07S0", b"#07*", b" #07",
+    b"#07#07", b"#07S\x00", b",,#07", b"@0000", b"#07@0000", b",ap00.00#07",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", BEFORE_CHECK)
+def test_a_right_check_does_not_mend_a_wrong_form(parser: Parser, suffix: bytes) -> None:
+    head = ZERO + suffix
+    assert parser.parse(head + b"*%04X" % binascii.crc_hqx(head, 0)) is None
+
+
+def test_lower_case_and_a_wrong_check_are_refused(parser: Parser) -> None:
+    right = checked(SEED_LINE, 0xAB, "S")
+    assert parser.parse(right) is not None
+    assert parser.parse(right[:-4] + right[-4:].lower()) is None or right[-4:].isdigit()
+    assert parser.parse(right.replace(b"#AB", b"#ab")) is None
+    for wrong in range(1, 65536, 97):
+        crc = int(right[-4:], 16) ^ wrong
+        assert parser.parse(right[:-4] + b"%04X" % crc) is None
+
+
+def flipped(rng: random.Random, checked_lines: bool) -> tuple[bytes, list[tuple[int, ...]]]:
+    """Three lines as they are sent, one bit of the middle one wrong, and the values sent."""
+    sent, data = [], []
+    for i in range(3):
+        hundredths = [rng.randrange(-9999, 10000) for _ in range(4)]
+        line = speeds_line([value / 100 for value in hundredths])
+        sent.append(tuple(10 * value for value in hundredths))
+        if checked_lines:
+            line = checked(line, rng.randrange(256), rng.choice(["", "S"]))
+        data.append(line + b"\r\n")
+        if i == 1:
+            bit = rng.randrange(8 * len(data[1]))
+            data[1] = _with(data[1], bit // 8, data[1][bit // 8] ^ (1 << bit % 8))
+    return b"".join(data), sent
+
+
+def wrong_values(parser: Parser, count: int, checked_lines: bool) -> int:
+    """How many of so many single-bit errors put a speed in force that was never sent."""
+    rng = random.Random(count)
+    wrong = 0
+    for _ in range(count):
+        data, sent = flipped(rng, checked_lines)
+        wrong += any(command.thousandths not in sent for command in parser.stream(data))
+    return wrong
+
+
+@pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
+@pytest.mark.timeout(600)
+def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
+    parser: Parser, count: int
+) -> None:
+    assert wrong_values(parser, count, checked_lines=True) == 0
+    plain = wrong_values(parser, 20_000, checked_lines=False)
+    print(f"single-bit errors: 0 of {count} checked lines wrong; plain {plain / 200:.1f} %")
+
+
+def test_a_byte_that_becomes_a_line_end_leaves_no_valid_piece(parser: Parser) -> None:
+    """But two, by the letter of the format: where the check begins, which leaves the plain line (it
+    takes two errors or more to make a line end of `#`), and within the last wheel's decimals."""
+    for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 7), SEED_LINE):
+        (whole,) = parser.stream(line + b"\r\n")
+        shortened = (*whole.thousandths[:3], -10200)
+        for at in range(len(line)):
+            for end in (b"\n", b"\r\n", b"\r"):
+                got = parser.stream(line[:at] + end + line[at + 1 :] + b"\r\n")
+                if line[:at] in (SEED_LINE, SEED_LINE + b",") and end != b"\r":
+                    assert [command.thousandths for command in got] == [whole.thousandths]
+                elif line[:at] == SEED_LINE[:-1] and end != b"\r":
+                    assert [command.thousandths for command in got] == [shortened]
+                else:
+                    assert not got, (line, at, end)
+
+
+def test_no_single_bit_error_makes_a_line_end_where_the_rest_is_a_line(parser: Parser) -> None:
+    for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 0x2A), SEED_LINE):
+        for bit in range(8 * len(line)):
+            bad = _with(line, bit // 8, line[bit // 8] ^ (1 << bit % 8))
+            if b"\n" in bad:
+                assert parser.stream(bad + b"\r\n") == [], bad
+
+
+# replies
+
+
+@given(
+    st.lists(st.integers(-9999, 9999), min_size=4, max_size=4),
+    st.lists(st.integers(0, 65535), min_size=4, max_size=4),
+    st.integers(0, 65535), st.integers(0, 255), st.booleans(), st.booleans(),
+)  # fmt: skip
+def test_a_reply_says_what_it_was_given(
+    parser: Parser,
+    hundredths: list[int],
+    counts: list[int],
+    milliseconds: int,
+    sequence: int,
+    check: bool,
+    sample: bool,
+) -> None:
+    command = Command((0,) * 4, check, sample, sequence)
+    line = parser.reply(command, milliseconds, counts, hundredths)
+    assert line.endswith(b"\r\n")
+    assert len(line) == (33 if not check else 62 if sample else 41)
+    reply = read_reply(line[:-2])
+    assert [round(speed * 100) for speed in reply.speeds] == hundredths
+    assert reply.sequence == (sequence if check else None)
+    if check and sample:
+        assert reply.milliseconds == milliseconds
+        assert list(reply.counts) == counts
+    assert said(line[:31]) == tuple(10 * value for value in hundredths)
