@@ -2,8 +2,6 @@
 
 #include "crc.h"
 
-#define FASTEST 99990L /* thousandths of a rad/s: what the reply can say too */
-
 uint8_t line_feed(struct line_reader *reader, uint8_t byte)
 {
     uint8_t length = reader->length;
@@ -44,26 +42,31 @@ static bool is_digit(const struct cursor *cursor)
     return cursor->at != cursor->end && *cursor->at >= '0' && *cursor->at <= '9';
 }
 
-/* One or two digits, a point, one to three digits; at most 99.99. */
-static bool take_number(struct cursor *cursor, int32_t *thousandths)
+/* Two digits, a point, two decimals, as the host writes them: were one decimal enough, a line that
+ * was cut before its last digit would still be one. */
+static bool take_number(struct cursor *cursor, int16_t *hundredths)
 {
-    int32_t value = 0;
-    uint8_t digits = 0;
+    int16_t value = 0;
+    uint8_t place;
 
-    for (; digits < 2 && is_digit(cursor); digits++)
-        value = value * 10 + (*cursor->at++ - '0');
-    if (!digits || !take(cursor, '.') || !is_digit(cursor))
-        return false;
-    for (digits = 0; digits < 3; digits++)
-        value = value * 10 + (is_digit(cursor) ? *cursor->at++ - '0' : 0);
-    *thousandths = value;
-    return value <= FASTEST;
+    for (place = 0; place < 5; place++) {
+        if (place == 2) {
+            if (!take(cursor, '.'))
+                return false;
+            continue;
+        }
+        if (!is_digit(cursor))
+            return false;
+        value = (int16_t)(value * 10 + (*cursor->at++ - '0'));
+    }
+    *hundredths = value;
+    return true;
 }
 
 static bool take_wheel(struct cursor *cursor, struct command *command, uint8_t *seen)
 {
     uint8_t motor, bit;
-    int32_t value;
+    int16_t value;
     bool negative;
 
     if (cursor->at == cursor->end || *cursor->at < 'a' || *cursor->at > 'd')
@@ -78,7 +81,7 @@ static bool take_wheel(struct cursor *cursor, struct command *command, uint8_t *
         return false;
     if (!take_number(cursor, &value))
         return false;
-    command->thousandths[motor] = negative ? -value : value;
+    command->hundredths[motor] = (int16_t)(negative ? -value : value);
     return true;
 }
 

@@ -23,7 +23,7 @@ struct line_reader {
 uint8_t line_feed(struct line_reader *reader, uint8_t byte);
 
 struct command {
-    int32_t thousandths[4]; /* of a rad/s, motors a to d */
+    int16_t hundredths[4]; /* of a rad/s, motors a to d */
     bool checked;           /* it had a right suffix, so it is answered with one */
     bool sample;            /* ... which asks for the sample fields */
     uint8_t sequence;

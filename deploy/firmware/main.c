@@ -128,7 +128,7 @@ static void on_command(const struct command *command)
         return;
     checked_seen |= command->checked;
     for (i = 0; i < MOTORS; i++)
-        wheels[i].target = (float)command->thousandths[i] * 0.001f;
+        wheels[i].target = (float)command->hundredths[i] * 0.01f;
     watchdog_feed(&watchdog, latest.milliseconds);
     if (latest.milliseconds - report_ms >= REPORT_MS)
         renew_report();
