@@ -188,7 +188,8 @@ def _result(
     from acsard.runtime.bench_rig import resident_mb
 
     state, pid = rig.state(), rig.process.pid
-    realtime = os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR)
+    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+    realtime = policy in (os.SCHED_FIFO, os.SCHED_RR)
     resident = resident_mb(pid)
     record = rig.end()
     read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]
