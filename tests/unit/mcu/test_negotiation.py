@@ -159,6 +159,16 @@ def test_questions_that_did_not_leave_are_not_counted() -> None:
     assert bench.check.state == "asking"
 
 
+def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
+    bench = Bench()
+    bench.check.heard_plain()
+    bench.ask()
+    for _ in range(100):
+        bench.now_ns += 10 * MS
+        bench.check.judge(bench.now_ns)
+    assert bench.check.state == "asking"
+
+
 def test_silence_is_no_refusal_however_long() -> None:
     bench = Bench(SAMPLES)
     bench.ask(60_000)
@@ -205,6 +215,30 @@ def test_a_new_opening_forgets_who_was_there() -> None:
 
 
 # sequences
+
+
+def test_sequences_count_up_and_start_over_after_255() -> None:
+    bench = Bench().checked()
+    first, *others = bench.drive(300)
+    assert others == [(first + n) % 256 for n in range(1, 300)]
+
+
+def test_only_the_last_line_can_be_one_that_did_not_leave() -> None:
+    bench = Bench().checked()
+    first, second = bench.drive(2)
+    bench.check.unsent()
+    bench.check.unsent()
+    assert bench.stale(second)
+    bench.reply(first)
+
+
+def test_a_line_from_another_time_is_stale_also_when_newer_ones_are_out() -> None:
+    bench = Bench().checked()
+    (old,) = bench.drive()
+    bench.now_ns += LATE_NS + 1
+    (new,) = bench.drive()
+    assert bench.stale(old)
+    bench.reply(new)
 
 
 def test_each_sequence_is_answered_once() -> None:
