@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from acsard.histogram import Histogram
-from acsard.values import NS_PER_S, Measured, Spread
+from acsard.values import NS_PER_S, Measured
 
 Name = Literal[
     "period_lateness",
@@ -42,27 +42,30 @@ FRESH_NS = NS_PER_S
 
 class _Figure:
     def __init__(self) -> None:
-        self.total = Histogram()
+        self._past = Histogram()
+        """All that is older than the last minute."""
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
 
     def add(self, now_ns: int, value: float) -> None:
-        self._advance(now_ns // SLOT_NS)
-        self.total.add(value)
-        self._slots[self._number % SLOTS].add(value)
+        number = now_ns // SLOT_NS
+        if number != self._number:
+            self._advance(number)
+        self._slots[number % SLOTS].add(value)
 
-    def last_minute(self, now_ns: int) -> Spread:
+    def measured(self, now_ns: int) -> Measured:
         self._advance(now_ns // SLOT_NS)
         minute = Histogram()
         for slot in self._slots:
             minute.merge(slot)
-        return minute.spread()
+        last_minute = minute.spread()
+        minute.merge(self._past)
+        return Measured(minute.spread(), last_minute)
 
     def _advance(self, number: int) -> None:
-        if number == self._number:
-            return
-        for old in range(max(self._number, number - SLOTS) + 1, number + 1):
-            self._slots[old % SLOTS] = Histogram()
+        for new in range(max(self._number, number - SLOTS) + 1, number + 1):
+            self._past.merge(self._slots[new % SLOTS])
+            self._slots[new % SLOTS] = Histogram()
         self._number = number
 
 
@@ -82,8 +85,5 @@ class Figures:
         """Every figure by its name; at most a second old."""
         if now_ns - self._told_ns >= FRESH_NS:
             self._told_ns = now_ns
-            self._told = {
-                name: Measured(figure.total.spread(), figure.last_minute(now_ns))
-                for name, figure in self._figures.items()
-            }
+            self._told = {name: figure.measured(now_ns) for name, figure in self._figures.items()}
         return self._told

@@ -12,29 +12,32 @@ PER_DECADE = 20
 DECADES = 7
 """From 1 to 10^7 of the unit; what is smaller or larger falls into the end buckets."""
 
+LAST = PER_DECADE * DECADES
+"""The end bucket."""
+
 
 class Histogram:
     """Counts measurements of one quantity."""
 
     def __init__(self) -> None:
-        self._buckets = [0] * (PER_DECADE * DECADES + 1)
+        self._buckets = [0] * (LAST + 1)
         self._count = 0
         self._max = 0.0
 
     def add(self, value: float) -> None:
         """Count one measurement."""
-        last = len(self._buckets) - 1
-        index = min(last, math.ceil(PER_DECADE * math.log10(value))) if value > 1.0 else 0
+        index = min(LAST, math.ceil(PER_DECADE * math.log10(value))) if value > 1.0 else 0
         self._buckets[index] += 1
         self._count += 1
-        self._max = max(self._max, value)
+        if value > self._max:
+            self._max = value
 
     def merge(self, other: Histogram) -> None:
         """Count all that the other has counted."""
-        if other._count:
-            self._buckets = [a + b for a, b in zip(self._buckets, other._buckets, strict=True)]
-            self._count += other._count
-            self._max = max(self._max, other._max)
+        for index, count in enumerate(other._buckets):
+            self._buckets[index] += count
+        self._count += other._count
+        self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
         """Median, 99th percentile and maximum so far; a percentile is its bucket's upper end."""

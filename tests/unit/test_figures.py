@@ -78,7 +78,7 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
         return sum(
             sys.getsizeof(histogram._buckets)
             for figure in figures._figures.values()
-            for histogram in (figure.total, *figure._slots)
+            for histogram in (figure._past, *figure._slots)
         )
 
     figures = Figures()
