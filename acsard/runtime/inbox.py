@@ -97,7 +97,6 @@ class Inbox:
 
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
         arrived = clock.now()
-        self._rouse()  # it takes the loop as long to wake as us to read on
         put = sample.kind == zenoh.SampleKind.PUT
         stamp, stamp_ns, sender = sample.timestamp, None, ""
         if stamp is not None and stamp.get_id() != self.own_id:
