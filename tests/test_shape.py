@@ -71,6 +71,7 @@ ORDER = (
     "runtime.real_time",
     "runtime.timerfd",
     "runtime.ticker",
+    "runtime.wakeup",
     "runtime.journal",
     "runtime.logs",
     "runtime.systemd",

@@ -27,6 +27,7 @@ from acsard.runtime.serial_port import SerialPort
 from acsard.runtime.sim_pty import SimPty
 from acsard.runtime.systemd import PATIENCE_S, Systemd
 from acsard.runtime.ticker import Alarm, Ticker
+from acsard.runtime.wakeup import Wakeup
 from acsard.runtime.zenoh_bus import ZenohBus
 from acsard.runtime.zenoh_session import log_from_environment
 from acsard.settings import Config
@@ -40,35 +41,6 @@ LATCHED_PERIOD_S = 5.0
 """How often latched messages are sent again, for subscribers that cannot ask for history."""
 
 SIMULATOR = "sim"
-
-
-class _Wakeup:
-    """Wakes the control task; many calls before it runs are one. An Event for one who waits."""
-
-    def __init__(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._called = False
-        self._waiter: asyncio.Future[None] | None = None
-
-    def __call__(self) -> None:
-        self._called = True
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
-
-    def from_thread(self) -> None:
-        """The same, from any thread."""
-        try:
-            self._loop.call_soon_threadsafe(self)
-        except RuntimeError:
-            pass  # the loop has closed: nobody is left to wake
-
-    async def wait(self) -> None:
-        """Until somebody calls."""
-        if not self._called:
-            self._waiter = self._loop.create_future()
-            await self._waiter
-            self._waiter = None
-        self._called = False
 
 
 class _Departure:
@@ -113,7 +85,7 @@ Announce = Callable[[str, str], None]
 
 async def run(config: Config, log: Log, announce: Announce) -> None:
     """Run until a signal; raises `ExitError` when it cannot start."""
-    wake = _Wakeup()
+    wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
     departure = _Departure(log, wake, manager)
     departure.watch()
@@ -136,7 +108,7 @@ async def _run(
     log: Log,
     announce: Announce,
     departure: _Departure,
-    wake: _Wakeup,
+    wake: Wakeup,
     manager: Systemd,
 ) -> None:
     async with AsyncExitStack() as stack:
@@ -183,7 +155,7 @@ async def _control(
     config: Config,
     control: ControlLoop,
     departure: _Departure,
-    wake: _Wakeup,
+    wake: Wakeup,
     manager: Systemd,
 ) -> None:
     """The control task: a step every period, and one for feedback in hand."""
@@ -191,9 +163,8 @@ async def _control(
     gc.collect()
     gc.freeze()  # what lives now lives to the end; later collections need not look at it
     with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker, Alarm(wake) as alarm:
-        ticker.start(clock.now().mono_ns)
-        while True:
-            await wake.wait()
+
+        def step() -> bool:
             now = clock.now()
             period = ticker.take()
             control.leaving = departure.begun_ns is not None
@@ -201,8 +172,10 @@ async def _control(
             outputs = control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
             manager.step(outputs)
             alarm.set(control.retry_ns)
-            if departure.over(now.mono_ns, control.at_rest):
-                return
+            return departure.over(now.mono_ns, control.at_rest)
+
+        ticker.start(clock.now().mono_ns)
+        await wake.run(step)
 
 
 @asynccontextmanager
