@@ -21,20 +21,22 @@ Name = Literal[
 ]
 """The figures, in the order of the way a command goes:
 
-period_lateness  how late a control period began
-step_time        from a wake-up of the control task to the end of its work
+period_lateness  from when a period was due to its step; of several missed ones, the first
+step_time        from the start of a step to the end of its work
 command_age      from a command's arrival here to each line that follows it
-command_to_wire  from a command's arrival here to the first line that follows it
-feedback_to_bus  from the end of a feedback line to its last message handed to the bus
-mcu_round_trip   from a line handed to the port to the end of its answer
+command_to_wire  from a command's arrival here to the line that first follows it, handed to the
+                 port; one that first waited for its source's turn is not counted
+feedback_to_bus  from the read of a feedback line's end to its messages handed to the bus; before
+                 that it may have waited in the kernel, for no longer than the loop stood still
+mcu_round_trip   from a line to the end of its answer; see `mcu/roundtrip.py`
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
 
-SLOT_NS = 5 * NS_PER_S
+SLOT_NS = 10 * NS_PER_S
 """The last minute is kept in pieces of this length; the oldest makes room for the newest."""
 
-SLOTS = 12
+SLOTS = 6
 
 FRESH_NS = NS_PER_S
 """How old the told values may be: adding up the minute costs more than a step."""

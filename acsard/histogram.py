@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from itertools import accumulate
+from operator import add
 
 from acsard.values import Spread
 
@@ -34,8 +37,9 @@ class Histogram:
 
     def merge(self, other: Histogram) -> None:
         """Count all that the other has counted."""
-        for index, count in enumerate(other._buckets):
-            self._buckets[index] += count
+        if other._count == 0:
+            return
+        self._buckets[:] = map(add, self._buckets, other._buckets)
         self._count += other._count
         self._max = max(self._max, other._max)
 
@@ -44,9 +48,8 @@ class Histogram:
         return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
 
     def _percentile(self, share: float) -> float:
-        rank, seen = share * self._count, 0
-        for index, count in enumerate(self._buckets):
-            seen += count
-            if count and seen >= rank:
-                return min(math.pow(10.0, index / PER_DECADE), self._max)
-        return 0.0
+        if self._count == 0:
+            return 0.0
+        rank = max(1.0, share * self._count)
+        index = bisect_left(list(accumulate(self._buckets)), rank)
+        return min(math.pow(10.0, index / PER_DECADE), self._max)

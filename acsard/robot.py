@@ -61,8 +61,8 @@ class Robot:
         self._life = Lifecycle(config.control.auto_activate)
         self._choice = Choice("", None, "no commands: no source has sent one yet")
         self._speeds = STILL
-        self._told: tuple[int | None, bool] = (None, False)
-        """Whose command, by its arrival, and whether halted: what the last line was made of."""
+        self._told: tuple[int | None, Mode] = (None, self._life.mode)
+        """Whose command, by its arrival, and the mode: what the last line was made of."""
         self._limited_ns = 0
         self._before = (self._limiter.state, 0)
         """The limiter and its time before the last line: restored when that line did not go."""
@@ -127,10 +127,7 @@ class Robot:
 
     def _news(self) -> bool:
         """The next line has something to say that the last did not: worth going at once."""
-        halted = self._life.mode in HALTED
-        return (self._choice.arrived_ns, halted) != self._told and (
-            halted or self._choice.arrived_ns is not None
-        )
+        return (self._choice.arrived_ns, self._life.mode) != self._told
 
     # fold
 
@@ -255,7 +252,7 @@ class Robot:
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
-        self._told = (self._choice.arrived_ns, self._life.mode in HALTED)
+        self._told = (self._choice.arrived_ns, self._life.mode)
         if inputs.superseded:
             limiter.state, self._limited_ns = self._before
         self._before = (limiter.state, self._limited_ns)

@@ -148,6 +148,8 @@ class Sample(Struct, frozen=True):
     positions: tuple[float, float, float, float]
     """Wheel angles in rad since start, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
+    asked_ns: int | None = None
+    """When the line it answers was made, monotonic; None where a reply does not tell which."""
 
 
 class SourceStatus(Struct, frozen=True):
@@ -212,7 +214,8 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """A new command is followed, or a stop or fault has come, since the last line that was due."""
+    """Another command is followed, or none any more, or the mode is another one, than when the last
+    line was due."""
 
 
 class Spread(Struct, frozen=True):

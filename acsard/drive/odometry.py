@@ -90,7 +90,15 @@ class Odometry:
             self._advance(twist.linear * dt, twist.angular * dt)
             self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
         self.twist, self.speeds = twist, speeds
-        return Sample(feedback.at, self._pose, twist, self._covariance, self._positions, speeds)
+        return Sample(
+            feedback.at,
+            self._pose,
+            twist,
+            self._covariance,
+            self._positions,
+            speeds,
+            feedback.asked_ns,
+        )
 
     def _move(self, turned: Motors) -> None:
         """Advance by these wheel angles in rad: equations (4) to (7) are linear."""

@@ -28,6 +28,8 @@ class Feedback(Struct, frozen=True):
     dt: float
     gap: float = 0.0
     turned: Motors | None = None
+    asked_ns: int | None = None
+    """When the line it answers was made, monotonic, where the reply tells which one that is."""
 
 
 class Timeline:

@@ -122,15 +122,19 @@ class Negotiation:
         """A whole plain line came while asking: the MCU is awake, so silence is an answer too."""
         self._awake = True
 
-    def answered(self, reply: Checked, at_ns: int) -> None:
-        """Take a right reply; raises `FrameError` unless it answers a line sent and unanswered."""
+    def answered(self, reply: Checked, at_ns: int) -> int:
+        """Take a right reply; when the line it answers was made.
+
+        Raises `FrameError` unless it answers a line sent and unanswered.
+        """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
         # Lines are answered in order: those before this one will not be any more.
-        while self._pending.popleft()[0] != reply.sequence:
-            pass
+        sequence, asked_ns = self._pending.popleft()
+        while sequence != reply.sequence:
+            sequence, asked_ns = self._pending.popleft()
         has_sample = reply.reading is not None
         if self.state == "asking":
             self.state, self.settled_ns = "checked", at_ns
@@ -139,6 +143,7 @@ class Negotiation:
         elif self.samples:
             self._without = 0 if has_sample else self._without + 1
             self.samples = self._without < FEW_SAMPLES
+        return asked_ns
 
     def judge(self, now_ns: int) -> None:
         """Count a question that goes unanswered; after the last one settle for what there is."""

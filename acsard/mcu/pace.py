@@ -1,8 +1,8 @@
 """When a line may go: every period, and at once for what is new.
 
 A line that went at once takes the place of the next period's, so that a flood of commands makes no
-more lines than the clock alone; and two lines are never closer than the wire needs and a little
-more.
+more lines than the clock alone; and it keeps a distance to the line before it: what that takes on
+the wire and a little more. Each period has one try.
 """
 
 from __future__ import annotations
@@ -18,42 +18,52 @@ more than this, and the command that counts still has a chance in each period to
 class Pace:
     """Remembers the last line and whether it has already taken the next period's place."""
 
-    def __init__(self, line_ns: int) -> None:
+    def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
+        self._possible = self._gap_ns < period_ns
+        """Else the next period always comes before a line may go."""
         self._last_ns = -self._gap_ns
         self._ahead = False
         """A line has gone in the place of the next period's."""
+        self._tried = False
+        """This period's line has been offered, whether or not it went."""
         self._waiting = False
         """There was something new to say, too soon after a line."""
         self._idle = 0
 
-    def tick(self) -> bool:
-        """A period has ended: does its line go, or did one go in its place?"""
-        ahead, self._ahead = self._ahead, False
+    def tick(self, missed: int) -> bool:
+        """A period has ended: does its line go, or did one go in its place?
+
+        After `missed` periods it goes in any case: the one before it is long ago.
+        """
+        ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
-        return not ahead
+        return missed > 0 or not ahead
 
     def at_once(self, now_ns: int) -> bool:
         """May a line go now, beside the clock, if there is something new to say?"""
-        return not self._ahead and now_ns - self._last_ns >= self._gap_ns
+        return self._possible and not self._tried and now_ns - self._last_ns >= self._gap_ns
 
-    def note(self, now_ns: int, tick: bool, sent: bool, news: bool, heard: bool) -> None:
-        """After a step: a line `sent` on its `tick` or at once, or `news` that could not go yet.
+    def note(self, tick: bool, due: bool, sent_ns: int | None, news: bool, heard: bool) -> None:
+        """After a step: was its line the clock's, was one `due`, when did it leave if it did?
 
-        `heard`: the bus had something for this step.
+        `news` is what the next line has to say that the last did not; `heard` that the bus had
+        something for this step.
         """
-        self._waiting = news and not sent and not tick
-        self._idle += heard and not tick and not news
-        if sent:
-            self._last_ns = now_ns
-            self._ahead = not tick
+        self._waiting = news and not due
+        self._idle += heard and not news
+        if due and not tick:
+            self._tried, self._ahead = True, sent_ns is not None
+        if sent_ns is not None:
+            self._last_ns = sent_ns
 
     @property
     def listens(self) -> bool:
         """Worth waking for a command: none is in hand, and a line could go before the tick."""
-        return not (self._ahead or self._waiting or self._idle > IDLE_WAKES)
+        return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
     @property
     def retry_ns(self) -> int | None:
         """When the line for what is new may go, if that is before the tick; None for never."""
-        return self._last_ns + self._gap_ns if self._waiting and not self._ahead else None
+        ahead = self._waiting and self._possible and not self._tried
+        return self._last_ns + self._gap_ns if ahead else None

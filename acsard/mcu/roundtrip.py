@@ -1,9 +1,10 @@
 """How long the MCU takes to answer, from outside.
 
-A plain reply does not say which line it answers, and lines are pipelined. So each reply is held to
-answer the youngest line it can: one that left at least a command's and a reply's time on the wire
-ago, and after the line answered before. An MCU slower than a period shows up too fast by whole
-periods; none shows up too slow.
+A checked reply names the line it answers. A plain one does not, and lines are pipelined: it is held
+to answer the youngest line it can, one that left at least a command's and a reply's time on the
+wire ago, and after the line answered before. So without the check an MCU that takes longer than a
+period shows up too fast by whole periods, and a board on USB, which does not keep to the baud
+rate's pace, may show up too slow by one.
 """
 
 from __future__ import annotations

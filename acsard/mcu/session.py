@@ -17,6 +17,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import Literal
 
+from msgspec.structs import replace
+
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
@@ -238,8 +240,9 @@ class McuSession:
             if self.check.state == "checked" or (self.check.state == "asking" and b"#" in line):
                 reply = unseal(line)
                 speeds = self.codec.decode(reply.plain)
-                self.check.answered(reply, read_at.mono_ns)
-                return self._good(speeds, reply.reading, read_at, following)
+                asked_ns = self.check.answered(reply, read_at.mono_ns)
+                feedback = self._good(speeds, reply.reading, read_at, following)
+                return replace(feedback, asked_ns=asked_ns)
             speeds = self.codec.decode(line)
         except FrameError as error:
             self.rejects[error.reason] += 1

@@ -26,6 +26,7 @@ from acsard.messages.schema import Info, Message
 from acsard.robot import Robot
 from acsard.settings import Config
 from acsard.values import (
+    NS_PER_S,
     Command,
     Event,
     Inputs,
@@ -126,11 +127,12 @@ class ControlLoop:
         self._superseded = False
         self._trip = ""
         # The longest line of either direction: answers must not queue in the MCU either.
-        self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate))
+        period_ns = int(NS_PER_S / config.rate_hz)
+        self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
         self._round_trip = RoundTrip(2 * wire_ns(PLAIN_BYTES, config.mcu.baud_rate))
         self._prompted = not config.mcu.reply_period
-        self._followed_ns: int | None = None
-        """When the command arrived that the last line followed."""
+        self._line_ns = 0
+        """When the last line left."""
 
     @property
     def at_rest(self) -> bool:
@@ -145,16 +147,15 @@ class ControlLoop:
 
     def wake(self, now: Instant, tick: bool, missed: int = 0, late_ns: int = 0) -> Outputs:
         """One step at `now`; `tick` with the period's lateness and how many were missed."""
-        counters = self.robot.counters
         if tick:
             self.figures.add("period_lateness", now.mono_ns, late_ns)
             if missed:
-                counters["missed_periods"] += missed
+                self.robot.counters["missed_periods"] += missed
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self._pace
         inputs = Inputs(
             now=now,
-            tick=tick and pace.tick(),
+            tick=tick and pace.tick(missed),
             at_once=pace.at_once(now.mono_ns),
             port_open=port.is_open,
             opened=port.opened,
@@ -171,7 +172,7 @@ class ControlLoop:
         outputs = self.outputs = self.robot.step(inputs)
         sent = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
-        pace.note(now.mono_ns, inputs.tick, sent, outputs.news, heard)
+        pace.note(inputs.tick, outputs.tick, port.sent_ns if sent else None, outputs.news, heard)
         self._publish(outputs)
         self._bus.alert(pace.listens)
         self.figures.add("step_time", now.mono_ns, self._mono_ns() - now.mono_ns)
@@ -242,9 +243,9 @@ class ControlLoop:
             self._round_trip.sent(sent_ns)
         if command_ns is not None and outputs.mode == "driving":
             self.figures.add("command_age", sent_ns, sent_ns - command_ns)
-            if command_ns != self._followed_ns:
+            if command_ns > self._line_ns:  # else it waited for its turn, not for the wire
                 self.figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
-        self._followed_ns = command_ns
+        self._line_ns = sent_ns
 
     def _publish(self, outputs: Outputs) -> None:
         bus, told_ns = self._bus, None
@@ -253,11 +254,13 @@ class ControlLoop:
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
         for sample in outputs.samples:
-            round_trip_ns = self._round_trip.replied(sample.at.mono_ns)
-            if round_trip_ns is not None:
-                self.figures.add("mcu_round_trip", sample.at.mono_ns, round_trip_ns)
-        if told_ns is not None:
-            self.figures.add("feedback_to_bus", told_ns, told_ns - outputs.samples[-1].at.mono_ns)
+            at_ns, asked_ns = sample.at.mono_ns, sample.asked_ns
+            guessed_ns = self._round_trip.replied(at_ns)
+            trip_ns = guessed_ns if asked_ns is None else at_ns - asked_ns
+            if trip_ns is not None:
+                self.figures.add("mcu_round_trip", at_ns, trip_ns)
+            if told_ns is not None:
+                self.figures.add("feedback_to_bus", told_ns, told_ns - at_ns)
         for answer in outputs.answers:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:

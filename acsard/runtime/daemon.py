@@ -10,6 +10,7 @@ import asyncio
 import gc
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 
@@ -36,6 +37,9 @@ from acsard.values import NS_PER_S
 
 EXIT_RAMP_S = 0.6
 """Bound on the ramp to zero on the way down; then STOP whatever the speed."""
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long another Python thread may hold up the loop; by default 5 ms, half a period."""
 
 LATCHED_PERIOD_S = 5.0
 """How often latched messages are sent again, for subscribers that cannot ask for history."""
@@ -90,6 +94,7 @@ async def run(config: Config, log: Log, announce: Announce) -> None:
     departure = _Departure(log, wake, manager)
     departure.watch()
     log_from_environment()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     # Before the first thread: those the bus starts are not to inherit it.
     refused = real_time.ask() if config.control.real_time else ""
     if refused:

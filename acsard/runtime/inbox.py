@@ -61,13 +61,18 @@ class Inbox:
         self._slow: deque[Query] = deque()
         """Questions that take as long to answer as all others of a step."""
         self._overrun = 0
-        self._wake, self._alert = wake, False
+        self._wake, self._alert, self._stop_told = wake, False, False
 
     def alert(self, on: bool) -> None:
-        """Wake the loop for the next command or stop, once; or leave it to the next period."""
+        """Wake the loop for the next command, once; or leave it to the next period.
+
+        A stop wakes it all the same, but not every one of a flood of them.
+        """
         self._alert = on
-        if on and (self._stops or any(self._arrivals.values())):
-            self._rouse()
+        if on:
+            self._stop_told = False
+            if any(self._arrivals.values()):
+                self._rouse()
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
@@ -113,14 +118,19 @@ class Inbox:
             _bytes(sample.attachment, ATTACHMENT_BYTES),
         )
         if key == "stop" and put:
-            self._stops.append(arrival)
-            self._rouse()
+            self._stop(arrival)
             return
         held = self._arrivals.get(key, self._arrivals[OTHERS])
         if len(held) == ARRIVALS:
             self._overrun += 1
         held.append(arrival)
         self._rouse()
+
+    def _stop(self, arrival: Arrival) -> None:
+        self._stops.append(arrival)
+        if not self._stop_told:
+            self._stop_told = True
+            self._wake()
 
     def _rouse(self) -> None:
         # Once until the loop asks for it again: a flood wakes nobody more often than that.
@@ -150,8 +160,7 @@ class Inbox:
         arrived_ns = clock.now().mono_ns
         if topic == "srv/stop":
             # The stop itself never waits in a line with other questions, nor is it turned away.
-            self._stops.append(Arrival("stop", True, b"", "", arrived_ns, None, ""))
-            self._rouse()
+            self._stop(Arrival("stop", True, b"", "", arrived_ns, None, ""))
         number = self._replies.open(query, key)
         if number is None:
             return

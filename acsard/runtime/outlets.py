@@ -7,6 +7,7 @@ encoded once per encoding, and not at all for a tree without listeners.
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import zenoh
@@ -54,16 +55,19 @@ class Outlets:
     def __init__(self) -> None:
         self._outlets: dict[str, list[_Outlet]] = {}
         self._kept: list[object] = []
+        self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
         """The topics that somebody listens to."""
 
-    def _count(self) -> None:
-        # Replaced whole: the loop may be reading it while one of Zenoh's threads is here.
-        self.wanted = frozenset(
-            topic
-            for topic, outlets in list(self._outlets.items())
-            if any(outlet.wanted for outlet in outlets)
-        )
+    def _count(self, outlet: _Outlet, wanted: bool) -> None:
+        # By one of Zenoh's threads at a time; replaced whole, for the loop may be reading it.
+        with self._counting:
+            outlet.wanted = wanted
+            self.wanted = frozenset(
+                topic
+                for topic, outlets in list(self._outlets.items())
+                if any(one.wanted for one in outlets)
+            )
 
     def publish(self, topic: str, message: Message) -> None:
         """Send a message to its listeners."""
@@ -101,14 +105,11 @@ class Outlets:
         outlet = _Outlet(publisher, form, gid)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:
-            outlet.wanted = True  # it is kept for those who are still to come
-            self._count()
+            self._count(outlet, wanted=True)  # it is kept for those who are still to come
             return
 
         def matching(status: zenoh.MatchingStatus) -> None:
-            outlet.wanted = status.matching
-            self._count()
+            self._count(outlet, status.matching)
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
-        outlet.wanted = outlet.wanted or publisher.matching_status.matching
-        self._count()
+        self._count(outlet, outlet.wanted or publisher.matching_status.matching)

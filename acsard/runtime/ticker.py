@@ -13,7 +13,7 @@ from acsard.runtime.timerfd import TimerFd
 
 
 class Period(Struct, frozen=True):
-    """`expired` periods ended since the last look (0: none), the newest due at `due_ns`."""
+    """`expired` periods ended since the last look (0: none), the first of them due at `due_ns`."""
 
     expired: int
     due_ns: int
@@ -75,8 +75,9 @@ class Ticker(_Timer):
     def take(self) -> Period:
         """The periods that ended since the last call."""
         expired, self._expired = self._expired, 0
+        due_ns = self._due_ns + self._period_ns
         self._due_ns += expired * self._period_ns
-        return Period(expired, self._due_ns)
+        return Period(expired, due_ns)
 
     def _expire(self) -> None:
         self._expired += self._timer.expirations()

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from acsard.mcu.pace import IDLE_WAKES
+from acsard.messages.queries import Query
 from acsard.settings import CommandsConfig, Config, Source
+from acsard.values import Outputs
 from tests.scenarios.world import World
 
 MS = 1_000_000
@@ -39,7 +45,7 @@ def test_a_fresh_command_is_on_the_wire_at_once(world: World) -> None:
     at_ns = world.now_ns
     world.send(0.5)
     assert sent_after(world, at_ns) == [0]
-    assert world.state.linear >= 0.0
+    assert world.port.sent[-1][1] != world.port.sent[-2][1]
 
 
 def test_one_that_comes_right_after_a_line_waits_for_the_gap_and_no_longer(world: World) -> None:
@@ -90,16 +96,121 @@ def test_one_whose_command_does_not_count_pulls_no_line_forward(world: World) ->
     assert sent_after(world, at_ns) == []
 
 
-def test_a_ramp_is_as_steep_under_a_flood_as_without(world: World) -> None:
-    calm = World()
-    calm.run(0.25)
-    for one, hz in ((calm, 10.0), (world, 1000.0)):
-        one.send(0.0)
-        one.run(0.05)
-        began_ns = one.now_ns
-        one.hold(1.0, seconds=0.5, hz=hz)
-        speed = one.loop.robot._limiter.twist.linear
-        assert speed == pytest.approx((one.now_ns - began_ns) / 1e9, abs=0.025)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0.0005, 0.06),
+            st.sampled_from(["app", "teleop", "stop", "block", "stall", "deactivate"]),
+            st.floats(-1.0, 1.0),
+        ),
+        max_size=40,
+    )
+)
+@settings(max_examples=25)
+def test_no_timing_of_commands_makes_a_ramp_steeper_or_steps_more(
+    happenings: list[tuple[float, str, float]],
+) -> None:
+    world = World()
+    world.run(0.3)
+    for _ in range(2):
+        world.send(0.0)
+        world.send(0.0, source="teleop")
+        world.run(0.05)
+    steps, began_ns, heard = world.steps, world.now_ns, world.loop.robot.session.good_lines
+    lines: list[tuple[int, float]] = []
+
+    def watch(outputs: Outputs) -> None:
+        if world.port.sent and (not lines or world.port.sent[-1][0] > lines[-1][0]):
+            lines.append((world.port.sent[-1][0], abs(outputs.speeds.front_left) * 0.05))
+
+    world.watch = watch
+    for wait, what, value in happenings:
+        world.port.blocked = what == "block"
+        if what in ("app", "teleop"):
+            world.send(value, source=what)
+        elif what == "stop":
+            world.put("stop", b"")
+        elif what == "stall":
+            world.stall(abs(value) / 10)
+        elif what == "deactivate":
+            world.ask("srv/deactivate")
+        world.run(wait)
+    for (before_ns, slower), (after_ns, faster) in pairwise(lines):
+        # Of a stall no more than MAX_DT is made up for; a line rounds to 0.01 rad/s.
+        assert faster - slower <= min(after_ns - before_ns, 50 * MS) * 1e-9 + 1e-3
+    periods = (world.now_ns - began_ns) / (10 * MS)
+    heard = world.loop.robot.session.good_lines - heard
+    assert world.steps - steps <= (5 + IDLE_WAKES) * (periods + 1) + heard + len(happenings)
+
+
+def unplug(world: World) -> None:
+    world.port.unplug()
+
+
+def silence(world: World) -> None:
+    world.mcu.muted = True
+
+
+def block(world: World) -> None:
+    world.port.blocked = True
+
+
+@pytest.mark.parametrize("trouble", [unplug, silence, block])
+def test_a_flood_that_no_line_can_answer_makes_few_steps(
+    world: World, trouble: Callable[[World], None]
+) -> None:
+    world.hold(0.3, seconds=0.5, hz=1000.0)
+    trouble(world)
+    world.run(0.3)
+    steps = world.steps
+    world.hold(0.0, seconds=1.0, hz=1000.0)
+    assert world.steps - steps <= 100 * (3 + IDLE_WAKES)
+
+
+def test_after_a_stall_the_clocks_line_goes_though_one_went_at_once(world: World) -> None:
+    between_ticks(world, 6.0)
+    world.send(0.5)
+    world.stall(0.045)
+    at_ns = world.now_ns
+    world.run(0.001)
+    assert sent_after(world, at_ns) == [0]
+
+
+def test_what_makes_it_brake_goes_in_the_period_whose_line_went_ahead(world: World) -> None:
+    world.hold(0.5, seconds=1.0)
+    between_ticks(world, 5.0)
+    world.send(0.5)
+    world.run(0.001)
+    query = Query(77, "srv/deactivate", "srv/deactivate", "", b"", "", world.now_ns)
+    world.bus.queries.append(query)
+    at_ns = world.now_ns
+    world.run(0.0045)
+    assert world.state.mode == "inactive"
+    assert sent_after(world, at_ns) == [4 * MS]
+
+
+@pytest.mark.parametrize("phase_ms", [0.0, 1.7, 3.1, 4.9, 6.3, 8.8, 9.6])
+@pytest.mark.parametrize("apart_ms", [0.6, 2.2, 5.1, 9.4])
+def test_when_two_commanders_die_together_braking_starts_a_tick_after_the_timeout(
+    phase_ms: float, apart_ms: float
+) -> None:
+    world = World()
+    world.run(0.3)
+    for source in ("teleop", "nav"):
+        world.send(0.0, source=source)
+    world.run(0.05)
+    for source in ("teleop", "nav") * 20:
+        world.send(0.5, source=source)
+        world.run(0.025)
+    between_ticks(world, phase_ms)
+    world.send(0.5, source="teleop")
+    world.run(apart_ms / 1e3)
+    world.send(0.5, source="nav")
+    last_ns = world.now_ns
+    world.run(0.4)
+    full = max(at for at, line in world.port.sent if line.startswith(b"ap10.00"))
+    slower = min(at for at, line in world.port.sent if at > full)
+    assert slower - last_ns <= 260 * MS
 
 
 def test_a_repeated_command_keeps_a_robot_from_stopping_but_makes_no_line_of_its_own() -> None:
@@ -115,9 +226,7 @@ def test_what_the_daemon_says_of_itself_is_what_happened(world: World) -> None:
     world.run(1.1)
     figures = world.state.figures
     waited = figures["command_to_wire"].since_start
-    assert waited.count == 2
-    assert waited.max == pytest.approx(GAP_NS / 1000)
-    assert waited.p50 == pytest.approx((GAP_NS - 1 * MS) / 1000, rel=0.13)
+    assert waited.max == pytest.approx((GAP_NS - 1 * MS) / 1000)
     round_trip = figures["mcu_round_trip"].since_start
     assert 6_700 <= round_trip.p50 <= 10_700
     assert figures["period_lateness"].since_start.max == 0.0

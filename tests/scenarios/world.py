@@ -134,8 +134,10 @@ class World:
             lambda: self.now_ns,
         )
         self._queries = 0
-        self._rung_ns: int | None = None
-        """The last alarm that rang: each rings once."""
+        self.steps = 0
+        self._alarm_ns: int | None = None
+        self._alarm_set_ns: int | None = None
+        """As `runtime.ticker.Alarm` keeps them: when it rings, what it was last set to."""
         self._missed = 0
         self._due_ns = self.now_ns
 
@@ -150,14 +152,10 @@ class World:
             mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
             tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
             at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
-            retry_ns = self.loop.retry_ns
-            if (
-                retry_ns is not None
-                and retry_ns != self._rung_ns
-                and retry_ns <= min(at_ns, end_ns)
-            ):
-                self._rung_ns = retry_ns
-                self.now_ns = max(self.now_ns, retry_ns)
+            alarm_ns = self._alarm_ns
+            if alarm_ns is not None and alarm_ns <= min(at_ns, end_ns):
+                self._alarm_ns = None
+                self.now_ns = max(self.now_ns, alarm_ns)
                 self._wake(tick=False)
                 continue
             if at_ns > end_ns:
@@ -165,7 +163,7 @@ class World:
                 return
             self.now_ns = max(self.now_ns, at_ns)
             if tick:
-                self._due_ns = self.next_tick_ns
+                self._due_ns = self.next_tick_ns - self._missed * self.period_ns
                 self.next_tick_ns += self.period_ns
                 self._wake(tick=True)
             elif self.port.mcu is not None:
@@ -188,6 +186,11 @@ class World:
         missed = self._missed if tick else 0
         self._missed -= missed
         outputs = self.loop.wake(self.instant, tick, missed, self.now_ns - self._due_ns)
+        self.steps += 1
+        retry_ns = self.loop.retry_ns
+        if retry_ns is not None and retry_ns != self._alarm_set_ns:
+            self._alarm_ns = retry_ns
+        self._alarm_set_ns = retry_ns
         self.watch(outputs)
 
     # what people do
@@ -203,7 +206,7 @@ class World:
         self.bus.arrivals.append(
             Arrival(key, put, payload, "", self.now_ns, stamp_ns, "peer" if stamp_ns else "")
         )
-        if self.bus.alerted:
+        if self.bus.alerted or key == "stop":
             self.bus.alerted = False
             self._wake(tick=False)
 

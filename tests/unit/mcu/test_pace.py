@@ -11,89 +11,135 @@ from acsard.mcu.pace import BREATH_NS, IDLE_WAKES, Pace
 
 MS = 1_000_000
 WIRE_NS = 3 * MS
+PERIOD_NS = 10 * MS
 GAP_NS = WIRE_NS + BREATH_NS
 
 
-def ticked(at_ns: int = 0) -> Pace:
-    """After the line of a period at `at_ns`."""
-    pace = Pace(WIRE_NS)
-    assert pace.tick()
-    pace.note(at_ns, True, True, False, False)
-    return pace
+class Paced:
+    """A pace, and what a control loop tells it."""
+
+    def __init__(self, period_ns: int = PERIOD_NS) -> None:
+        self.pace = Pace(WIRE_NS, period_ns)
+
+    def ticks(self, at_ns: int, missed: int = 0) -> bool:
+        """A period without news; whether its line went."""
+        due = self.pace.tick(missed)
+        self.pace.note(due, due, at_ns if due else None, False, False)
+        return due
+
+    def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
+        """A command between two periods; whether a line for it was tried."""
+        due = news and self.pace.at_once(at_ns)
+        self.pace.note(False, due, at_ns if due and goes else None, news, True)
+        return due
+
+
+def ticked() -> Paced:
+    """After the line of a period at 0."""
+    paced = Paced()
+    assert paced.ticks(0)
+    return paced
 
 
 def test_every_period_has_its_line() -> None:
-    pace = Pace(WIRE_NS)
-    for number in range(5):
-        assert pace.tick()
-        pace.note(number * 10 * MS, True, True, False, False)
+    paced = Paced()
+    assert all(paced.ticks(number * PERIOD_NS) for number in range(5))
 
 
 def test_a_line_at_once_keeps_the_gap() -> None:
-    pace = ticked()
-    assert not pace.at_once(GAP_NS - 1)
-    assert pace.at_once(GAP_NS)
+    paced = ticked()
+    assert not paced.pace.at_once(GAP_NS - 1)
+    assert paced.pace.at_once(GAP_NS)
+
+
+def test_the_gap_counts_from_when_the_line_left() -> None:
+    paced = Paced()
+    paced.pace.tick(0)
+    paced.pace.note(True, True, 2 * MS, False, False)
+    assert not paced.pace.at_once(2 * MS + GAP_NS - 1)
+    assert paced.pace.at_once(2 * MS + GAP_NS)
 
 
 def test_a_line_at_once_takes_the_next_periods_place() -> None:
-    pace = ticked()
-    pace.note(6 * MS, False, True, True, False)
-    assert not pace.at_once(9 * MS), "only one"
-    assert not pace.tick()
-    pace.note(10 * MS, False, False, False, False)
-    assert pace.tick()
+    paced = ticked()
+    assert paced.hears(6 * MS)
+    assert not paced.hears(9 * MS), "only one"
+    assert not paced.ticks(10 * MS)
+    assert paced.ticks(20 * MS)
+
+
+def test_after_missed_periods_the_clocks_line_goes_in_any_case() -> None:
+    paced = ticked()
+    assert paced.hears(6 * MS)
+    assert paced.ticks(50 * MS, missed=4)
+
+
+def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
+    paced = ticked()
+    assert paced.hears(6 * MS, goes=False)
+    assert not paced.hears(7 * MS), "one try a period"
+    assert paced.pace.retry_ns is None
+    assert not paced.pace.listens
+    assert paced.ticks(10 * MS)
+    assert paced.pace.listens
 
 
 def test_what_comes_too_soon_is_sent_as_soon_as_the_gap_has_passed() -> None:
-    pace = ticked()
-    pace.note(1 * MS, False, False, True, False)
-    assert pace.retry_ns == GAP_NS
-    assert not pace.listens, "it is awake for the newest command anyway"
+    paced = ticked()
+    assert not paced.hears(1 * MS)
+    assert paced.pace.retry_ns == GAP_NS
+    assert not paced.pace.listens, "it is awake for the newest command anyway"
+    assert paced.hears(GAP_NS)
+    assert paced.pace.retry_ns is None
 
 
 def test_there_is_nothing_to_retry_without_news() -> None:
-    pace = ticked()
-    pace.note(1 * MS, False, False, False, False)
-    assert pace.retry_ns is None
-    assert pace.listens
+    paced = ticked()
+    paced.hears(1 * MS, news=False)
+    assert paced.pace.retry_ns is None
+    assert paced.pace.listens
 
 
 def test_a_stranger_wakes_it_only_so_often_a_period() -> None:
-    pace = ticked()
+    paced = ticked()
     for _ in range(IDLE_WAKES):
-        pace.note(5 * MS, False, False, False, True)
-        assert pace.listens
-    pace.note(5 * MS, False, False, False, True)
-    assert not pace.listens
-    pace.tick()
-    pace.note(10 * MS, True, True, False, False)
-    assert pace.listens
+        paced.hears(5 * MS, news=False)
+        assert paced.pace.listens
+    paced.hears(5 * MS, news=False)
+    assert not paced.pace.listens
+    paced.ticks(10 * MS)
+    assert paced.pace.listens
 
 
 def test_the_line_before_the_first_is_long_ago() -> None:
-    assert Pace(WIRE_NS).at_once(0)
+    assert Paced().pace.at_once(0)
 
 
-@given(st.lists(st.tuples(st.integers(1, 12), st.booleans()), max_size=200))
+def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken() -> None:
+    paced = Paced(period_ns=GAP_NS)
+    paced.ticks(0)
+    assert not paced.pace.listens
+    assert not paced.hears(GAP_NS)
+    assert paced.pace.retry_ns is None
+
+
+@given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))
 def test_no_traffic_makes_more_lines_than_the_clock_or_closer_ones(
-    wakes: list[tuple[int, bool]],
+    wakes: list[tuple[int, bool, bool]],
 ) -> None:
-    pace, now_ns, due_ns = Pace(WIRE_NS), 0, 10 * MS
-    periods = 0
+    pace, now_ns, due_ns, periods = Pace(WIRE_NS, PERIOD_NS), 0, PERIOD_NS, 0
     lines: list[int] = []
-    for wait_ms, news in wakes:
+    for wait_ms, news, blocked in wakes:
         now_ns += wait_ms * MS
-        tick = now_ns >= due_ns
-        if tick:
-            periods += 1
-            due_ns += 10 * MS * (1 + (now_ns - due_ns) // (10 * MS))
-        own = tick and pace.tick()
-        sent = (own and (not lines or now_ns - lines[-1] >= WIRE_NS)) or (
-            news and pace.at_once(now_ns)
-        )
-        pace.note(now_ns, own, sent, news, False)
-        if sent:
-            lines.append(now_ns)
+        expired = max(0, (now_ns - due_ns) // PERIOD_NS + 1)
+        due_ns += expired * PERIOD_NS
+        periods += expired
+        tick = expired > 0 and pace.tick(expired - 1)
+        due = tick or (news and pace.at_once(now_ns))
+        sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)
+        pace.note(tick, due, now_ns if sent else None, news, news)
+        lines += [now_ns] * sent
+        retry_ns = pace.retry_ns
+        assert retry_ns is None or retry_ns > now_ns
     assert len(lines) <= periods + 1
-    gaps = [after - before for before, after in pairwise(lines)]
-    assert all(gap >= WIRE_NS for gap in gaps)
+    assert all(after - before >= WIRE_NS for before, after in pairwise(lines))
