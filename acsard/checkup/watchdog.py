@@ -1,0 +1,250 @@
+"""The microcontroller's own last safety: how long after the last line it stops the motors.
+
+Measured by going silent at speed. One that sends counts tells how far the motors ran; one that
+reports by its own clock is watched; any other is asked after silences of different lengths whether
+it was still turning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from acsard.checkup import counts
+from acsard.checkup.bench import REST_S, SPEED, ZERO, Bench, Reply
+from acsard.checkup.findings import LETTERS, Finding, Stopped
+from acsard.checkup.turning import run_up
+from acsard.mcu.frames import Motors
+from acsard.mcu.wire import FIELD
+from acsard.values import NS_PER_S
+
+CONTRACT_S = 0.3
+LEAST_S, MOST_S = 0.1, 0.5
+"""What the MCU contract takes."""
+
+LONGEST_S = 2.5
+"""The longest silence; an MCU that drives on for so long has no watchdog."""
+
+FIRST_S = 0.8
+"""The first silence: longer than any watchdog that is right, and a motor's run-out."""
+
+FINE_S = 0.03
+"""How finely it is found by asking."""
+
+QUICK_S = 0.012
+"""Between the two lines that ask: the second reply's speed is of this time."""
+
+UNKNOWN = math.inf
+
+
+class Silence(Struct, frozen=True):
+    """How long the motors ran on after the last line: between these, in s."""
+
+    least: float
+    most: float
+
+
+def finding(bench: Bench, motors: Sequence[int]) -> Finding:
+    """Measure it with these motors, which turn as told; they stand again afterwards."""
+    name = "watchdog"
+    if not motors:
+        return Finding(name, "SKIPPED", "", "no motor turns as told, so none can show it")
+    measure = _asked
+    if bench.own_clock:
+        measure = _watched
+    elif bench.sampled and _fits(bench, motors):
+        measure = _counted
+    found = measure(bench, motors)
+    if found.most == UNKNOWN:
+        return Finding(
+            name,
+            "FAIL",
+            f"none within {found.least:.1f} s",
+            "the motors run on when the host falls silent: a pulled cable or a hung computer "
+            "leaves the robot driving",
+            "the firmware must stop the motors 300 ms after the last valid line",
+        )
+    middle, half = (found.least + found.most) / 2, (found.most - found.least) / 2
+    figure = f"{middle * 1000:.0f} ms"
+    if half >= 0.005:
+        figure += f" ± {half * 1000:.0f}"
+    if found.least > MOST_S:
+        return Finding(
+            name,
+            "FAIL",
+            figure,
+            f"the robot drives on for {middle:.1f} s after a pulled cable: at 1 m/s as many metres",
+            f"set the firmware's watchdog to {CONTRACT_S * 1000:.0f} ms",
+        )
+    if found.most < LEAST_S:
+        text = "so short that a host that is late once stops the robot"
+        return Finding(name, "WARN", figure, text, "set the firmware's watchdog to 300 ms")
+    return Finding(name, "PASS", figure, f"contract {CONTRACT_S * 1000:.0f} ms")
+
+
+def _command(motors: Sequence[int]) -> Motors:
+    a, b, c, d = (SPEED if motor in motors else 0.0 for motor in range(4))
+    return a, b, c, d
+
+
+def _fast(reply: Reply, motors: Sequence[int]) -> bool:
+    """Some motor still turns at more than half its speed."""
+    return any(abs(reply.motors[motor]) > SPEED / 2 for motor in motors)
+
+
+def _at_speed(bench: Bench, motors: Sequence[int]) -> int:
+    """Bring the motors to speed; when the last line went."""
+    run_up(bench, _command(motors))
+    if not bench.replies or not _fast(bench.replies[-1], motors):
+        bench.rest()
+        names = ", ".join(LETTERS[motor] for motor in motors)
+        text = f"motors {names} turned one by one, but not together: does the supply give in?"
+        raise Stopped(Finding("watchdog", "FAIL", "", text, "measure the supply under load"))
+    return bench.sent_ns
+
+
+def _run_out(bench: Bench, motors: Sequence[int]) -> float:
+    """How long the motors stay above half their speed after an ordinary stop, s."""
+    began_ns = _at_speed(bench, motors)
+    bench.send(ZERO)
+    began_ns = bench.sent_ns
+    while bench.wire.now_ns() - began_ns < REST_S * NS_PER_S:
+        got = bench.listen(max(QUICK_S, bench.period_s if bench.period_s > 0.02 else 0.0))
+        slow = [reply for reply in got if not _fast(reply, motors)]
+        if slow:
+            bench.rest()
+            return (slow[0].at_ns - began_ns) / NS_PER_S
+        bench.send(ZERO)
+    bench.rest()
+    return REST_S
+
+
+def _asked(bench: Bench, motors: Sequence[int]) -> Silence:
+    """Silences of different lengths, halved in on the one after which the motors just stand."""
+    run_out_s = _run_out(bench, motors)
+    least, most = 0.0, UNKNOWN
+
+    def try_one(length_s: float) -> None:
+        nonlocal least, most
+        silent_s, turns = _ask(bench, motors, length_s)
+        if turns:
+            least = max(least, silent_s)
+        else:
+            most = min(most, silent_s)
+
+    for length_s in (FIRST_S + run_out_s, LONGEST_S):
+        try_one(length_s)
+        if most < UNKNOWN:
+            break
+    else:
+        return Silence(least, UNKNOWN)
+    for _ in range(8):
+        if most - least <= max(FINE_S, 0.1 * most):
+            break
+        try_one((least + most) / 2)
+    # The reply that tells is of a moment after the silence, as the run-out's is.
+    least, most = least - run_out_s + QUICK_S, most - run_out_s + 2 * QUICK_S
+    return Silence(max(0.0, least), max(0.0, most))
+
+
+def _ask(bench: Bench, motors: Sequence[int], length_s: float) -> tuple[float, bool]:
+    """How long the silence was in the end, and whether the motors still turned after it."""
+    last_ns = _at_speed(bench, motors)
+    bench.listen(length_s - (bench.wire.now_ns() - last_ns) / NS_PER_S)
+    before = len(bench.replies)
+    bench.send(ZERO)
+    silent_s = (bench.sent_ns - last_ns) / NS_PER_S
+    bench.listen(max(QUICK_S, bench.period_s if bench.period_s > 0.02 else 0.0))
+    for _ in range(10):
+        bench.send(ZERO)
+        bench.listen(bench.period_s)
+        if len(bench.replies) >= before + 2:
+            break
+    # The first reply may be of the whole silence; the second is of the moment after it.
+    turns = any(_fast(reply, motors) for reply in bench.replies[before + 1 : before + 2])
+    bench.rest()
+    return silent_s, turns
+
+
+def _watched(bench: Bench, motors: Sequence[int]) -> Silence:
+    """It reports by itself: how far its speeds say the motors ran, less their run-out."""
+    _at_speed(bench, motors)
+    bench.send(ZERO)
+    began_ns = bench.sent_ns
+    bench.rest()
+    ran_out_s = _covered(bench, motors, began_ns)
+    last_ns = _at_speed(bench, motors)
+    while bench.wire.now_ns() - last_ns < LONGEST_S * NS_PER_S:
+        bench.listen(0.02)
+        if bench.standing(last_ns):
+            break
+    still = bool(bench.replies) and _fast(bench.replies[-1], motors)
+    ran_s = _covered(bench, motors, last_ns)
+    bench.rest()
+    if still:
+        return Silence(LONGEST_S, UNKNOWN)
+    time_s = max(0.0, ran_s - ran_out_s)
+    return Silence(max(0.0, time_s - bench.gap_s / 2), time_s + bench.gap_s / 2)
+
+
+def _covered(bench: Bench, motors: Sequence[int], since_ns: int) -> float:
+    """How long at full speed the motors ran since then, as the replies' speeds say, s."""
+    ran = [0.0] * 4
+    before_ns = since_ns
+    for reply in (reply for reply in bench.replies if reply.at_ns > since_ns):
+        for motor in motors:
+            share = abs(reply.motors[motor]) / SPEED
+            ran[motor] += share * (reply.at_ns - before_ns) / NS_PER_S
+        before_ns = reply.at_ns
+    return max(ran)
+
+
+# by the encoders' counts
+
+
+def _fits(bench: Bench, motors: Sequence[int]) -> bool:
+    """The longest silence's counts do not wrap."""
+    per_turn = counts.per_turn(bench.replies, motors)
+    return per_turn is not None and per_turn * 2 * SPEED * LONGEST_S / math.tau < FIELD / 2
+
+
+def _counted(bench: Bench, motors: Sequence[int]) -> Silence:
+    """It sends counts: how far the motors ran in the silence, at their speed, less their run-out."""
+    ran_out_ms = _ran(bench, motors, 0.0)
+    for length_s in (FIRST_S, LONGEST_S):
+        ran_ms = _ran(bench, motors, length_s)
+        still = ran_ms - ran_out_ms > 0.95 * length_s * 1000
+        if not still:
+            time_s = max(0.0, ran_ms - ran_out_ms) / 1000
+            return Silence(time_s, time_s)
+    return Silence(LONGEST_S, UNKNOWN)
+
+
+def _ran(bench: Bench, motors: Sequence[int], length_s: float) -> float:
+    """How long the motors ran after the last line before a silence, their run-out with it, in ms
+    at full speed: the one that ran the longest."""
+    last_ns = _at_speed(bench, motors)
+    bench.listen(max(0.0, 0.03 - (bench.wire.now_ns() - last_ns) / NS_PER_S))
+    at_speed = bench.replies[-6:]
+    if length_s:
+        bench.listen(length_s - (bench.wire.now_ns() - last_ns) / NS_PER_S)
+    before, zeros_ns = len(bench.replies), bench.wire.now_ns()
+    bench.rest()
+    after = bench.replies[before:]
+    start_ns, start = (last_ns, at_speed[-1]) if length_s else (zeros_ns, at_speed[-1])
+    if not length_s and start.at_ns > last_ns:
+        # The first zero's own reading is to hand: all counts from it on are run-out.
+        start, start_ns = after[0], 0
+    full_ms = max(0.0, (start_ns - start.at_ns) / 1e6)
+    return max(_ran_ms(at_speed, [start, *after], motor) for motor in motors) - full_ms
+
+
+def _ran_ms(at_speed: Sequence[Reply], course: Sequence[Reply], motor: int) -> float:
+    made = list(counts.legs(at_speed))
+    ms = sum(leg.ms for leg in made)
+    turned = sum(leg.counts[motor] for leg in made)
+    ran = sum(leg.counts[motor] for leg in counts.legs(course))
+    return ran / turned * ms if turned else 0.0
+
