@@ -13,7 +13,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.checkup.findings import LETTERS, Finding, Stopped, WireLost, motor_name
+from acsard.checkup.findings import LETTERS, Finding, StoppedError, WireLostError, motor_name
 from acsard.checkup.outside import Wire
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, Reading, seal, unseal
 from acsard.mcu.frames import Codec, FrameError, Motors
@@ -108,7 +108,7 @@ class Bench:
             for _ in range(FAREWELL):
                 self.zeros()
                 self.wire.listen(self.wire.now_ns() + int(2 * self.period_s * NS_PER_S))
-        except WireLost:
+        except WireLostError:
             pass  # nothing reaches the motors any more; the MCU's own watchdog has to
         finally:
             self.wire.close()
@@ -234,7 +234,7 @@ class Bench:
         self.comma = not self.comma
         self.zeros()
         names = ", ".join(motor_name(self.mcu, motor) for motor in turning) or "something"
-        raise Stopped(
+        raise StoppedError(
             Finding(
                 "stop",
                 "FAIL",
@@ -262,7 +262,7 @@ class Bench:
             asked = self._commanded[motor]
             self.zeros()
             against = asked * speed < 0
-            raise Stopped(
+            raise StoppedError(
                 Finding(
                     "runaway",
                     "FAIL",
@@ -289,7 +289,7 @@ class Bench:
             return
         self.zeros()
         asked = [motor_name(self.mcu, m) for m, speed in enumerate(self._commanded) if speed]
-        raise Stopped(
+        raise StoppedError(
             Finding(
                 "link",
                 "FAIL",

@@ -87,7 +87,9 @@ def finding(bench: Bench, motors: Sequence[int]) -> Finding:
     if abs(measured - stated) <= AGREES * stated:
         return _stated(bench, stated, f"by its identification; measured {measured:.0f}")
     text = f"it names {stated} per turn, but by its speeds there are {measured:.0f}"
-    return Finding(name, "FAIL", f"{measured:.0f}", text, "the firmware's counts per turn or speeds")
+    return Finding(
+        name, "FAIL", f"{measured:.0f}", text, "the firmware's counts per turn or speeds"
+    )
 
 
 def _stated(bench: Bench, counts: int, text: str) -> Finding:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from itertools import pairwise
-from statistics import median
+from statistics import fmean, median
 from typing import get_args
 
 from acsard.checkup.bench import PERIOD_S, ZERO, Bench, Reply
-from acsard.checkup.findings import Finding, Stopped
+from acsard.checkup.findings import Finding, StoppedError
 from acsard.mcu.session import IDENTITY
 from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.settings import Baud
@@ -61,7 +61,7 @@ def baud(bench: Bench) -> Finding:
                 {"mcu.baud_rate": rate},
             )
     bench.open(configured)
-    raise Stopped(
+    raise StoppedError(
         Finding(
             "baud rate",
             "FAIL",
@@ -101,7 +101,7 @@ def identity(bench: Bench) -> Finding:
             bench.identity = dict(w.split("=", 1) for w in text.split()[2:] if "=" in w)
             return Finding("identification", "PASS", " ".join(text.split()[:2]), text)
     if b"?" in bench.others:
-        raise Stopped(
+        raise StoppedError(
             Finding(
                 "identification",
                 "FAIL",
@@ -174,7 +174,7 @@ def pace(bench: Bench) -> Iterator[Finding]:
     if len(replies) < 10:
         replies += bench.drive(ZERO, 1.0, period_s=period_s)
     gaps = [(b.at_ns - a.at_ns) / NS_PER_S for a, b in pairwise(replies)]
-    bench.gap_s = median(gaps or [0.0])
+    bench.gap_s = fmean(gaps or [0.0])
     yield _rate(bench, period_s, max(gaps or [0.0]))
     yield _trip(bench)
 

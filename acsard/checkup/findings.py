@@ -26,10 +26,10 @@ class Finding(Struct, frozen=True):
     figure: str = ""
     text: str = ""
     mend: str = ""
-    keys: dict[str, object] = {}  # noqa: RUF012 - msgspec copies it for each
+    keys: dict[str, object] = {}
 
 
-class Stopped(AcsardError):
+class StoppedError(AcsardError):
     """The check must end here; `finding` is why."""
 
     def __init__(self, finding: Finding) -> None:
@@ -37,7 +37,7 @@ class Stopped(AcsardError):
         self.finding = finding
 
 
-class WireLost(AcsardError):
+class WireLostError(AcsardError):
     """The line is gone: unplugged, or its driver has hung."""
 
 

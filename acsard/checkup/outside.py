@@ -19,10 +19,10 @@ class Wire(Protocol):
         """The monotonic time."""
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the line now; raises `WireLost`."""
+        """Put bytes on the line now; raises `WireLostError`."""
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Wait until then; what came, in pieces with their times. Raises `WireLost`."""
+        """Wait until then; what came, in pieces with their times. Raises `WireLostError`."""
 
 
 class Operator(Protocol):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from acsard.checkup import counts, damage, dialect, watchdog
 from acsard.checkup.bench import Bench
-from acsard.checkup.findings import Finding, Stopped, WireLost
+from acsard.checkup.findings import Finding, StoppedError, WireLostError
 from acsard.checkup.outside import Operator, Wire
 from acsard.checkup.turning import channels, comma_needed
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
@@ -45,12 +45,12 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             bench.open(config.mcu.baud_rate)
             bench.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
-                raise Stopped(Finding("wheels", "SKIPPED", "", "not confirmed to be lifted"))
+                raise StoppedError(Finding("wheels", "SKIPPED", "", "not confirmed to be lifted"))
             _steps(bench, operator, also)
-    except Stopped as end:
+    except StoppedError as end:
         also(end.finding)
         why = f"the check ended early: {end.finding.name}"
-    except WireLost as lost:
+    except WireLostError as lost:
         also(Finding("serial line", "FAIL", "lost", str(lost), "a loose plug? `dmesg | tail`"))
         why = "the check ended early: the serial line was lost"
     else:

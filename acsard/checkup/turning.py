@@ -27,6 +27,7 @@ STALL_S = 0.15
 
 ANSWERS = {"fr": 0, "fl": 1, "rl": 2, "rr": 3}
 
+
 def one(motor: int, speed: float) -> Motors:
     """The command that turns one motor only."""
     a, b, c, d = (speed if index == motor else 0.0 for index in range(4))

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from acsard.checkup import counts
 from acsard.checkup.bench import REST_S, SPEED, ZERO, Bench, Reply
-from acsard.checkup.findings import LETTERS, Finding, Stopped
+from acsard.checkup.findings import LETTERS, Finding, StoppedError
 from acsard.checkup.turning import run_up
 from acsard.mcu.frames import Motors
 from acsard.mcu.wire import FIELD
@@ -101,7 +101,7 @@ def _at_speed(bench: Bench, motors: Sequence[int]) -> int:
         bench.rest()
         names = ", ".join(LETTERS[motor] for motor in motors)
         text = f"motors {names} turned one by one, but not together: does the supply give in?"
-        raise Stopped(Finding("watchdog", "FAIL", "", text, "measure the supply under load"))
+        raise StoppedError(Finding("watchdog", "FAIL", "", text, "measure the supply under load"))
     return bench.sent_ns
 
 
@@ -211,7 +211,7 @@ def _fits(bench: Bench, motors: Sequence[int]) -> bool:
 
 
 def _counted(bench: Bench, motors: Sequence[int]) -> Silence:
-    """It sends counts: how far the motors ran in the silence, at their speed, less their run-out."""
+    """It sends counts: how far the motors ran in the silence, less their run-out."""
     ran_out_ms = _ran(bench, motors, 0.0)
     for length_s in (FIRST_S, LONGEST_S):
         ran_ms = _ran(bench, motors, length_s)
@@ -247,4 +247,3 @@ def _ran_ms(at_speed: Sequence[Reply], course: Sequence[Reply], motor: int) -> f
     turned = sum(leg.counts[motor] for leg in made)
     ran = sum(leg.counts[motor] for leg in counts.legs(course))
     return ran / turned * ms if turned else 0.0
-

@@ -123,7 +123,9 @@ def _explain_reversed(mcu: McuConfig, channel: Channel) -> tuple[str, str]:
     text = f"encoder {letter} counts against motor {letter}; no configuration mends that"
     wheel, sign = wheel_of(mcu, channel.motor)
     if channel.wheel is None or channel.wheel == 4 or WHEELS[channel.wheel] != wheel:
-        mend = f"swap the two leads of motor {letter} if the wheel turns the wrong way, else A and B"
+        mend = (
+            f"swap the two leads of motor {letter} if the wheel turns the wrong way, else A and B"
+        )
         return text, f"{mend} of encoder {letter}"
     if channel.forward == (sign > 0):
         return text, f"the motor is right: swap A and B of encoder {letter}"

@@ -21,6 +21,7 @@ from acsard.cli import (
     echo,
     hz,
     lan,
+    mcu,
     ports,
     run,
     service,
@@ -30,11 +31,11 @@ from acsard.cli import (
 )
 from acsard.runtime.exits import Exit, ExitError
 
-VERBS = (run, sim, check, topics, echo, hz, top, drive, call, doctor, ports, lan, service)
+VERBS = (run, sim, check, topics, echo, hz, top, drive, call, doctor, ports, mcu, lan, service)
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 usage, 69 daemon unreachable, 75 port, bus address
-or robot id in use, 77 no permission, 78 bad configuration
+exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
+bus address or robot id in use, 77 no permission, 78 bad configuration
 
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)

@@ -117,7 +117,10 @@ async def _play(config: object, args: argparse.Namespace) -> int:
                 _reset_again(mcu, values[0])
             else:
                 kinds = ARGUMENTS.get(name, "")
-                whole = [int(v) if v.is_integer() or k == "m" else v for k, v in zip(kinds, values, strict=True)]
+                whole = [
+                    int(v) if v.is_integer() or k == "m" else v
+                    for k, v in zip(kinds, values, strict=True)
+                ]
                 stack.enter_context(getattr(mcu, name)(*whole))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:

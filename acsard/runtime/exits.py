@@ -11,6 +11,7 @@ class Exit(IntEnum):
     OK = 0
     FAILURE = 1
     USAGE = 2
+    NO_PORT = 66
     UNREACHABLE = 69
     IN_USE = 75
     NO_PERMISSION = 77

@@ -159,14 +159,19 @@ class FakeMcu(Faults):
 
     def _name_itself(self, now_ns: int) -> None:
         if self.understand is protocol.whole:
-            self._send(now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples))
+            self._send(
+                now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
+            )
 
     def _reply(self, now_ns: int, command: protocol.Command) -> None:
         if self.muted or now_ns - self._replied_ns < self.reply_gap_ns:
             return
         self._replied_ns = now_ns
         comma, end = self.ending[:-2].encode(), self.ending[-2:].encode()
-        text = protocol.speeds_text(self._speeds(now_ns), self.separator, self.unpadded_replies) + comma
+        text = (
+            protocol.speeds_text(self._speeds(now_ns), self.separator, self.unpadded_replies)
+            + comma
+        )
         if command.sequence:
             sample = self._sample() if command.wants_sample and self.samples else ()
             text += protocol.suffix(text, command.sequence, sample)
@@ -215,7 +220,9 @@ class FakeMcu(Faults):
         period_ns = int(period_s * NS_PER_S)
         clock = b"clock %d" % next(self._order)  # a new one: an older one's events go unheeded
         self._schedule(self._now_ns + period_ns, "report", clock)
-        with self._with(unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"):
+        with self._with(
+            unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"
+        ):
             yield
 
 
