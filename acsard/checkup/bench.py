@@ -197,6 +197,11 @@ class Bench:
             self._present()
         return got
 
+    def begin(self) -> None:
+        """Motors are to turn from here on: what was before it, a question say, does not count."""
+        self._excused_ns = self.sent_ns = self.wire.now_ns()
+        self.longest_pause_s = 0.0
+
     def until(self, done: Callable[[], bool], seconds: float) -> bool:
         """Zeros in the form in force until `done`; False when it is not in so many seconds."""
         end_ns = self.wire.now_ns() + int(seconds * NS_PER_S)

@@ -22,6 +22,11 @@ HOLD_S = 1.4
 DEAD_S = 0.6
 """A motor that shows nothing by then is not held longer: its control loop may be winding up."""
 
+CHUNKS = 8
+"""Over so many tenths of a second the speed of an encoder is taken that is not steady before."""
+
+UNSEEN_S = 0.5
+
 STALL_S = 0.15
 """A pause of ours this long makes what was measured worthless: it is measured again."""
 
@@ -36,31 +41,33 @@ def one(motor: int, speed: float) -> Motors:
 
 def turn(bench: Bench, motor: int, speed: float) -> Motors:
     """Turn a motor for a moment and let it come to rest; each encoder's speed meanwhile."""
-    for _ in range(2):
-        bench.longest_pause_s, bench.sent_ns = 0.0, bench.wire.now_ns()
+    means = run_up(bench, one(motor, speed))
+    if bench.longest_pause_s >= STALL_S:
+        bench.rest()
         means = run_up(bench, one(motor, speed))
-        if bench.longest_pause_s < STALL_S:
-            break
     return means
 
 
 def run_up(bench: Bench, motors: Motors) -> Motors:
     """Ramp up and hold until the encoders show a steady speed; what they show."""
+    bench.begin()
     steps = max(1, int(RAMP_S / bench.period_s))
     for step in range(steps):
         share = (step + 1) / steps
         a, b, c, d = (round(speed * share, 2) for speed in motors)
         bench.drive((a, b, c, d), bench.period_s)
     chunk_s = max(0.1, 2.5 * bench.gap_s)
-    held, steady, means = 0.0, 0, ZERO
-    while held < HOLD_S and steady < 2:
-        means = mean(bench.drive(motors, chunk_s))
-        held += chunk_s
+    steady, means = 0, ZERO
+    chunks: list[Sequence[Reply]] = []
+    while len(chunks) * chunk_s < HOLD_S and steady < 2:
+        chunks.append(bench.drive(motors, chunk_s))
+        # A coarse encoder needs more of them, a quick one is seen to be steady before.
+        means = mean([reply for chunk in chunks[1:][-CHUNKS:] or chunks for reply in chunk])
         moves = moving(means)
         near = [m for m in moves if abs(abs(means[m]) / SPEED - 1) < 0.4 * TOLERANCE]
         asked = sum(1 for speed in motors if speed)
         steady = steady + 1 if len(near) >= asked else 0
-        if held >= DEAD_S and not moves:
+        if len(chunks) * chunk_s >= DEAD_S and not moves:
             break
     return means
 
@@ -91,10 +98,18 @@ def channels(bench: Bench, operator: Operator) -> Iterator[tuple[Channel, Findin
 
 def _both_ways(bench: Bench, motor: int) -> tuple[Channel, Literal["rest", "comma"]]:
     forth = turn(bench, motor, SPEED)
-    stopped = bench.rest()
+    stopped = _rest(bench, motor, forth)
     back = turn(bench, motor, -SPEED)
-    stopped = "comma" if "comma" in (bench.rest(), stopped) else "rest"
+    stopped = "comma" if "comma" in (_rest(bench, motor, back), stopped) else "rest"
     return Channel(motor, forth, back), stopped
+
+
+def _rest(bench: Bench, motor: int, seen: Motors) -> Literal["rest", "comma"]:
+    """Come to rest; a motor whose encoder shows nothing is given the time for it unseen."""
+    stopped = bench.rest()
+    if motor not in moving(seen):
+        bench.drive(ZERO, UNSEEN_S)
+    return stopped
 
 
 def _with_other_comma(bench: Bench, dead: Channel) -> tuple[Channel, Finding]:
@@ -104,7 +119,7 @@ def _with_other_comma(bench: Bench, dead: Channel) -> tuple[Channel, Finding]:
     if not moving(forth):
         bench.rest()
         bench.comma = not bench.comma
-        bench.rest()
+        _rest(bench, dead.motor, forth)
         text = "motor d shows nothing either way: it cannot be told"
         return dead, Finding("trailing comma", "SKIPPED", "", text)
     if bench.comma:

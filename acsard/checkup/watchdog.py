@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from acsard.checkup import counts
-from acsard.checkup.bench import REST_S, SPEED, ZERO, Bench, Reply
+from acsard.checkup.bench import PERIOD_S, REST_S, SPEED, ZERO, Bench, Reply
 from acsard.checkup.findings import LETTERS, Finding, StoppedError
 from acsard.checkup.turning import run_up
 from acsard.mcu.frames import Motors
@@ -35,6 +35,9 @@ FINE_S = 0.03
 
 QUICK_S = 0.012
 """Between the two lines that ask: the second reply's speed is of this time."""
+
+TURNING, STOPPED = 0.9, 0.1
+"""Shares of the full speed: from here on it has not slowed down; below, it stands."""
 
 UNKNOWN = math.inf
 
@@ -91,7 +94,7 @@ def _command(motors: Sequence[int]) -> Motors:
 
 def _fast(reply: Reply, motors: Sequence[int]) -> bool:
     """Some motor still turns at more than half its speed."""
-    return any(abs(reply.motors[motor]) > SPEED / 2 for motor in motors)
+    return _share(reply, motors) > 0.5
 
 
 def _at_speed(bench: Bench, motors: Sequence[int]) -> int:
@@ -105,67 +108,98 @@ def _at_speed(bench: Bench, motors: Sequence[int]) -> int:
     return bench.sent_ns
 
 
-def _run_out(bench: Bench, motors: Sequence[int]) -> float:
-    """How long the motors stay above half their speed after an ordinary stop, s."""
-    began_ns = _at_speed(bench, motors)
-    bench.send(ZERO)
-    began_ns = bench.sent_ns
-    while bench.wire.now_ns() - began_ns < REST_S * NS_PER_S:
-        got = bench.listen(max(QUICK_S, bench.period_s if bench.period_s > 0.02 else 0.0))
-        slow = [reply for reply in got if not _fast(reply, motors)]
-        if slow:
-            bench.rest()
-            return (slow[0].at_ns - began_ns) / NS_PER_S
-        bench.send(ZERO)
-    bench.rest()
-    return REST_S
+class Answer(Struct, frozen=True):
+    """What the two lines after a silence of `silent_s` told, in shares of the full speed."""
+
+    silent_s: float
+    first: float
+    """Of the whole silence where the firmware takes speeds from one line to the next; of the
+    moment where it measures by its own clock."""
+    second: float
+    """Of the moment after; a quick motor has obeyed the first zero by then."""
+
+    @property
+    def turned(self) -> bool:
+        """The motors had not stopped by themselves."""
+        return self.first >= TURNING or self.second >= STOPPED
 
 
 def _asked(bench: Bench, motors: Sequence[int]) -> Silence:
-    """Silences of different lengths, halved in on the one after which the motors just stand."""
-    run_out_s = _run_out(bench, motors)
+    """It answers when spoken to: after a silence two quick lines tell what it did meanwhile."""
+    stop = _stop(bench, motors)
     least, most = 0.0, UNKNOWN
-
-    def try_one(length_s: float) -> None:
-        nonlocal least, most
-        silent_s, turns = _ask(bench, motors, length_s)
-        if turns:
-            least = max(least, silent_s)
-        else:
-            most = min(most, silent_s)
-
-    for length_s in (FIRST_S + run_out_s, LONGEST_S):
-        try_one(length_s)
-        if most < UNKNOWN:
+    for length_s in (FIRST_S + stop.slow_s, LONGEST_S):
+        answer = _ask(bench, motors, length_s)
+        if not answer.turned:
+            most = answer.silent_s
             break
+        least = answer.silent_s
     else:
         return Silence(least, UNKNOWN)
+    if answer.first >= STOPPED:
+        # The mean over the silence: how far it ran, less what it runs out after any stop.
+        ran_s = answer.first * answer.silent_s - stop.covered_s
+        return Silence(max(0.0, ran_s - QUICK_S), max(0.0, ran_s + QUICK_S))
     for _ in range(8):
         if most - least <= max(FINE_S, 0.1 * most):
             break
-        try_one((least + most) / 2)
-    # The reply that tells is of a moment after the silence, as the run-out's is.
-    least, most = least - run_out_s + QUICK_S, most - run_out_s + 2 * QUICK_S
+        answer = _ask(bench, motors, (least + most) / 2)
+        if answer.turned:
+            least = max(least, answer.silent_s)
+        else:
+            most = min(most, answer.silent_s)
+    # The reply that tells is of a moment after the silence, as the ordinary stop's is.
+    least, most = least - stop.slow_s + QUICK_S, most - stop.slow_s + 2 * QUICK_S
     return Silence(max(0.0, least), max(0.0, most))
 
 
-def _ask(bench: Bench, motors: Sequence[int], length_s: float) -> tuple[float, bool]:
-    """How long the silence was in the end, and whether the motors still turned after it."""
+class Stop(Struct, frozen=True):
+    """An ordinary stop: when the motors had nearly stopped, and how long at full speed they would
+    have covered what they ran out, s."""
+
+    slow_s: float
+    covered_s: float
+
+
+def _stop(bench: Bench, motors: Sequence[int]) -> Stop:
+    _at_speed(bench, motors)
+    bench.send(ZERO)
+    began_ns, slow_ns = bench.sent_ns, 0
+    while not slow_ns and bench.wire.now_ns() - began_ns < REST_S * NS_PER_S:
+        for reply in bench.listen(_quick_s(bench)):
+            if not slow_ns and _share(reply, motors) < STOPPED:
+                slow_ns = reply.at_ns
+        bench.send(ZERO)
+    bench.rest()
+    slow_s = (slow_ns - began_ns) / NS_PER_S if slow_ns else REST_S
+    return Stop(slow_s, _covered(bench, motors, began_ns))
+
+
+def _ask(bench: Bench, motors: Sequence[int], length_s: float) -> Answer:
     last_ns = _at_speed(bench, motors)
     bench.listen(length_s - (bench.wire.now_ns() - last_ns) / NS_PER_S)
     before = len(bench.replies)
     bench.send(ZERO)
     silent_s = (bench.sent_ns - last_ns) / NS_PER_S
-    bench.listen(max(QUICK_S, bench.period_s if bench.period_s > 0.02 else 0.0))
+    bench.listen(_quick_s(bench))
     for _ in range(10):
         bench.send(ZERO)
         bench.listen(bench.period_s)
         if len(bench.replies) >= before + 2:
             break
-    # The first reply may be of the whole silence; the second is of the moment after it.
-    turns = any(_fast(reply, motors) for reply in bench.replies[before + 1 : before + 2])
+    shares = [_share(reply, motors) for reply in bench.replies[before : before + 2]]
     bench.rest()
-    return silent_s, turns
+    first, second = (*shares, 0.0, 0.0)[:2]
+    return Answer(silent_s, first, second)
+
+
+def _share(reply: Reply, motors: Sequence[int]) -> float:
+    """The fastest of these motors, as a share of the speed they were told."""
+    return max(abs(reply.motors[motor]) for motor in motors) / SPEED
+
+
+def _quick_s(bench: Bench) -> float:
+    return max(QUICK_S, bench.period_s if bench.period_s > PERIOD_S else 0.0)
 
 
 def _watched(bench: Bench, motors: Sequence[int]) -> Silence:
