@@ -60,6 +60,7 @@ ORDER = (
     "robot",
     "guard",
     "checkup.findings",
+    "checkup.ends",
     "checkup.outside",
     "checkup.bench",
     "checkup.dialect",

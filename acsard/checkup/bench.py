@@ -13,7 +13,8 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.checkup.findings import LETTERS, Finding, StoppedError, WireLostError, motor_name
+from acsard.checkup import ends
+from acsard.checkup.findings import WireLostError
 from acsard.checkup.outside import Wire
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, Reading, seal, unseal
 from acsard.mcu.frames import Codec, FrameError, Motors
@@ -238,16 +239,7 @@ class Bench:
             return "rest"
         self.comma = not self.comma
         self.zeros()
-        names = ", ".join(motor_name(self.mcu, motor) for motor in turning) or "something"
-        raise StoppedError(
-            Finding(
-                "stop",
-                "FAIL",
-                f"still turning {2 * REST_S:g} s after zeros",
-                f"{names} turns on, by its encoder, whatever zeros are sent",
-                "cut the motors' power; does the firmware take `p00.00` for a stop?",
-            )
-        )
+        raise ends.stays_turning(self.mcu, turning, 2 * REST_S)
 
     def turning(self) -> list[int]:
         """The motors that turn by the last reply."""
@@ -266,21 +258,7 @@ class Bench:
                 continue
             asked = self._commanded[motor]
             self.zeros()
-            against = asked * speed < 0
-            raise StoppedError(
-                Finding(
-                    "runaway",
-                    "FAIL",
-                    f"{LETTERS[motor]}: told {asked:.1f}, seen {speed:.1f} rad/s",
-                    f"the encoder of {motor_name(self.mcu, motor)} says more than "
-                    f"{RUNAWAY:g} x {SPEED:g} rad/s"
-                    + (", against the command: the firmware's control loop drives it away"
-                       if against else ""),
-                    "swap this motor's two leads, or A and B of its encoder"
-                    if against
-                    else "counts per turn in the firmware too low, or its control loop unstable",
-                )
-            )  # fmt: skip
+            raise ends.runaway(self.mcu, motor, asked, speed, RUNAWAY * SPEED)
 
     @property
     def _last_ns(self) -> int:
@@ -292,15 +270,6 @@ class Bench:
         silent_s = (self.wire.now_ns() - heard_ns) / NS_PER_S
         if not self.armed or silent_s <= SILENCE_S + 4 * self.gap_s:
             return
+        asked = [motor for motor, speed in enumerate(self._commanded) if speed]
         self.zeros()
-        asked = [motor_name(self.mcu, m) for m, speed in enumerate(self._commanded) if speed]
-        raise StoppedError(
-            Finding(
-                "link",
-                "FAIL",
-                f"silent for {silent_s:.1f} s",
-                f"the microcontroller fell silent while {' and '.join(asked) or 'nothing'} "
-                "was to turn",
-                "does its supply dip when a motor starts, and it restarts? a loose cable?",
-            )
-        )
+        raise ends.silent(self.mcu, asked, silent_s)

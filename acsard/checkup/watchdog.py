@@ -15,7 +15,7 @@ from msgspec import Struct
 from acsard.checkup import counts
 from acsard.checkup.bench import PERIOD_S, REST_S, SPEED, ZERO, Bench, Reply
 from acsard.checkup.findings import LETTERS, Finding, StoppedError
-from acsard.checkup.turning import run_up
+from acsard.checkup.turning import mean, run_up
 from acsard.mcu.frames import Motors
 from acsard.mcu.wire import FIELD
 from acsard.values import NS_PER_S
@@ -99,13 +99,21 @@ def _fast(reply: Reply, motors: Sequence[int]) -> bool:
 
 def _at_speed(bench: Bench, motors: Sequence[int]) -> int:
     """Bring the motors to speed; when the last line went."""
+    began_ns = bench.wire.now_ns()
     run_up(bench, _command(motors))
-    if not bench.replies or not _fast(bench.replies[-1], motors):
+    shown = mean(_later_half(bench, began_ns))
+    if max(abs(shown[motor]) for motor in motors) < SPEED / 2:
         bench.rest()
         names = ", ".join(LETTERS[motor] for motor in motors)
         text = f"motors {names} turned one by one, but not together: does the supply give in?"
         raise StoppedError(Finding("watchdog", "FAIL", "", text, "measure the supply under load"))
     return bench.sent_ns
+
+
+def _later_half(bench: Bench, began_ns: int) -> list[Reply]:
+    """The replies of the second half of the time since then: the ramp is over by then."""
+    middle_ns = (began_ns + bench.wire.now_ns()) // 2
+    return [reply for reply in bench.replies if reply.at_ns > middle_ns]
 
 
 class Answer(Struct, frozen=True):
@@ -251,17 +259,23 @@ def _counted(bench: Bench, motors: Sequence[int]) -> Silence:
         ran_ms = _ran(bench, motors, length_s)
         still = ran_ms - ran_out_ms > 0.95 * length_s * 1000
         if not still:
-            time_s = max(0.0, ran_ms - ran_out_ms) / 1000
-            return Silence(time_s, time_s)
+            time_s, count_s = (ran_ms - ran_out_ms) / 1000, 2 * _count_s(bench, motors)
+            return Silence(max(0.0, time_s - count_s), max(0.0, time_s + count_s))
     return Silence(LONGEST_S, UNKNOWN)
+
+
+def _count_s(bench: Bench, motors: Sequence[int]) -> float:
+    """How long a motor takes for one count: it cannot be told finer."""
+    return math.tau / SPEED / (counts.per_turn(bench.replies, motors) or 1.0)
 
 
 def _ran(bench: Bench, motors: Sequence[int], length_s: float) -> float:
     """How long the motors ran after the last line before a silence, their run-out with it, in ms
     at full speed: the one that ran the longest."""
+    began_ns = bench.wire.now_ns()
     last_ns = _at_speed(bench, motors)
     bench.listen(max(0.0, 0.03 - (bench.wire.now_ns() - last_ns) / NS_PER_S))
-    at_speed = bench.replies[-6:]
+    at_speed = _later_half(bench, began_ns)
     if length_s:
         bench.listen(length_s - (bench.wire.now_ns() - last_ns) / NS_PER_S)
     before, zeros_ns = len(bench.replies), bench.wire.now_ns()

@@ -13,7 +13,7 @@ from acsard.checkup.findings import Finding, WireLostError
 from acsard.mcu.frames import Codec
 from acsard.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.values import WHEELS
-from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check
+from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured
 
 MOTORS = "abcd"
 
@@ -43,7 +43,7 @@ def test_a_robot_that_is_right_passes(
 
 @pytest.mark.parametrize("baud", [9600, 19200, 38400, 57600])
 def test_a_slow_wire_passes(baud: int) -> None:
-    config = Config(mcu=McuConfig(baud_rate=baud))
+    config = configured(Config(), baud_rate=baud)
     assert check(config=config).failed == []
 
 
@@ -111,7 +111,7 @@ def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
 def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
     letter: str, part: str
 ) -> None:
-    checked = check(f"reversed_{part}={letter}", person=True)
+    checked = check("plain_only", f"reversed_{part}={letter}", person=True)
     assert len(checked.failed) == 1
     mend = checked[f"motor {letter}"].mend
     assert ("two leads of motor" if part == "motor" else f"A and B of encoder {letter}") in mend
@@ -120,7 +120,7 @@ def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
 
 @pytest.mark.parametrize("motor", range(4))
 def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) -> None:
-    checked = check(f"reversed_wheel={MOTORS[motor]}", person=True)
+    checked = check("plain_only", f"reversed_wheel={MOTORS[motor]}", person=True)
     assert checked.failed == ["wheel map"]
     wheels = {k: v for k, v in checked.changes.items() if "wheels" in k}
     assert wheels == {f"mcu.wheels.{WHEELS[motor]}": f"-{MOTORS[motor]}"}
@@ -128,7 +128,7 @@ def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) ->
 
 @pytest.mark.parametrize(("one", "other"), list(combinations(range(4), 2)))
 def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
-    checked = check(f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
+    checked = check("plain_only", f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
     assert checked.failed == ["wheel map"]
     assert checked.changes[f"mcu.wheels.{WHEELS[one]}"] == f"+{MOTORS[other]}"
     assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[one]}"
@@ -137,7 +137,7 @@ def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
 @pytest.mark.parametrize("what", ["motors", "encoders"])
 @pytest.mark.parametrize(("one", "other"), list(combinations(MOTORS, 2)))
 def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, other: str) -> None:
-    checked = check(f"swapped_{what}={one}:{other}", person=True)
+    checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
     assert [name.partition(" (")[0] for name in checked.failed] == [
         f"motor {one}",
         f"motor {other}",
@@ -158,7 +158,7 @@ def test_any_wiring_is_found_out() -> None:
 def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
     part: str, letter: str
 ) -> None:
-    checked = check(f"{part}={letter}", person=True)
+    checked = check("plain_only", f"{part}={letter}", person=True)
     assert len(checked.failed) == 1
     says = "does not turn" if part == "dead_motor" else "a dead encoder"
     assert says in checked[f"motor {letter}"].text
@@ -281,7 +281,7 @@ def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
     assert not robot.is_open
 
 
-@pytest.mark.parametrize(("gain", "text"), [(3, "more than 2 x 3"), (-3, "against the command")])
+@pytest.mark.parametrize(("gain", "text"), [(3, "more than 6 rad/s"), (-3, "against the command")])
 def test_a_runaway_stops_it_at_once(gain: int, text: str) -> None:
     robot = Robot(f"bias=b:{gain}")
     checked = Checked(robot)
@@ -344,7 +344,7 @@ def test_a_board_that_boots_when_opened_is_waited_for() -> None:
 def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> None:
     robot = Robot("plain_only", "no_watchdog")
     Checked(robot)
-    turning_since = {}
+    turning_since: dict[str, int] = {}
     for at_ns, line in robot.mcu.heard:
         tokens = line.rstrip(b",\r\n").split(b",")
         if len(tokens) != 4 or not line.startswith(b"a") or b"x" in line:
