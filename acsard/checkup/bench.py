@@ -41,6 +41,9 @@ REST_S = 2.0
 SILENCE_S = 0.3
 """How long the MCU may not answer while a motor turns, besides its own pace."""
 
+LATE_S = 0.1
+"""A wait that takes this much longer was the host's own pause."""
+
 PERIOD_S = 0.02
 """Between two lines, where the wire carries that."""
 
@@ -106,13 +109,20 @@ class Bench:
         if not self.is_open:
             return
         try:
+            self._farewell()
+        except BaseException:
+            self._farewell()  # a signal in the middle of it: the zeros still have to go
+            raise
+        finally:
+            self.wire.close()
+
+    def _farewell(self) -> None:
+        try:
             for _ in range(FAREWELL):
                 self.zeros()
                 self.wire.listen(self.wire.now_ns() + int(2 * self.period_s * NS_PER_S))
         except WireLostError:
             pass  # nothing reaches the motors any more; the MCU's own watchdog has to
-        finally:
-            self.wire.close()
 
     # sending
 
@@ -195,6 +205,8 @@ class Bench:
             self.longest_pause_s = max(self.longest_pause_s, pause_s)
             self.send(motors, comma)
             got += self._listen(min(period_s, (end_ns - now_ns) / NS_PER_S))
+            if self.wire.now_ns() - now_ns > int((period_s + LATE_S) * NS_PER_S):
+                self._excused_ns = self.wire.now_ns()  # it was the host that paused
             self._present()
         return got
 

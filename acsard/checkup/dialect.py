@@ -218,7 +218,7 @@ def _trip(bench: Bench) -> Finding:
     if bench.own_clock:
         text = "it answers by its own clock: a reply says nothing of the line before it"
         return Finding("round trip", "SKIPPED", "", text)
-    trips = []
+    trips: list[float] = []
     for _ in range(TRIPS):
         # No reply to an earlier line may be taken for this one's.
         bench.listen(0.0 if trips and bench.gap_s <= 2 * bench.period_s else 2 * ANSWER_S / 3)

@@ -206,7 +206,8 @@ class Nobody:
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Signals end the check by an exception, so that the zeros go out; a second one is too late."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    # Ctrl-Z too: a check that is suspended would leave a wheel turning.
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
     before = [signal.getsignal(number) for number in numbers]
 
     def end(number: int, frame: FrameType | None) -> None:

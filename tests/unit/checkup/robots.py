@@ -59,12 +59,13 @@ class Robot(VirtualWire):
             yield
 
     @contextmanager
-    def bench(self) -> Iterator[Bench]:
-        """The bench alone, the line open and the motors known to stand."""
+    def bench(self, rest: bool = True) -> Iterator[Bench]:
+        """The bench alone, the line open and the motors known to stand, if they can say so."""
         with self.faulty(), Bench(self, self.config.mcu, self.config.rate_hz) as bench:
             bench.open(self.config.mcu.baud_rate)
-            bench.rest()
-            bench.armed = True
+            if rest:
+                bench.rest()
+                bench.armed = True
             yield bench
 
     def later(self) -> list[float]:

@@ -14,7 +14,9 @@ from tests.unit.checkup.robots import Robot
 
 @pytest.mark.parametrize("rate", [9600, 19200, 38400, 57600])
 def test_the_rate_it_speaks_at_is_found_and_used(rate: Any) -> None:
-    with Robot(config=Config(mcu=McuConfig(baud_rate=rate)), baud_rate=115200).bench() as bench:
+    with Robot(config=Config(mcu=McuConfig(baud_rate=rate)), baud_rate=115200).bench(
+        rest=False
+    ) as bench:
         finding = dialect.baud(bench)
         assert finding.verdict == "FAIL"
         assert finding.keys == {"mcu.baud_rate": rate}
@@ -23,10 +25,8 @@ def test_the_rate_it_speaks_at_is_found_and_used(rate: Any) -> None:
 
 def test_garbage_is_told_from_silence() -> None:
     for fault, word in (("mute", "nothing"), ("noise", "only garbage")):
-        with Robot(fault).bench() as bench:
-            bench.armed = False
-            with pytest.raises(StoppedError) as end:
-                dialect.baud(bench)
+        with Robot(fault).bench(rest=False) as bench, pytest.raises(StoppedError) as end:
+            dialect.baud(bench)
         assert end.value.finding.figure.startswith(word)
 
 

@@ -247,6 +247,24 @@ def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, num
     assert not robot.is_open
 
 
+def test_a_signal_in_the_middle_of_the_last_zeros_does_not_keep_them_back() -> None:
+    class Interrupted(Robot):
+        interrupted = False
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            if self.sent[-1].startswith(b"\r\nap") and len(self.sent) > 100:
+                if not self.interrupted:
+                    self.interrupted = True
+                    raise KeyboardInterrupt
+            return super().listen(until_ns)
+
+    robot = Interrupted("plain_only")
+    with robot.faulty(), pytest.raises(KeyboardInterrupt):
+        procedure.run(robot, Nobody(), robot.config, lambda finding: None)
+    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap(), True).stop) == 5
+    assert not robot.is_open
+
+
 def test_a_listener_that_fails_ends_in_zeros_too() -> None:
     robot = Robot("no_watchdog")
 
