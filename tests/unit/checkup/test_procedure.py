@@ -252,10 +252,10 @@ def test_a_signal_in_the_middle_of_the_last_zeros_does_not_keep_them_back() -> N
         interrupted = False
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            if self.sent[-1].startswith(b"\r\nap") and len(self.sent) > 100:
-                if not self.interrupted:
-                    self.interrupted = True
-                    raise KeyboardInterrupt
+            last = self.sent[-1].startswith(b"\r\nap") and len(self.sent) > 100
+            if last and not self.interrupted:
+                self.interrupted = True
+                raise KeyboardInterrupt
             return super().listen(until_ns)
 
     robot = Interrupted("plain_only")
