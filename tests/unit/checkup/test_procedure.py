@@ -135,7 +135,7 @@ def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
 
 
 @pytest.mark.parametrize("what", ["motors", "encoders"])
-@pytest.mark.parametrize(("one", "other"), list(combinations(MOTORS, 2)))
+@pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
 def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, other: str) -> None:
     checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
     assert [name.partition(" (")[0] for name in checked.failed] == [
@@ -234,7 +234,7 @@ LINES = 560
 
 
 @pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
-@pytest.mark.parametrize("number", range(2, LINES, 31))
+@pytest.mark.parametrize("number", range(2, LINES, 43))
 def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
     error = KeyboardInterrupt if number % 2 else RuntimeError
     robot = Trouble(number, error(), fault, "no_watchdog")
