@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from msgspec import Struct
 
 from acsard.checkup.bench import SPEED, ZERO, Bench
@@ -26,10 +28,12 @@ class Broken(Struct, frozen=True):
     dangerous."""
 
 
-def broken_lines(comma: bool, sealed: bool) -> list[Broken]:
-    """Every kind of damage, in the dialect the firmware takes."""
-    token = f"p{SPEED:05.2f}"
-    a, b, c, d = (f"{letter}{token}" for letter in LETTERS)
+def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broken]:
+    """Every kind of damage, in the dialect the firmware takes; all but these motors at zero."""
+    a, b, c, d = (
+        f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
+        for motor, letter in enumerate(LETTERS)
+    )
     end = ",\r\n" if comma else "\r\n"
 
     def line(*tokens: str) -> bytes:
@@ -37,10 +41,10 @@ def broken_lines(comma: bool, sealed: bool) -> list[Broken]:
 
     found = [
         Broken("a value is missing", line(a, b, c)),
-        Broken("a wrong letter", line(a, b, c, "x" + token)),
+        Broken("a wrong letter", line(a, b, c, "x" + d[1:])),
         Broken("a letter twice", line(a, a, c, d)),
         Broken("a bad digit", line(a, "bp0x.00", c, d)),
-        Broken("neither p nor n", line(a, b, "cq" + token[1:], d)),
+        Broken("neither p nor n", line(a, b, "cq" + c[2:], d)),
         Broken("cut short", line(a, b, c, d)[:20] + b"\r\n"),
         Broken("over-long", line(*(a, b, c, d) * 5), whole=True),
         Broken("garbage before it", b"\xff~" + line(a, b, c, d), whole=True),
@@ -53,11 +57,13 @@ def broken_lines(comma: bool, sealed: bool) -> list[Broken]:
     return found
 
 
-def finding(bench: Bench) -> Finding:
-    """Send them all; the motors stand before and after."""
+def finding(bench: Bench, motors: Sequence[int]) -> Finding:
+    """Send them all, to motors that turn as told; they stand before and after."""
     name = "damaged lines"
+    if not motors:
+        return Finding(name, "SKIPPED", "", "no motor turns as told, so none can show it")
     took, whole = [], True
-    lines = broken_lines(bench.comma, bench.sealed)
+    lines = broken_lines(bench.comma, bench.sealed, motors)
     for broken in lines:
         bench.rest()
         if _moves(bench, broken.line):

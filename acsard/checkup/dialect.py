@@ -13,6 +13,7 @@ from typing import get_args
 
 from acsard.checkup.bench import PERIOD_S, ZERO, Bench, Reply
 from acsard.checkup.findings import Finding, StoppedError
+from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
 from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.settings import Baud
@@ -83,8 +84,11 @@ def _knock(bench: Bench, seconds: float) -> bool:
     end_ns = wire.now_ns() + int(seconds * NS_PER_S)
     while wire.now_ns() < end_ns:
         bench.zeros()
-        bench.listen(max(0.05, 4 * bench.period_s))
+        # For firmware that has taken a checked line since it booted, and refuses others since.
+        bench.wire.send(seal(bench.line(ZERO), 0))
+        bench.listen(max(0.05, 5 * bench.period_s))
         if len(bench.replies) >= ENOUGH:
+            bench.sealed = all(b"#" in reply.line for reply in bench.replies)
             return True
     return False
 
@@ -192,7 +196,10 @@ def _line_s(bench: Bench) -> float:
 def _rate(bench: Bench, period_s: float, longest_s: float) -> Finding:
     gap_s = bench.gap_s
     way = "by its own clock" if bench.own_clock else "when spoken to"
-    figure = f"{1 / gap_s:.0f} Hz, {way}" if gap_s else "too few replies"
+    if not gap_s:
+        text, mend = "lines go unanswered", "the firmware must answer every line, or by its clock"
+        return Finding("reply rate", "FAIL", "too few replies", text, mend)
+    figure = f"{1 / gap_s:.0f} Hz, {way}"
     quiet_s = max(0.1, 4 * period_s, 3 * bench.mcu.reply_period)
     period = float(f"{gap_s:.1g}")
     if 3 * gap_s > 1.1 * quiet_s:

@@ -74,7 +74,7 @@ def _steps(bench: Bench, operator: Operator, tell: Tell) -> None:
     tell(wheel_map(bench.mcu, found))
     tell(counts.finding(bench, right))
     tell(watchdog.finding(bench, right))
-    tell(damage.finding(bench))
+    tell(damage.finding(bench, right))
 
 
 def _motors(

@@ -9,7 +9,7 @@ import pytest
 from acsard.checkup import dialect
 from acsard.checkup.findings import StoppedError
 from acsard.settings import Config, McuConfig
-from tests.unit.checkup.robots import Robot
+from tests.unit.checkup.robots import Checked, Robot
 
 
 @pytest.mark.parametrize("rate", [9600, 19200, 38400, 57600])
@@ -90,6 +90,22 @@ class Particular(Robot):
     def send(self, data: bytes) -> None:
         lines = data.splitlines(keepends=True)
         super().send(b"".join(s for s in lines if s.endswith(b",\r\n") == self._comma))
+
+
+def test_firmware_that_refuses_plain_lines_is_found_and_checked_to_the_end() -> None:
+    class Refuses(Robot):
+        def send(self, data: bytes) -> None:
+            super().send(b"".join(s for s in data.splitlines(keepends=True) if b"p" not in s
+                                  or b"#" in s))  # fmt: skip
+
+    assert Checked(Refuses()).failed == []
+
+
+def test_firmware_that_answers_nearly_nothing_fails() -> None:
+    with Robot("plain_only").bench() as bench, bench.wire.mcu.mute():  # type: ignore[attr-defined]
+        bench.armed = False
+        rate, trip = dialect.pace(bench)
+    assert (rate.verdict, trip.verdict) == ("FAIL", "SKIPPED")
 
 
 @pytest.mark.parametrize("comma", [False, True])
