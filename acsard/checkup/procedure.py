@@ -15,8 +15,9 @@ from acsard.settings import Config
 LIFTED = "lifted"
 
 CONFIRM = (
-    "The wheels will turn one by one, at 3 rad/s at the most. Lift the robot so that none touches "
-    f'anything, keep a hand on the power switch, then type "{LIFTED}":'
+    "The wheels will turn one by one, then together, at 3 rad/s at the most. Lift the robot so "
+    "that none touches anything, keep a hand on the power switch, then type "
+    f'"{LIFTED}":'
 )
 
 STEPS = (
@@ -73,7 +74,9 @@ def _steps(bench: Bench, operator: Operator, tell: Tell) -> None:
     found, right = _motors(bench, operator, tell, comma_told=refused is not None)
     tell(wheel_map(bench.mcu, found))
     tell(counts.finding(bench, right))
+    operator.say("the motors turn together, then the host falls silent, several times perhaps")
     tell(watchdog.finding(bench, right))
+    operator.say("broken lines go out; nothing may turn")
     tell(damage.finding(bench, right))
 
 

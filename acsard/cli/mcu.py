@@ -34,9 +34,9 @@ DESCRIPTION = """\
 Find out on your own robot, wheels lifted, what its microcontroller speaks and whether it keeps
 what the robot's safety rests on: baud rate, dialect and trailing comma, reply rate and round trip,
 the checked link, each motor and encoder alone, the watchdog, damaged lines. It opens the port
-itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one at 3 rad/s at the
-most, after you have typed that the wheels are lifted; the last lines out are zeros, whatever
-happens. Exit 0 when nothing fails, 1 when something does.
+itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one, then
+together, at 3 rad/s at the most, after you have typed that the wheels are lifted; the last lines
+out are zeros, whatever happens. Exit 0 when nothing fails, 1 when something does.
 """
 
 
