@@ -46,7 +46,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             bench.open(config.mcu.baud_rate)
             bench.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
-                raise StoppedError(Finding("wheels", "SKIPPED", "", "not confirmed to be lifted"))
+                raise StoppedError(Finding("wheels", "FAIL", "", "not confirmed to be lifted"))
             _steps(bench, operator, also)
     except StoppedError as end:
         also(end.finding)

@@ -104,14 +104,20 @@ def main(args: argparse.Namespace) -> int:
     with ended_by_signals():
         procedure.run(_wire(config), person, config, tell)
     changes = advice.changes(findings, configured)
-    written = bool(args.write and changes)
-    if written:
-        change(Path(where), changes)
     failed = any(finding.verdict == "FAIL" for finding in findings)
+    trouble: ExitError | None = None
+    if args.write and changes:
+        try:
+            change(Path(where), changes)
+        except ExitError as error:  # a minute's findings are told first
+            trouble = error
+    written = bool(args.write and changes and not trouble)
     if args.json:
         _print_json(port, findings, changes, where if written else None)
     else:
         _sum_up(findings, advice.lines(changes), where, written)
+    if trouble is not None:
+        raise trouble
     return int(Exit.FAILURE if failed else Exit.OK)
 
 

@@ -211,7 +211,7 @@ def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted
 
     findings: list[Finding] = []
     procedure.run(robot, Refuses(), robot.config, findings.append)
-    assert {finding.verdict for finding in findings} == {"SKIPPED"}
+    assert [finding.name for finding in findings if finding.verdict != "SKIPPED"] == ["wheels"]
     assert all(zero(line) for data in robot.sent for line in data.splitlines(True))
     assert not robot.is_open
 

@@ -69,6 +69,19 @@ def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
     assert (tmp_path / "acsard.toml").read_text() == written
 
 
+def test_findings_are_told_also_when_the_file_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*given: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("acsard.cli.config_file._replace", full)
+    with pytest.raises(ExitError, match="No space left"):
+        called(tmp_path, "--yes", "--json", "--write")
+    assert json.loads(capsys.readouterr().out)["written"] is None
+    assert (tmp_path / "acsard.toml").read_text() == ""
+
+
 def test_write_without_a_file_is_told_before_anything_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
