@@ -84,6 +84,7 @@ class Bench:
         """Lines that are no good replies."""
         self.heard_bytes = 0
         self.sent_ns = 0
+        self.sent_lines = 0
         self.longest_pause_s = 0.0
         """Between two lines of ours while driving: too long, and the watchdog strikes."""
         self._commanded = ZERO
@@ -146,6 +147,7 @@ class Bench:
         """One command, now."""
         self._commanded = motors
         self.wire.send(self.line(motors, comma))
+        self.sent_lines += 1
         self.sent_ns = self.wire.now_ns()
 
     def zeros(self) -> None:
