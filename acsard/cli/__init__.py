@@ -22,6 +22,7 @@ from acsard.cli import (
     echo,
     hz,
     lan,
+    mcu,
     ports,
     run,
     service,
@@ -44,6 +45,7 @@ VERBS = (
     bench,
     doctor,
     ports,
+    mcu,
     lan,
     service,
 )

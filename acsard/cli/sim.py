@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import get_args
 
 from acsard.cli.common import add_config, load
 from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import Baud
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import FAULTS
+from acsard.sim.faults import ARGUMENTS, FAULTS
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,8 +29,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         default=[],
         type=fault,
         metavar="NAME",
-        help=f"misbehave, may be repeated: {', '.join(FAULTS)}, stuck_encoder=MOTOR, "
-        "bias=MOTOR:GAIN (motors a to d), reset=SECONDS (again and again)",
+        help=f"misbehave, may be repeated: {', '.join(FAULTS)}; with motors (a to d) or numbers: "
+        f"{', '.join(map(_form, ARGUMENTS))}; reset=SECONDS (again and again)",
     )
     parser.add_argument(
         "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"
@@ -36,22 +38,31 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.set_defaults(main=main)
 
 
+def _form(name: str) -> str:
+    words = {"m": "MOTOR", "n": "NUMBER"}
+    return f"{name}={':'.join(words[kind] for kind in ARGUMENTS[name])}"
+
+
 def fault(text: str) -> tuple[str, tuple[float, ...]]:
     """An argparse type: the name of a fault and its numbers; motors a to d become 0 to 3."""
     name, _, value = text.partition("=")
-    numbers = [str("abcd".index(v)) if v and v in "abcd" else v for v in value.split(":") if v]
-    wanted = {"stuck_encoder": 1, "bias": 2, "reset": 1}
-    if len(numbers) != (0 if name in FAULTS else wanted.get(name, -1)):
+    given = [v for v in value.split(":") if v]
+    wanted = {"reset": "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}.get(name)
+    if wanted is None or len(given) != len(wanted):
         raise argparse.ArgumentTypeError(f"{text} is not a fault")
-    try:
-        values = tuple(float(number) for number in numbers)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text}: {value} is not a number") from None
-    if name in ("stuck_encoder", "bias") and values[0] not in (0, 1, 2, 3):
-        raise argparse.ArgumentTypeError(f"{text}: motors are a, b, c and d")
+    values = []
+    for kind, word in zip(wanted, given, strict=True):
+        if kind == "m" and word not in ("a", "b", "c", "d"):
+            raise argparse.ArgumentTypeError(f"{text}: motors are a, b, c and d")
+        try:
+            values.append(float("abcd".index(word) if kind == "m" else word))
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text}: {word} is not a number") from None
     if name == "reset" and not values[0] > 0:
         raise argparse.ArgumentTypeError(f"{text}: seconds between resets must be above 0")
-    return name, values
+    if name == "other_baud" and values[0] not in get_args(Baud):
+        raise argparse.ArgumentTypeError(f"{text}: rates are {', '.join(map(str, get_args(Baud)))}")
+    return name, tuple(values)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -104,12 +115,13 @@ async def _play(config: object, args: argparse.Namespace) -> int:
         for name, values in args.fault:
             if name == "reset":
                 _reset_again(mcu, values[0])
-            elif name == "bias":
-                stack.enter_context(mcu.bias(int(values[0]), values[1]))
-            elif name == "stuck_encoder":
-                stack.enter_context(mcu.stuck_encoder(int(values[0])))
             else:
-                stack.enter_context(getattr(mcu, name)())
+                kinds = ARGUMENTS.get(name, "")
+                whole = [
+                    int(v) if v.is_integer() or k == "m" else v
+                    for k, v in zip(kinds, values, strict=True)
+                ]
+                stack.enter_context(getattr(mcu, name)(*whole))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:
             link = Path(args.link)

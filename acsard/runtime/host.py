@@ -24,6 +24,9 @@ BOARDS: dict[tuple[int, int], str] = {
 }
 """USB ids a robot's microcontroller is found behind; deploy/udev/70-acsar.rules has the same."""
 
+PTY_MAJORS = range(136, 144)
+"""Device numbers of ptys, 256 each; a serial port has another."""
+
 BY_ID = Path("/dev/serial/by-id")
 
 
@@ -81,6 +84,27 @@ def holders(path: str) -> Iterator[Holder]:
                 yield Holder(int(process.name), _name(process))
         except OSError:
             continue  # ended meanwhile, or not ours to see
+
+
+def master_of(path: str) -> Holder | None:
+    """The process at the other end of a pty, as far as we may see it; None for a real device."""
+    try:
+        device = os.stat(path).st_rdev
+    except OSError:
+        return None
+    if os.major(device) not in PTY_MAJORS:
+        return None
+    index = f"tty-index:\t{os.minor(device) + 256 * (os.major(device) - PTY_MAJORS[0])}"
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            for entry in os.scandir(process / "fd"):
+                if not os.readlink(entry.path).endswith("/ptmx"):
+                    continue
+                if index in (process / "fdinfo" / entry.name).read_text().splitlines():
+                    return Holder(int(process.name), _name(process))
+        except OSError:
+            continue  # ended meanwhile, or not ours to see
+    return None
 
 
 def _name(process: Path) -> str:

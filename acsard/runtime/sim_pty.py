@@ -1,4 +1,8 @@
-"""The fake MCU behind a real pty, paced by the real clock, so that the real serial code is used."""
+"""The fake MCU behind a real pty, paced by the real clock, so that the real serial code is used.
+
+A pty carries any baud rate; here a host that sets another one than the MCU's gets garbage, and so
+does the MCU, as on a real wire.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,15 @@ import pty
 import termios
 import tty
 from types import TracebackType
+from typing import get_args
 
 from acsard.runtime import clock
 from acsard.runtime.timerfd import TimerFd
+from acsard.settings import Baud
 from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.garble import garbled
+
+_RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_args(Baud)}
 
 
 class SimPty:
@@ -29,6 +38,7 @@ class SimPty:
         self._master, self._slave = pty.openpty()
         # Held open here, or the master would see a hang-up whenever no host is connected.
         tty.setraw(self._slave)
+        self._set_speed()
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
         loop = asyncio.get_running_loop()
@@ -59,15 +69,25 @@ class SimPty:
             raise
         # A host that was killed leaves its exclusive mark on the pty, as no real port would.
         fcntl.ioctl(self._slave, termios.TIOCNXCL)
-        self.mcu.receive(clock.now().mono_ns, data)
+        self.mcu.receive(clock.now().mono_ns, garbled(data, self._speed(), self.mcu.baud_rate))
         self._arm()
+
+    def _set_speed(self) -> None:
+        """The MCU's own rate, for a host that sets none."""
+        attributes = termios.tcgetattr(self._slave)
+        attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
+        termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
+
+    def _speed(self) -> int:
+        """The host's rate; the MCU's own where it is one no MCU has."""
+        return _RATES.get(termios.tcgetattr(self._slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
         self._timer.expirations()
         data = self.mcu.advance(clock.now().mono_ns)
         if data:
             try:
-                os.write(self._master, data)
+                os.write(self._master, garbled(data, self.mcu.baud_rate, self._speed()))
             except BlockingIOError:
                 pass  # nobody reads; a real wire would lose the bytes too
         self._arm()

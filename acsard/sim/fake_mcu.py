@@ -20,14 +20,12 @@ from itertools import count, cycle
 from acsard.mcu.wire import wire_ns
 from acsard.settings import Config, WheelMap
 from acsard.sim import protocol
+from acsard.sim.faults import WATCHDOG_NS as WATCHDOG_NS
 from acsard.sim.faults import Faults
 from acsard.sim.vehicle import Vehicle
 from acsard.values import NS_PER_S
 
 MS = 1_000_000
-
-WATCHDOG_NS = 300 * MS
-"""Silence after which the MCU stops the motors by itself."""
 
 RESET_NS = 2 * NS_PER_S
 """How long a board with a bootloader is deaf after a reset."""
@@ -45,7 +43,7 @@ class FakeMcu(Faults):
     def __init__(self, config: Config, now_ns: int = 0) -> None:
         super().__init__()
         self.vehicle = Vehicle(config.sim, config.drive)
-        self._baud_rate = config.mcu.baud_rate
+        self.baud_rate = config.mcu.baud_rate
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = now_ns
@@ -60,6 +58,7 @@ class FakeMcu(Faults):
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._counted = [0.0] * 4
+        self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
         """The last lines received with the time each was complete, valid or not, as they came."""
         self.valid_lines = 0
@@ -78,9 +77,9 @@ class FakeMcu(Faults):
             taken += len(piece) + 1
             line = (self._held + piece + b"\n")[-256:]
             self._held = b""
-            self._schedule(start + wire_ns(taken, self._baud_rate), "line", line)
+            self._schedule(start + wire_ns(taken, self.baud_rate), "line", line)
         self._held = (self._held + rest)[-256:]
-        self._in_free_ns = start + wire_ns(len(data), self._baud_rate)
+        self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
     def next_ns(self) -> int | None:
         """When it next has something to do, or None."""
@@ -131,7 +130,7 @@ class FakeMcu(Faults):
 
     def _pass(self, now_ns: int) -> None:
         """Move the vehicle; the watchdog trips at its own time on the way."""
-        deadline = max(self._fed_ns + WATCHDOG_NS, self._now_ns)
+        deadline = max(self._fed_ns + self.watchdog_ns, self._now_ns)
         if self.watchdog and deadline <= now_ns and any(self.vehicle.set_points):
             self.vehicle.advance((deadline - self._now_ns) / NS_PER_S)
             self._now_ns = deadline
@@ -151,8 +150,8 @@ class FakeMcu(Faults):
         if command is None:
             return
         for motor, value in command.values.items():
-            wheel, forward = self._wiring[motor]
-            self.vehicle.set_points[wheel] = forward * value
+            wheel, forward = self._wiring[self.drivers[motor]]
+            self.vehicle.set_points[wheel] = forward * self.drives[motor] * value
         self.valid_lines += 1
         self._fed_ns = now_ns
         if not self.unprompted_ns:
@@ -160,13 +159,19 @@ class FakeMcu(Faults):
 
     def _name_itself(self, now_ns: int) -> None:
         if self.understand is protocol.whole:
-            self._send(now_ns, protocol.identity(self._counts, WATCHDOG_NS // MS, self.samples))
+            self._send(
+                now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
+            )
 
     def _reply(self, now_ns: int, command: protocol.Command) -> None:
-        if self.muted:
+        if self.muted or now_ns - self._replied_ns < self.reply_gap_ns:
             return
+        self._replied_ns = now_ns
         comma, end = self.ending[:-2].encode(), self.ending[-2:].encode()
-        text = protocol.speeds_text(self._speeds(now_ns), self.separator, self.unpadded) + comma
+        text = (
+            protocol.speeds_text(self._speeds(now_ns), self.separator, self.unpadded_replies)
+            + comma
+        )
         if command.sequence:
             sample = self._sample() if command.wants_sample and self.samples else ()
             text += protocol.suffix(text, command.sequence, sample)
@@ -176,7 +181,7 @@ class FakeMcu(Faults):
         self._send(now_ns, data[: len(data) // 2] if self.cut_replies else data)
 
     def _send(self, now_ns: int, data: bytes) -> None:
-        self._out_free_ns = max(self._out_free_ns, now_ns) + wire_ns(len(data), self._baud_rate)
+        self._out_free_ns = max(self._out_free_ns, now_ns) + wire_ns(len(data), self.baud_rate)
         self._schedule(self._out_free_ns, "sent", data)
 
     def _encoders(self) -> list[int]:
@@ -190,7 +195,9 @@ class FakeMcu(Faults):
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
-            moved = [b - a for a, b in zip(before, counts, strict=True)]
+            every = [b - a for a, b in zip(before, counts, strict=True)]
+            read = zip(self.encoders, self.encoder_signs, strict=True)
+            moved = [every[encoder] * sign for encoder, sign in read]
             self._measured = [count * scale for count in moved]
             for motor, (count, gain) in enumerate(zip(moved, self.gains, strict=True)):
                 self._counted[motor] += 0.0 if motor == self.stuck else count * gain
@@ -213,7 +220,9 @@ class FakeMcu(Faults):
         period_ns = int(period_s * NS_PER_S)
         clock = b"clock %d" % next(self._order)  # a new one: an older one's events go unheeded
         self._schedule(self._now_ns + period_ns, "report", clock)
-        with self._with(unprompted_ns=period_ns, _clock=clock, unpadded=True, ending=",\r\n"):
+        with self._with(
+            unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"
+        ):
             yield
 
 

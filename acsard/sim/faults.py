@@ -13,6 +13,9 @@ from acsard.values import NS_PER_S
 
 Fault = AbstractContextManager[None]
 
+WATCHDOG_NS = 300_000_000
+"""Silence after which the MCU stops the motors by itself."""
+
 
 class Faults:
     """The switches, all off; a `with` block turns one on and back."""
@@ -26,9 +29,19 @@ class Faults:
         self.extra_delay_ns = 0
         self.separator = ","
         self.ending = "\r\n"
-        self.unpadded = False
+        self.unpadded_replies = False
         self.unprompted_ns = 0
         self.watchdog = True
+        self.watchdog_ns = WATCHDOG_NS
+        self.baud_rate = 115200
+        self.reply_gap_ns = 0
+        self.drivers = [0, 1, 2, 3]
+        """Which motor each channel's output turns."""
+        self.drives = [1.0] * 4
+        """What of a channel's command reaches its motor: 1, turned round -1, none 0."""
+        self.encoders = [0, 1, 2, 3]
+        """Which motor's encoder each channel reads."""
+        self.encoder_signs = [1, 1, 1, 1]
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.lose_reply = self.lose_command = self.bit_error = 0
@@ -79,9 +92,54 @@ class Faults:
         """Sees motor `wheel` (0 to 3 for a to d) stand whatever it does."""
         return self._with(stuck=wheel)
 
+    @contextmanager
+    def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
+        """Two channels are connected to each other's wheel, motor and encoder both."""
+        with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
+            yield
+
+    def swapped_motors(self, wheel: int, other: int) -> Fault:
+        """Two channels turn each other's motor."""
+        return self._with(drivers=_swapped(self.drivers, wheel, other))
+
+    def swapped_encoders(self, wheel: int, other: int) -> Fault:
+        """Two channels read each other's encoder."""
+        return self._with(encoders=_swapped(self.encoders, wheel, other))
+
+    @contextmanager
+    def reversed_wheel(self, wheel: int) -> Iterator[None]:
+        """The wheel is mounted the other way round: its motor turns back and its encoder agrees."""
+        with self.reversed_motor(wheel), self.reversed_encoder(wheel):
+            yield
+
+    def reversed_motor(self, wheel: int) -> Fault:
+        """The motor's two leads are swapped."""
+        return self._with(drives=[-d if i == wheel else d for i, d in enumerate(self.drives)])
+
+    def reversed_encoder(self, wheel: int) -> Fault:
+        """The encoder's A and B are swapped."""
+        signs = enumerate(self.encoder_signs)
+        return self._with(encoder_signs=[-s if i == wheel else s for i, s in signs])
+
+    def dead_motor(self, wheel: int) -> Fault:
+        """The motor does not turn."""
+        return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
+
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
         """Takes `delay_s` longer to act and answer."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
+
+    def sparse_replies(self, period_s: float = 0.1) -> Fault:
+        """Answers only one line in so long."""
+        return self._with(reply_gap_ns=int(period_s * NS_PER_S))
+
+    def other_baud(self, baud_rate: int) -> Fault:
+        """Speaks and listens at another rate than it was configured for."""
+        return self._with(baud_rate=baud_rate)
+
+    def unpadded(self) -> Fault:
+        """Writes speeds below ten with one integer digit."""
+        return self._with(unpadded_replies=True)
 
     def spaces(self) -> Fault:
         """Writes a space after every comma."""
@@ -111,6 +169,10 @@ class Faults:
         """Keeps the motors running when the host falls silent."""
         return self._with(watchdog=False)
 
+    def late_watchdog(self, time_s: float = 1.0) -> Fault:
+        """Stops the motors only after so long a silence."""
+        return self._with(watchdog_ns=int(time_s * NS_PER_S))
+
     def lost_replies(self, every: int = 5) -> Fault:
         """Every so many-th reply is lost on the way."""
         return self._with(lose_reply=every)
@@ -125,8 +187,21 @@ class Faults:
 
 
 FAULTS = (
-    "mute", "noise", "partial_line", "slow_reply", "spaces", "trailing_comma", "comma_latched",
-    "no_check", "plain_only", "no_sample", "no_watchdog", "lost_replies", "lost_commands",
-    "bit_errors", "unprompted",
+    "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
+    "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
+    "late_watchdog", "lost_replies", "lost_commands", "bit_errors", "unprompted",
 )  # fmt: skip
 """The faults that need no argument, by method name: what `acsard sim --fault` offers."""
+
+ARGUMENTS = {
+    "stuck_encoder": "m", "dead_motor": "m", "reversed_motor": "m", "reversed_encoder": "m",
+    "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
+    "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
+}  # fmt: skip
+"""The faults that need arguments: `m` a motor, 0 to 3 for a to d; `n` a number."""
+
+
+def _swapped(order: list[int], one: int, other: int) -> list[int]:
+    swapped = list(order)
+    swapped[one], swapped[other] = order[other], order[one]
+    return swapped

@@ -112,10 +112,18 @@ def _hex(number: int, digits: int) -> bytes:
 
 
 def _crc(data: bytes) -> int:
-    """CRC-16/XMODEM, bit by bit: polynomial x16 + x12 + x5 + 1, from 0."""
+    """CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, from 0."""
     crc = 0
     for byte in data:
-        for bit in range(8):
-            top = crc >> 15 ^ byte >> (7 - bit) & 1
-            crc = (crc << 1 & 0xFFFF) ^ (0x1021 if top else 0)
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_OF[crc >> 8 ^ byte]
     return crc
+
+
+def _crc_of(byte: int) -> int:
+    crc = byte << 8
+    for _ in range(8):
+        crc = (crc << 1 & 0xFFFF) ^ (0x1021 if crc >> 15 else 0)
+    return crc
+
+
+_CRC_OF = [_crc_of(byte) for byte in range(256)]

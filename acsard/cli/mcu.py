@@ -1,0 +1,279 @@
+"""`acsard mcu check`: prove the microcontroller's side on one's own robot, wheels lifted.
+
+What is looked at, and in which order, is `checkup/procedure.py`'s; here are the port, the person
+and what is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import Overrides, add_config, find, load
+from acsard.cli.config_file import change, require_tomlkit
+from acsard.runtime.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.checkup.findings import Finding
+    from acsard.checkup.outside import Wire
+    from acsard.settings import Config
+
+SIMULATOR = "sim"
+
+COLOURS = {"PASS": 32, "WARN": 33, "FAIL": 31, "SKIPPED": 90}
+
+DESCRIPTION = """\
+Find out on your own robot, wheels lifted, what its microcontroller speaks and whether it keeps
+what the robot's safety rests on: baud rate, dialect and trailing comma, reply rate and round trip,
+the checked link, each motor and encoder alone, the watchdog, damaged lines. It opens the port
+itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one, then
+together, at 3 rad/s at the most, after you have typed that the wheels are lifted; the last lines
+out are zeros, whatever happens. Exit 0 when nothing fails, 1 when something does.
+"""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "mcu",
+        help="prove the microcontroller's side on your own robot, wheels lifted",
+        description="What has to do with the microcontroller alone, without the daemon.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    check = actions.add_parser(
+        "check",
+        help="dialect, wheels, watchdog and damage, and the lines of acsard.toml",
+        description=DESCRIPTION,
+    )
+    add_config(check)
+    check.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
+    check.add_argument("--baud-rate", type=int, metavar="N", help="tried first; 9600 to 115200")
+    check.add_argument(
+        "--yes",
+        action="store_true",
+        help="ask nothing: on the simulator; on a robot only with --wheels-are-lifted",
+    )
+    check.add_argument(
+        "--wheels-are-lifted",
+        action="store_true",
+        help="with --yes: you have made sure that no wheel touches anything, and watch the robot",
+    )
+    check.add_argument("--json", action="store_true", help="print one JSON object")
+    check.add_argument(
+        "--write",
+        action="store_true",
+        help="also write the lines into the configuration file, comments kept (needs the extra: "
+        "pip install 'acsard[mcu]')",
+    )
+    check.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Check and tell."""
+    from acsard.checkup import advice, procedure
+
+    given: Overrides = {}
+    for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
+        if value is not None:
+            given.setdefault("mcu", {})[key] = value
+    where, config = load(args.config, given)
+    _, configured = load(args.config)
+    if args.write:
+        _writable(args.config)
+    port = config.mcu.port
+    person: Person | Nobody = Nobody(args.json) if args.yes else Person()
+    _may(args, port)
+    findings: list[Finding] = []
+
+    def tell(finding: Finding) -> None:
+        findings.append(finding)
+        if not args.json:
+            print("\n".join(row(finding, sys.stdout.isatty())), flush=True)
+
+    if not args.json:
+        simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""
+        print(f"port {port}{simulated}, configuration {where}", flush=True)
+    with ended_by_signals():
+        procedure.run(_wire(config), person, config, tell)
+    changes = advice.changes(findings, configured)
+    failed = any(finding.verdict == "FAIL" for finding in findings)
+    trouble: ExitError | None = None
+    if args.write and changes:
+        try:
+            change(Path(where), changes)
+        except ExitError as error:  # a minute's findings are told first
+            trouble = error
+    written = bool(args.write and changes and not trouble)
+    if args.json:
+        _print_json(port, findings, changes, where if written else None)
+    else:
+        _sum_up(findings, advice.lines(changes), where, written)
+    if trouble is not None:
+        raise trouble
+    return int(Exit.FAILURE if failed else Exit.OK)
+
+
+def _wire(config: Config) -> Wire:
+    """The port, or the simulator in virtual time: nobody waits for what does not turn."""
+    if config.mcu.port == SIMULATOR:
+        from acsard.sim.fake_mcu import FakeMcu
+        from acsard.sim.virtual_wire import VirtualWire
+
+        return VirtualWire(FakeMcu(config))
+    from acsard.runtime.serial_wire import SerialWire
+
+    return SerialWire(config.mcu.port)
+
+
+# who may
+
+
+def _may(args: argparse.Namespace, port: str) -> None:
+    """Raises unless somebody answers for the wheels: a person here, or nothing real can move."""
+    if not args.yes:
+        if not sys.stdin.isatty():
+            raise ExitError(
+                Exit.USAGE,
+                "mcu check turns the wheels and asks a person who sees them: run it in a "
+                "terminal; `--yes` without one is for the simulator (--port sim)",
+            )
+        return
+    if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
+        return
+    from acsard.runtime.host import master_of
+
+    master = master_of(port)
+    if master is None or master.name != "acsard":
+        what = f"a pty of {master.name}" if master else "no simulator of acsard's"
+        raise ExitError(
+            Exit.USAGE,
+            f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
+            "a question. Leave --yes out; or lift the wheels, stay with the robot, and add "
+            "--wheels-are-lifted",
+        )
+
+
+def _writable(path: str | None) -> None:
+    require_tomlkit()
+    where, text = find(path)
+    if not text and not Path(where).is_file():
+        raise ExitError(
+            Exit.FAILURE,
+            "--write has no configuration file to write to: name it by --config, or make an "
+            "acsard.toml here (an empty one is valid)",
+        )
+
+
+class Person:
+    """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
+
+    def say(self, text: str) -> None:
+        """Tell what happens now."""
+        print(f"   ... {text}", file=sys.stderr, flush=True)
+
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        """One of the answers; the end of the input ends the check."""
+        choice = f" [{'/'.join(answers)}]" if len(answers) > 1 else ""
+        while True:
+            print(f"\n{question}{choice} ", end="", file=sys.stderr, flush=True)
+            line = sys.stdin.readline()
+            if not line:
+                raise KeyboardInterrupt
+            word = line.strip().lower()
+            if word in answers:
+                return word
+            print(f"   please type {' or '.join(answers)}", file=sys.stderr)
+
+
+class Nobody:
+    """Confirms what has been said on the command line, and sees nothing."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
+
+    def say(self, text: str) -> None:
+        """Nobody listens; whoever looks at the screen may know."""
+        if not self._quiet and sys.stderr.isatty():
+            print(f"   ... {text}", file=sys.stderr, flush=True)
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        """The confirmation; no wheel has been seen to turn."""
+        return answers[0] if len(answers) == 1 else None
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Signals end the check by an exception, so that the zeros go out; a second one is too late."""
+    # Ctrl-Z too: a check that is suspended would leave a wheel turning.
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+    before = [signal.getsignal(number) for number in numbers]
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        print("\nstopping: zeros go out, then the port is closed", file=sys.stderr)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+# telling
+
+
+def row(finding: Finding, colours: bool) -> list[str]:
+    """A finding for people: verdict, name and figure, then what it means and the mend."""
+    mark = f"{finding.verdict:<7}"
+    if colours:
+        mark = f"\033[{COLOURS[finding.verdict]}m{mark}\033[0m"
+    found = [f"{mark} {finding.name:<22} {finding.figure}".rstrip()]
+    for lead, text in (("", finding.text), ("-> ", finding.mend)):
+        if text:
+            indent = " " * 8
+            found += textwrap.wrap(
+                text, 100, initial_indent=indent + lead, subsequent_indent=indent + " " * len(lead)
+            )
+    return found
+
+
+def _sum_up(findings: Sequence[Finding], lines: Sequence[str], where: str, written: bool) -> None:
+    counts = {v: sum(1 for f in findings if f.verdict == v) for v in COLOURS}
+    print("\n" + ", ".join(f"{n} {v}" for v, n in counts.items() if n))
+    if not lines:
+        print("acsard.toml: nothing to change")
+        return
+    print(f"\n{where}: written" if written else "\nfor acsard.toml:")
+    print("\n".join(lines))
+
+
+def _print_json(
+    port: str, findings: Sequence[Finding], changes: dict[str, object], written: str | None
+) -> None:
+    import msgspec
+
+    from acsard.checkup import advice
+
+    found = {
+        "port": port,
+        "passed": not any(finding.verdict == "FAIL" for finding in findings),
+        "findings": findings,
+        "changes": changes,
+        "toml": "\n".join(advice.lines(changes)),
+        "written": written,
+    }
+    print(msgspec.json.encode(found).decode())

@@ -1,0 +1,217 @@
+"""`acsard mcu check` as a person uses it: at a terminal, and on ptys with faults planted."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.harness import ROOT, Bus, Daemon, Program, acsard, finish, until
+from tests.system.test_cli import ON_TERMINAL, Terminal
+
+CHECK_S = 60.0
+"""A check takes 13 to 25 s; this is for a machine that is busy with other things."""
+
+WHEELS = ("fr", "fl", "rl", "rr")
+
+
+def test_a_port_that_the_daemon_holds_ends_with_75_and_how_to_stop_it(
+    shared: Daemon, bus: Bus, tmp_path: Path
+) -> None:
+    port = bus.get("info")["port"]
+    ended = finish(acsard("mcu", "check", "--port", port, "--yes"), tmp_path)
+    assert ended.code == 75
+    assert f"process {shared.pid}" in ended.err
+    assert "systemctl stop acsard" in ended.err
+    assert bus.state()["link"] == "up"
+
+
+def test_a_port_that_is_not_there_ends_with_66(tmp_path: Path) -> None:
+    ended = finish(acsard("mcu", "check", "--port", "/dev/acsar_none", "--yes"), tmp_path)
+    assert ended.code == 66
+    assert "acsard ports" in ended.err
+
+
+def test_without_a_terminal_it_refuses_with_2(tmp_path: Path) -> None:
+    ended = finish(acsard("mcu", "check"), tmp_path)
+    assert (ended.code, ended.out) == (2, "")
+    assert "terminal" in ended.err
+
+
+def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s(tmp_path: Path) -> None:
+    ends = pty.openpty()
+    try:
+        words = acsard("mcu", "check", "--yes", "--port", os.ttyname(ends[1]))
+        ended = finish(words, tmp_path)
+    finally:
+        for end in ends:
+            os.close(end)
+    assert (ended.code, ended.out) == (2, "")
+    assert "--wheels-are-lifted" in ended.err
+
+
+@contextmanager
+def at_terminal(where: Path, *words: str) -> Iterator[tuple[Terminal, Program]]:
+    """A check at a terminal of its own."""
+    with Terminal() as terminal:
+        command = [sys.executable, "-c", ON_TERMINAL, "mcu", "check", *words]
+        with Program(
+            command,
+            where,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=terminal.slave,
+            start_new_session=True,
+        ) as program:
+            yield terminal, program
+
+
+def answer(terminal: Terminal, question: str, word: str, times: int, within: float) -> None:
+    """Wait until the question has been asked so many times, then type."""
+    until(lambda: terminal.screen.count(question) >= times, within, f"{question}, {times} times")
+    terminal.press(f"{word}\n")
+
+
+def answer_all(terminal: Terminal, wheels: tuple[str, ...], ways: str, within: float) -> None:
+    answer(terminal, 'then type "lifted"', "lifted", 1, within)
+    for n, (wheel, way) in enumerate(zip(wheels, ways, strict=True), 1):
+        answer(terminal, "which wheel did", wheel, n, within)
+        answer(terminal, "which way did", {"f": "forward", "b": "back"}[way], n, within)
+
+
+def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path) -> None:
+    (tmp_path / "acsard.toml").write_text("# mine\n")
+    with at_terminal(tmp_path, "--port", "sim", "--write") as (terminal, program):
+        answer(terminal, 'then type "lifted"', "yes", 1, 10.0)
+        until(lambda: "please type lifted" in terminal.screen, 5.0, "what to type")
+        answer_all(terminal, ("fl", "fr", "rl", "rr"), "ffbf", 10.0)
+        assert program.ended(CHECK_S) == 1
+    written = tomllib.loads((tmp_path / "acsard.toml").read_text())
+    assert written["mcu"]["wheels"] == {
+        "front_right": "+b",
+        "front_left": "+a",
+        "rear_left": "-c",
+    }
+
+
+def test_ctrl_c_at_the_first_question_ends_it_with_130(tmp_path: Path) -> None:
+    with at_terminal(tmp_path, "--port", "sim") as (terminal, program):
+        until(lambda: "lifted" in terminal.screen, 10.0, "the question")
+        terminal.press("\x03")
+        assert program.ended(5.0) == 130
+        assert "Traceback" not in terminal.screen
+
+
+# on ptys, in real time
+
+FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
+    "good": ("", [], {}),
+    "swapped": ("swapped_encoders=a:d", ["motor a (front right)", "motor d (rear right)"], {}),
+    "reversed": ("reversed_encoder=b", ["motor b (front left)"], {}),
+    "comma": (
+        "comma_latched",
+        ["trailing comma", "damaged lines"],
+        {"mcu.trailing_comma": True},
+    ),
+    "no watchdog": ("no_watchdog", ["watchdog"], {}),
+    "late watchdog": ("late_watchdog", ["watchdog"], {}),
+    "dead encoder": ("stuck_encoder=c", ["motor c (rear left)"], {}),
+    "baud": ("other_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),
+    "10 Hz": ("unprompted", ["reply rate"], {"mcu.reply_period": 0.1}),
+    "spaces": ("spaces", [], {}),
+    "unpadded": ("unpadded", [], {}),
+}
+
+
+def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
+    """Exit code, answer and what the simulator heard last, of a check of one faulty robot."""
+    fault = FAULTS[name][0]
+    place = where / name
+    place.mkdir()
+    config = place / "acsard.toml"
+    shutil.copy(ROOT / "acsard.toml", config)
+    words = ["--fault", fault] if fault else []
+    with Program(acsard("sim", *words), place) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        check = acsard("mcu", "check", "--port", port, "--yes", "--json", "--write")
+        ended = finish(check, place, CHECK_S)
+    assert ended.err == ""
+    return ended.code, json.loads(ended.out), config.read_text()
+
+
+@pytest.mark.network
+def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(len(FAULTS)) as pool:
+        results = dict(zip(FAULTS, pool.map(lambda n: checked(tmp_path, n), FAULTS), strict=True))
+    for name, (_, failed, changes) in FAULTS.items():
+        code, found, text = results[name]
+        named = [one["name"] for one in found["findings"] if one["verdict"] == "FAIL"]
+        assert named == failed, (name, found)
+        assert code == (1 if failed else 0)
+        assert changes.items() <= found["changes"].items(), name
+        if name in ("spaces", "unpadded"):
+            form = next(one for one in found["findings"] if one["name"] == "reply form")
+            assert (form["verdict"], form["figure"]) == ("WARN", name)
+        # Every line of the reference is there still, but for the values of the keys that changed.
+        reference = (ROOT / "acsard.toml").read_text().splitlines()
+        pairs = zip(reference, text.splitlines(), strict=True)
+        differing = [after for before, after in pairs if before != after]
+        assert sorted(re.split(" =", line)[0] for line in differing) == sorted(
+            key.rpartition(".")[2] for key in found["changes"]
+        )
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGTSTP])
+def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: signal.Signals) -> None:
+    with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        words = acsard("mcu", "check", "--port", port, "--yes")
+        with Program(words, tmp_path) as check:
+            check.says("checked link")
+            # It is silent now for as long as motor a turns.
+            with pytest.raises(subprocess.TimeoutExpired):
+                check.process.wait(0.5)
+            check.signal(number)
+            assert check.ended(5.0) == (130 if number == signal.SIGINT else 128 + number)
+            assert "zeros go out" in check.stderr
+            assert "Traceback" not in check.stderr
+        # The next one finds the wheels standing, and the port free.
+        words = acsard("mcu", "check", "--port", port, "--yes")
+        with Program(words, tmp_path) as again:
+            again.says("PASS    motor a", 30.0)
+
+
+@pytest.mark.network
+def test_a_person_at_a_real_port_is_asked_after_each_motor(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--fault", "reversed_wheel=c"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        with at_terminal(tmp_path, "--port", port) as (terminal, program):
+            answer_all(terminal, WHEELS, "ffbf", 20.0)
+            assert program.ended(CHECK_S) == 1
+            until(lambda: 'rear_left = "-c"' in terminal.screen, 5.0, "the line")
+
+
+@pytest.mark.network
+def test_a_port_that_is_lost_while_a_wheel_turns_is_a_finding(tmp_path: Path) -> None:
+    with Program(acsard("sim"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as check:
+            check.says("checked link")
+            sim.process.kill()
+            assert check.ended(10.0) == 1
+        assert "FAIL    serial line" in check.stdout
+        assert "Traceback" not in check.stderr

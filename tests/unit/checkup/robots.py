@@ -1,0 +1,138 @@
+"""Robots on blocks for the tests of the check: a fake MCU, a wire in virtual time, a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import msgspec
+
+from acsard.checkup import advice, procedure
+from acsard.checkup.bench import Bench
+from acsard.checkup.findings import Finding
+from acsard.cli.sim import fault
+from acsard.settings import Config
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.faults import ARGUMENTS
+from acsard.sim.virtual_wire import VirtualWire
+
+MS = 1_000_000
+
+SHORT = dict(zip(("fr", "fl", "rl", "rr"), range(4), strict=True))
+
+
+class Robot(VirtualWire):
+    """A robot with these faults, and what it was sent."""
+
+    def __init__(self, *faults: str, config: Config | None = None, **mcu: Any) -> None:
+        """`config` is how it is built; `mcu` the keys the host has otherwise."""
+        self.built = config or Config()
+        self.config = configured(self.built, **mcu)
+        super().__init__(FakeMcu(self.built))
+        self.faults = faults
+        self.sent: list[bytes] = []
+        self.turned: dict[int, bool] = {}
+        """Which wheels have turned since this was last emptied, and whether forward first."""
+        self.opened: list[int] = []
+
+    def open(self, baud_rate: int) -> None:
+        super().open(baud_rate)
+        self.opened.append(baud_rate)
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+        for wheel, speed in enumerate(self.mcu.vehicle.speeds):
+            if abs(speed) > 1.0:
+                self.turned.setdefault(wheel, speed > 0)
+        super().send(data)
+
+    @contextmanager
+    def faulty(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            for text in self.faults:
+                name, values = fault(text)
+                kinds = ARGUMENTS.get(name, "")
+                given = [int(v) if v.is_integer() else v for v in values]
+                assert len(kinds) == len(given)
+                stack.enter_context(getattr(self.mcu, name)(*given))
+            yield
+
+    @contextmanager
+    def bench(self, rest: bool = True) -> Iterator[Bench]:
+        """The bench alone, the line open and the motors known to stand, if they can say so."""
+        with self.faulty(), Bench(self, self.config.mcu, self.config.rate_hz) as bench:
+            bench.open(self.config.mcu.baud_rate)
+            if rest:
+                bench.rest()
+                bench.armed = True
+            yield bench
+
+    def later(self) -> list[float]:
+        """What the motors are told to do once all that was sent has arrived."""
+        self.mcu.advance(self.now_ns() + 1000 * MS)
+        return [abs(speed) for speed in self.mcu.vehicle.set_points]
+
+
+def configured(config: Config, **mcu: Any) -> Config:
+    """The configuration with other keys of `[mcu]`."""
+    changed = msgspec.structs.replace(config.mcu, **mcu)
+    return msgspec.structs.replace(config, mcu=changed)
+
+
+class Nobody:
+    """Confirms, and sees nothing: `--yes`."""
+
+    def say(self, text: str) -> None: ...
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        return answers[0] if len(answers) == 1 else None
+
+
+class Person(Nobody):
+    """Stands beside the robot and says what its wheels did."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    def say(self, text: str) -> None:
+        self._robot.turned.clear()
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        assert not any(abs(v) > 0.5 for v in self._robot.mcu.vehicle.speeds), "asked at speed"
+        self._robot.listen(self._robot.now_ns() + 20_000 * MS)  # people take their time
+        seen = self._robot.turned
+        if len(answers) == 1:
+            return answers[0]
+        if "forward" in answers:
+            return "forward" if next(iter(seen.values())) else "back"
+        names = list(SHORT)
+        return names[next(iter(seen))] if seen else "none"
+
+
+class Checked:
+    """What a check of a robot found."""
+
+    def __init__(self, robot: Robot, person: bool = False) -> None:
+        self.findings: list[Finding] = []
+        operator = Person(robot) if person else Nobody()
+        with robot.faulty():
+            procedure.run(robot, operator, robot.config, self.findings.append)
+            self.left_turning = any(robot.later())
+        self.changes = advice.changes(self.findings, robot.config)
+
+    def __getitem__(self, name: str) -> Finding:
+        """The finding whose name begins so."""
+        return next(f for f in self.findings if f.name.startswith(name))
+
+    def named(self, verdict: str) -> list[str]:
+        return [f.name for f in self.findings if f.verdict == verdict]
+
+    @property
+    def failed(self) -> list[str]:
+        return self.named("FAIL")
+
+
+def check(*faults: str, person: bool = False, **how: Any) -> Checked:
+    """Check a robot with these faults."""
+    return Checked(Robot(*faults, **how), person)

@@ -1,0 +1,105 @@
+"""The bench: what goes out, what counts as an answer, and when it ends a check."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup.bench import REST_S, SPEED, ZERO, Bench
+from acsard.checkup.findings import StoppedError
+from acsard.settings import McuConfig
+from tests.unit.checkup.robots import Robot
+
+
+def test_a_bench_that_never_opened_its_line_sends_nothing_when_left() -> None:
+    robot = Robot()
+    with Bench(robot, McuConfig(), 100.0):
+        pass
+    assert robot.sent == []
+
+
+def test_a_line_speaks_of_motors_whatever_the_wheels_are() -> None:
+    robot = Robot()
+    with robot.bench() as bench:
+        assert bench.line((1.0, -2.0, 0.0, 3.0)) == b"ap01.00,bn02.00,cp00.00,dp03.00\r\n"
+        assert bench.line((1.0, -2.0, 0.0, 3.0), True).endswith(b"dp03.00,\r\n")
+        bench.sealed = bench.sampled = True
+        assert bench.line(ZERO).startswith(b"ap00.00,bp00.00,cp00.00,dp00.00#01S*")
+
+
+def test_driving_gives_an_answer_to_every_line_and_the_speeds_it_says() -> None:
+    robot = Robot()
+    with robot.bench() as bench:
+        before = len(robot.sent)
+        replies = bench.drive((SPEED, 0.0, 0.0, 0.0), 0.5)
+        assert len(replies) >= len(robot.sent) - before - 2 >= 20
+        assert replies[-1].motors[0] == pytest.approx(SPEED, abs=0.2)
+        assert replies[-1].motors[1:] == (0.0, 0.0, 0.0)
+        assert bench.turning() == [0]
+        assert bench.rest() == "rest"
+        assert bench.turning() == []
+
+
+def test_answers_come_at_the_time_they_were_complete() -> None:
+    robot = Robot()
+    with robot.bench() as bench:
+        replies = bench.drive(ZERO, 0.3)
+        times = [reply.at_ns for reply in replies]
+        assert times == sorted(times)
+        assert times[-1] <= robot.now_ns()
+
+
+@pytest.mark.parametrize("sent", [False, True])
+def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: bool) -> None:
+    robot = Robot("comma_latched", trailing_comma=sent)
+    with robot.bench() as bench:
+        bench.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
+        assert bench.rest() == ("rest" if sent else "comma")
+        assert bench.comma
+    assert robot.later() == [0.0] * 4
+
+
+def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
+    class Deaf(Robot):
+        def send(self, data: bytes) -> None:
+            super().send(data)
+            if self.mcu.vehicle.speeds[0] > 2.0:
+                self.mcu.understand = lambda line: None
+
+    robot = Deaf("no_watchdog", "unprompted")
+    with robot.bench() as bench:
+        bench.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
+        with pytest.raises(StoppedError) as end:
+            bench.rest()
+    assert end.value.finding.name == "stop"
+    assert f"{2 * REST_S:g} s" in end.value.finding.figure
+    assert "motor a (front right)" in end.value.finding.text
+
+
+def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
+    robot = Robot("mute")
+    wild = b"ap80.00,bp00.00,cp00.00,dp00.00\r\n"
+    still = wild.replace(b"80", b"00")
+
+    def answered(*lines: bytes) -> None:
+        bench = Bench(robot, McuConfig(), 100.0)
+        bench.open(115200)
+        bench.armed = True
+        queue = list(lines)
+        robot.listen = lambda until_ns: [(robot.now_ns(), queue.pop(0))]  # type: ignore[method-assign]
+        for _ in lines:
+            bench.listen(0.02)
+
+    answered(still, still, wild, still)
+    with pytest.raises(StoppedError):
+        answered(still, still, wild, wild, wild)
+
+
+def test_silence_ends_it_only_while_somebody_drives() -> None:
+    robot = Robot("plain_only")
+    with robot.bench() as bench:
+        bench.listen(5.0)
+        bench.drive(ZERO, 0.2)
+        with robot.mcu.mute(), pytest.raises(StoppedError) as end:
+            bench.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
+    assert end.value.finding.name == "link"
+    assert robot.later() == [0.0] * 4

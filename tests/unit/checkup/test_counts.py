@@ -1,0 +1,88 @@
+"""Counts against speeds."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from acsard.checkup import counts
+from acsard.checkup.bench import Reply
+from acsard.checkup.dialect import check, identity
+from acsard.checkup.turning import turn
+from acsard.mcu.check import Reading
+from acsard.settings import Config, SimConfig
+from tests.unit.checkup.robots import Robot
+
+
+def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Reply]:
+    found = []
+    for n in range(100):
+        turned = round(n * 0.02 * speed / math.tau * per_turn)
+        reading = Reading((65500 + 20 * n) % 65536, ((start + turned) % 65536, 0, 0, 0))
+        found.append(Reply(n, (speed, 0.0, 0.0, 0.0), b"", reading))
+    return found
+
+
+@pytest.mark.parametrize("per_turn", [64, 3200, 40000])
+@pytest.mark.parametrize("speed", [3.0, -3.0])
+def test_counts_per_turn_come_out_over_wraps_of_clock_and_counts(
+    per_turn: int, speed: float
+) -> None:
+    measured = counts.per_turn(replies(per_turn, speed), [0])
+    assert measured == pytest.approx(per_turn, rel=0.02)
+
+
+def test_too_little_turned_says_nothing() -> None:
+    assert counts.per_turn(replies(3200)[:20], [0]) is None
+    assert counts.per_turn(replies(3200), [1]) is None
+    assert counts.per_turn(replies(3200), []) is None
+
+
+@pytest.mark.parametrize(
+    ("configured", "identified", "verdict", "keys"),
+    [
+        (0, True, "PASS", {"mcu.encoder_counts": 3200}),
+        (3200, True, "PASS", {"mcu.encoder_counts": 3200}),
+        (1600, True, "FAIL", {"mcu.encoder_counts": 3200}),
+        (3210, False, "PASS", {"mcu.encoder_counts": 3210}),
+    ],
+)
+def test_what_is_said_of_the_configured_counts(
+    configured: int, identified: bool, verdict: str, keys: dict[str, object]
+) -> None:
+    with Robot(link_check="auto", encoder_counts=configured).bench() as bench:
+        check(bench)
+        if identified:
+            identity(bench)
+        for motor in range(4):
+            turn(bench, motor, 3.0)
+            bench.rest()
+        finding = counts.finding(bench, [0, 1, 2, 3])
+    assert (finding.verdict, finding.keys) == (verdict, keys)
+
+
+def test_counts_that_are_not_as_identified_are_a_fault() -> None:
+    with Robot(config=Config(sim=SimConfig(encoder_counts=2000))).bench() as bench:
+        check(bench)
+        bench.identity = {"counts": "3200"}
+        turn(bench, 0, 3.0)
+        turn(bench, 0, 3.0)
+        finding = counts.finding(bench, [0])
+    assert finding.verdict == "FAIL"
+    assert not finding.keys
+
+
+def test_counts_against_the_speeds_are_a_fault() -> None:
+    robot = Robot()
+    with robot.bench() as bench:
+        bench.sampled = True
+        bench.replies = [Reply(r.at_ns, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
+                         for r in replies(3200)]  # fmt: skip
+        assert "against" in counts.finding(bench, [0]).text
+
+
+def test_more_counts_than_the_host_takes_are_a_warning() -> None:
+    with Robot().bench() as bench:
+        bench.sampled, bench.identity = True, {"counts": "400000"}
+        assert counts.finding(bench, []).verdict == "WARN"

@@ -1,0 +1,376 @@
+"""The whole check in virtual time: good robots pass, each planted fault is found and named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import pytest
+
+from acsard.checkup import procedure
+from acsard.checkup.findings import Finding, WireLostError
+from acsard.mcu.frames import Codec
+from acsard.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.values import WHEELS
+from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured
+
+MOTORS = "abcd"
+
+# robots that are right
+
+GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
+    "plain": (("plain_only",), {}),
+    "checked": (("no_sample",), {"link_check": "auto"}),
+    "samples": ((), {"link_check": "require", "encoder_counts": 3200}),
+    "old sketch": (("unprompted", "plain_only"), {"reply_period": 0.1}),
+    "comma sent": ((), {"trailing_comma": True}),
+}
+
+
+@pytest.mark.parametrize(("faults", "mcu"), GOOD.values(), ids=GOOD)
+@pytest.mark.parametrize("person", [False, True])
+def test_a_robot_that_is_right_passes(
+    faults: tuple[str, ...], mcu: dict[str, Any], person: bool
+) -> None:
+    checked = check(*faults, person=person, **mcu)
+    assert checked.failed == []
+    assert checked.named("WARN") == (["reply form"] if "unprompted" in faults else [])
+    assert not checked.left_turning
+    new = {"mcu.link_check", "mcu.encoder_counts"} if not faults and len(mcu) == 1 else set()
+    assert set(checked.changes) == new
+
+
+@pytest.mark.parametrize("baud", [9600, 19200, 38400, 57600])
+def test_a_slow_wire_passes(baud: int) -> None:
+    config = configured(Config(), baud_rate=baud)
+    assert check(config=config).failed == []
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.2])
+def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
+    for faults in ((), ("plain_only",), ("unprompted",)):
+        checked = check(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
+        assert set(checked.failed) <= {"reply rate"}
+        assert int(checked["watchdog"].figure.split()[0]) == pytest.approx(300, abs=60)
+
+
+def test_a_coarse_encoder_is_no_runaway() -> None:
+    assert check(config=Config(sim=SimConfig(encoder_counts=64))).failed == []
+
+
+def test_every_step_has_a_finding() -> None:
+    checked = check(person=True)
+    names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
+    assert names == set(procedure.STEPS)
+
+
+# the ten faults
+
+TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
+    ("swapped_motors=a:b", "motor a", "FAIL", "encoder b", "swap", {}),
+    ("reversed_motor=c", "motor c", "FAIL", "counts against", "swap", {}),
+    ("comma_latched", "trailing comma", "FAIL", "motor d (rear right) still turns after zeros",
+     "trailing_comma = true", {"mcu.trailing_comma": True}),
+    ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
+    ("late_watchdog", "watchdog", "FAIL", "1.0 s after", "300 ms", {}),
+    ("stuck_encoder=b", "motor b", "FAIL", "a dead encoder", "look whether", {}),
+    ("other_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
+     {"mcu.baud_rate": 57600}),
+    ("sparse_replies", "reply rate", "FAIL", "one reply in", "reply_period = 0.1",
+     {"mcu.reply_period": 0.1}),
+    ("spaces", "reply form", "WARN", "ap00.00, bp", "nothing to do", {}),
+    ("unpadded", "reply form", "WARN", "ap0.00,bp", "nothing to do", {}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "name", "verdict", "text", "mend", "changes"), TEN)
+def test_a_planted_fault_is_found_and_named(
+    fault: str, name: str, verdict: str, text: str, mend: str, changes: dict[str, object]
+) -> None:
+    checked = check(fault)
+    finding = checked[name]
+    assert finding.verdict == verdict
+    assert text in finding.text
+    assert mend in finding.mend
+    assert changes.items() <= checked.changes.items()
+    # What it is not is said to be right.
+    expected = {"swapped_motors=a:b": 2, "comma_latched": 2}.get(fault, verdict == "FAIL")
+    assert len(checked.failed) == expected
+    assert not checked.left_turning
+
+
+def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
+    checked = check("unprompted")
+    assert checked["reply rate"].figure == "10 Hz, by its own clock"
+    assert checked.changes["mcu.reply_period"] == 0.1
+
+
+@pytest.mark.parametrize("letter", MOTORS)
+@pytest.mark.parametrize("part", ["motor", "encoder"])
+def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
+    letter: str, part: str
+) -> None:
+    checked = check("plain_only", f"reversed_{part}={letter}", person=True)
+    assert len(checked.failed) == 1
+    mend = checked[f"motor {letter}"].mend
+    assert ("two leads of motor" if part == "motor" else f"A and B of encoder {letter}") in mend
+    assert not any(key.startswith("mcu.wheels") for key in checked.changes)
+
+
+@pytest.mark.parametrize("motor", range(4))
+def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) -> None:
+    checked = check("plain_only", f"reversed_wheel={MOTORS[motor]}", person=True)
+    assert checked.failed == ["wheel map"]
+    wheels = {k: v for k, v in checked.changes.items() if "wheels" in k}
+    assert wheels == {f"mcu.wheels.{WHEELS[motor]}": f"-{MOTORS[motor]}"}
+
+
+@pytest.mark.parametrize(("one", "other"), list(combinations(range(4), 2)))
+def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
+    checked = check("plain_only", f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
+    assert checked.failed == ["wheel map"]
+    assert checked.changes[f"mcu.wheels.{WHEELS[one]}"] == f"+{MOTORS[other]}"
+    assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[one]}"
+
+
+@pytest.mark.parametrize("what", ["motors", "encoders"])
+@pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
+def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, other: str) -> None:
+    checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
+    assert [name.partition(" (")[0] for name in checked.failed] == [
+        f"motor {one}",
+        f"motor {other}",
+    ]
+    assert f"{what} {one} and {other}" in checked[f"motor {one}"].mend
+
+
+def test_any_wiring_is_found_out() -> None:
+    wired = WheelMap(front_right="-c", front_left="+d", rear_left="-a", rear_right="+b")
+    robot = Robot(config=Config(mcu=McuConfig(wheels=wired)), wheels=WheelMap())
+    checked = Checked(robot, person=True)
+    found = {w: checked.changes[f"mcu.wheels.{w}"] for w in WHEELS}
+    assert found == {w: getattr(wired, w) for w in WHEELS}
+
+
+@pytest.mark.parametrize("part", ["dead_motor", "stuck_encoder"])
+@pytest.mark.parametrize("letter", MOTORS)
+def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
+    part: str, letter: str
+) -> None:
+    checked = check("plain_only", f"{part}={letter}", person=True)
+    assert len(checked.failed) == 1
+    says = "does not turn" if part == "dead_motor" else "a dead encoder"
+    assert says in checked[f"motor {letter}"].text
+
+
+def test_a_dead_last_motor_is_no_missing_comma() -> None:
+    checked = check("dead_motor=d")
+    assert checked["trailing comma"].verdict == "SKIPPED"
+    assert "mcu.trailing_comma" not in checked.changes
+
+
+def test_old_firmware_with_its_comma_configured_fails_by_its_damaged_lines_only() -> None:
+    checked = check("comma_latched", trailing_comma=True)
+    assert checked.failed == ["damaged lines"]
+
+
+def test_several_faults_at_once_are_all_found() -> None:
+    checked = check(
+        "comma_latched", "other_baud=57600", "reversed_motor=a", "stuck_encoder=b", "spaces",
+        "no_watchdog", "reversed_wheel=c", person=True,
+    )  # fmt: skip
+    assert [name.partition(" (")[0] for name in checked.failed] == [
+        "baud rate", "motor a", "motor b", "trailing comma", "wheel map", "watchdog",
+        "damaged lines",
+    ]  # fmt: skip
+    assert checked.named("WARN") == ["reply form"]
+    assert checked.changes == {
+        "mcu.baud_rate": 57600,
+        "mcu.trailing_comma": True,
+        "mcu.wheels.rear_left": "-c",
+    }
+    assert not checked.left_turning
+
+
+# what keeps it safe
+
+
+def zero(line: bytes) -> bool:
+    return line in (Codec(WheelMap()).stop, Codec(WheelMap(), True).stop, b"\r\n")
+
+
+def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted() -> None:
+    robot = Robot()
+
+    class Refuses(Nobody):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            assert all(zero(line) for data in robot.sent for line in data.splitlines(True))
+            assert answers == ("lifted",)
+            return None
+
+    findings: list[Finding] = []
+    procedure.run(robot, Refuses(), robot.config, findings.append)
+    assert [finding.name for finding in findings if finding.verdict != "SKIPPED"] == ["wheels"]
+    assert all(zero(line) for data in robot.sent for line in data.splitlines(True))
+    assert not robot.is_open
+
+
+class Trouble(Robot):
+    """Something happens with the n-th line."""
+
+    def __init__(self, number: int, error: BaseException, *faults: str) -> None:
+        super().__init__(*faults)
+        self._number, self._error = number, error
+
+    def send(self, data: bytes) -> None:
+        super().send(data)
+        if len(self.sent) == self._number:
+            raise self._error
+
+
+LINES = 560
+"""Nearly as many lines as a whole check sends."""
+
+
+@pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
+@pytest.mark.parametrize("number", range(2, LINES, 43))
+def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
+    error = KeyboardInterrupt if number % 2 else RuntimeError
+    robot = Trouble(number, error(), fault, "no_watchdog")
+    with robot.faulty(), pytest.raises(error):
+        procedure.run(robot, Nobody(), robot.config, lambda finding: None)
+    last = b"".join(robot.sent[-5:])
+    assert last.count(Codec(WheelMap()).stop) == last.count(Codec(WheelMap(), True).stop) == 5
+    with robot.faulty():
+        assert robot.later() == [0.0] * 4
+    assert not robot.is_open
+
+
+def test_a_signal_in_the_middle_of_the_last_zeros_does_not_keep_them_back() -> None:
+    class Interrupted(Robot):
+        interrupted = False
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            last = self.sent[-1].startswith(b"\r\nap") and len(self.sent) > 100
+            if last and not self.interrupted:
+                self.interrupted = True
+                raise KeyboardInterrupt
+            return super().listen(until_ns)
+
+    robot = Interrupted("plain_only")
+    with robot.faulty(), pytest.raises(KeyboardInterrupt):
+        procedure.run(robot, Nobody(), robot.config, lambda finding: None)
+    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap(), True).stop) == 5
+    assert not robot.is_open
+
+
+def test_a_listener_that_fails_ends_in_zeros_too() -> None:
+    robot = Robot("no_watchdog")
+
+    def tell(finding: Finding) -> None:
+        raise BrokenPipeError
+
+    with robot.faulty(), pytest.raises(BrokenPipeError):
+        procedure.run(robot, Nobody(), robot.config, tell)
+    assert robot.later() == [0.0] * 4
+
+
+def test_a_person_who_leaves_while_asked_leaves_a_robot_that_stands() -> None:
+    robot = Robot("no_watchdog", "comma_latched")
+
+    class Leaves(Nobody):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            if len(answers) > 1:
+                raise KeyboardInterrupt
+            return answers[0]
+
+    with robot.faulty(), pytest.raises(KeyboardInterrupt):
+        procedure.run(robot, Leaves(), robot.config, lambda finding: None)
+    assert robot.later() == [0.0] * 4
+
+
+@pytest.mark.parametrize("number", [5, 200, 400])
+def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
+    robot = Trouble(number, WireLostError("unplugged"))
+    checked = Checked(robot)
+    assert checked.failed == ["serial line"]
+    assert checked.findings[-1].verdict == "SKIPPED"
+    assert not robot.is_open
+
+
+@pytest.mark.parametrize(("gain", "text"), [(3, "more than 6 rad/s"), (-3, "against the command")])
+def test_a_runaway_stops_it_at_once(gain: int, text: str) -> None:
+    robot = Robot(f"bias=b:{gain}")
+    checked = Checked(robot)
+    assert checked.failed == ["runaway"]
+    assert text in checked["runaway"].text
+    assert checked["watchdog"].verdict == "SKIPPED"
+    told = [max(float(token[2:7]) for token in line.split(b",")[:4])
+            for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
+    # Motor a has had its 3 rad/s; b never was told more than what already looked like a runaway.
+    assert max(told) <= 3.0
+    assert not checked.left_turning
+
+
+def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
+    class Restarts(Robot):
+        def send(self, data: bytes) -> None:
+            super().send(data)
+            if len(self.sent) == 230:
+                self.mcu.reset(self.now_ns())
+
+    checked = Checked(Restarts())
+    assert checked.failed == ["link"]
+    assert "restarts" in checked["link"].mend
+
+
+def test_an_echo_is_not_taken_for_a_robot() -> None:
+    class Echo(Robot):
+        def send(self, data: bytes) -> None:
+            self.sent.append(data)
+            self.echo = getattr(self, "echo", b"") + data
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            data, self.echo = getattr(self, "echo", b""), b""
+            super().listen(until_ns)
+            return [(self.now_ns(), data)] if data else []
+
+    checked = Checked(Echo())
+    assert checked.failed == ["identification"]
+    assert checked["identification"].figure == "an echo"
+
+
+@pytest.mark.parametrize("fault", ["mute", "noise", "partial_line"])
+def test_an_mcu_that_says_nothing_good_is_never_driven(fault: str) -> None:
+    robot = Robot(fault)
+    checked = Checked(robot)
+    assert checked.failed == ["baud rate"]
+    assert robot.mcu.vehicle.angles == [0.0] * 4
+    assert set(robot.opened) == {9600, 19200, 38400, 57600, 115200}
+
+
+@pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors", "slow_reply"])
+def test_a_poor_line_ends_in_a_stop_whatever_is_found(fault: str) -> None:
+    assert not check(fault).left_turning
+
+
+def test_a_board_that_boots_when_opened_is_waited_for() -> None:
+    assert check(config=Config(sim=SimConfig(boot_time=2.0))).failed == []
+
+
+def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> None:
+    robot = Robot("plain_only", "no_watchdog")
+    Checked(robot)
+    turning_since: dict[str, int] = {}
+    for at_ns, line in robot.mcu.heard:
+        tokens = line.rstrip(b",\r\n").split(b",")
+        if len(tokens) != 4 or not line.startswith(b"a") or b"x" in line:
+            continue
+        speeds = [float(token[2:7]) for token in tokens if len(token) == 7]
+        assert max(speeds) <= 3.0
+        moving = any(speeds)
+        since = turning_since.setdefault("on", at_ns)
+        if not moving:
+            turning_since.clear()
+        assert at_ns - since < 4000 * MS

@@ -1,0 +1,66 @@
+"""Turning motors: at speed for a moment, at rest afterwards."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup import turning
+from acsard.checkup.bench import SPEED
+from tests.unit.checkup.robots import Nobody, Robot
+
+
+@pytest.mark.parametrize("motor", range(4))
+def test_one_motor_turns_and_no_other(motor: int) -> None:
+    robot = Robot("plain_only")
+    with robot.bench() as bench:
+        means = turning.turn(bench, motor, -SPEED)
+        assert means[motor] == pytest.approx(-SPEED, abs=0.1)
+        assert [m for m in range(4) if means[m]] == [motor]
+
+
+def test_the_speed_is_ramped() -> None:
+    robot = Robot("plain_only")
+    with robot.bench() as bench:
+        before = len(robot.sent)
+        turning.run_up(bench, turning.one(0, SPEED))
+        told = [float(line[2:7]) for line in robot.sent[before:]]
+    assert told[:9] == sorted(told[:9])
+    assert told[0] <= SPEED / 5
+    assert max(told) == SPEED
+
+
+def test_a_motor_that_shows_nothing_is_not_held_for_long() -> None:
+    robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
+    with robot.bench() as bench:
+        began = robot.now_ns()
+        turning.run_up(bench, turning.one(1, SPEED))
+        assert robot.now_ns() - began < 1e9
+
+
+def test_a_host_that_stalled_measures_again() -> None:
+    class Stalls(Robot):
+        stalls = 0
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            if self.mcu.vehicle.speeds[0] > 2.0 and not self.stalls:
+                self.stalls = 1
+                until_ns += 450_000_000
+            return super().listen(until_ns)
+
+    robot = Stalls("plain_only")
+    with robot.bench() as bench:
+        assert turning.turn(bench, 0, SPEED)[0] == pytest.approx(SPEED, abs=0.1)
+    assert robot.stalls == 1
+
+
+def test_every_motor_is_announced_before_it_turns() -> None:
+    said: list[str] = []
+
+    class Listener(Nobody):
+        def say(self, text: str) -> None:
+            said.append(text)
+
+    with Robot("plain_only").bench() as bench:
+        found = list(turning.channels(bench, Listener()))
+    assert [text.split()[1] for text in said] == list("abcd")
+    assert [comma is not None for _, comma in found] == [False, False, False, True]

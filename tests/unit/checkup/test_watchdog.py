@@ -1,0 +1,79 @@
+"""The watchdog's time, by each way of finding it out."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup import dialect, watchdog
+from acsard.checkup.turning import turn
+from acsard.settings import Config, SimConfig
+from tests.unit.checkup.robots import Robot
+
+ALL = (0, 1, 2, 3)
+
+
+class ByItsOwnClock(Robot):
+    """Firmware whose speeds are those of the moment, as a fixed control period measures them."""
+
+    def __init__(self, *faults: str, config: Config | None = None) -> None:
+        super().__init__(*faults, config=config)
+        self.mcu._speeds = lambda now_ns: list(self.mcu.vehicle.speeds)  # type: ignore[method-assign]
+
+
+def measured(robot: Robot, *motors: int) -> tuple[str, str]:
+    with robot.bench() as bench:
+        list(dialect.pace(bench))
+        dialect.check(bench)
+        for motor in range(4):
+            turn(bench, motor, 3.0)
+            bench.rest()
+        finding = watchdog.finding(bench, motors or ALL)
+        assert bench.turning() == []
+    assert robot.later() == [0.0] * 4
+    return finding.verdict, finding.figure
+
+
+@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
+@pytest.mark.parametrize("time_ms", [120, 450])
+@pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
+def test_a_time_within_the_contract_is_measured(
+    kind: tuple[str, ...], time_ms: int, robot: type[Robot]
+) -> None:
+    one = robot(*kind)
+    one.mcu.watchdog_ns = time_ms * 1_000_000
+    verdict, figure = measured(one)
+    value, _, about = figure.partition(" ms")
+    assert int(value) == pytest.approx(time_ms, abs=60 if about else 20)
+    assert verdict == "PASS"
+
+
+@pytest.mark.parametrize("kind", [("plain_only",), (), ("unprompted",)])
+@pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
+def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(
+    kind: tuple[str, ...], lag: float
+) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=lag))
+    for robot in (Robot, ByItsOwnClock):
+        verdict, figure = measured(robot(*kind, config=config))
+        assert int(figure.split()[0]) == pytest.approx(300, abs=80)
+        assert verdict == "PASS"
+
+
+@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "unprompted"])
+def test_none_and_one_too_long_fail(kind: str) -> None:
+    for robot in (Robot, ByItsOwnClock):
+        assert measured(robot(kind, "no_watchdog")) == ("FAIL", "none within 2.5 s")
+        verdict, figure = measured(robot(kind, "late_watchdog"))
+        assert verdict == "FAIL"
+        assert int(figure.split()[0]) == pytest.approx(1000, abs=100)
+
+
+def test_one_too_short_for_any_host_is_a_warning() -> None:
+    robot = Robot()
+    robot.mcu.watchdog_ns = 40_000_000
+    assert measured(robot)[0] == "WARN"
+
+
+def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
+    with Robot().bench() as bench:
+        assert watchdog.finding(bench, []).verdict == "SKIPPED"

@@ -1,0 +1,185 @@
+"""`acsard mcu check` in this process, on the built-in simulator."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import pty
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from acsard.checkup.findings import Finding
+from acsard.cli import mcu
+from acsard.config import parse
+from acsard.runtime.exits import Exit, ExitError
+
+
+def called(where: Path, *words: str, text: str = "") -> int:
+    """The exit code of a check with this configuration."""
+    file = where / "acsard.toml"
+    if not file.exists():
+        file.write_text(text)
+    parser = argparse.ArgumentParser()
+    mcu.add(parser.add_subparsers())
+    args = parser.parse_args(["mcu", "check", "--config", str(file), *words])
+    return int(args.main(args))
+
+
+def test_the_simulator_passes_and_the_lines_are_toml(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(tmp_path, "--port", "sim", "--yes") == 0
+    out = capsys.readouterr().out
+    assert "SIMULATOR" in out
+    assert "PASS    motor d (rear right)" in out
+    assert "FAIL" not in out
+    lines = out.split("for acsard.toml:\n")[1]
+    assert parse(lines.encode()).mcu.encoder_counts == 3200
+
+
+def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(tmp_path, "--yes", "--json") == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert err == ""
+    assert found["passed"] is True
+    assert found["changes"] == {"mcu.link_check": "auto", "mcu.encoder_counts": 3200}
+    assert parse(found["toml"].encode()).mcu.link_check == "auto"
+    assert found["written"] is None
+    watchdog = next(one for one in found["findings"] if one["name"] == "watchdog")
+    assert (watchdog["verdict"], watchdog["figure"][:2]) == ("PASS", "30")
+
+
+def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "# my robot\n[mcu]\nlink_check = 'off' # not yet\n"
+    assert called(tmp_path, "--yes", "--write", text=text) == 0
+    assert "acsard.toml: written" in capsys.readouterr().out
+    written = (tmp_path / "acsard.toml").read_text()
+    assert written.startswith("# my robot\n")
+    assert "# not yet" in written
+    assert called(tmp_path, "--yes", "--write") == 0
+    assert "nothing to change" in capsys.readouterr().out
+    assert (tmp_path / "acsard.toml").read_text() == written
+
+
+def test_findings_are_told_also_when_the_file_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*given: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("acsard.cli.config_file._replace", full)
+    with pytest.raises(ExitError, match="No space left"):
+        called(tmp_path, "--yes", "--json", "--write")
+    assert json.loads(capsys.readouterr().out)["written"] is None
+    assert (tmp_path / "acsard.toml").read_text() == ""
+
+
+def test_write_without_a_file_is_told_before_anything_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ACSARD_CONFIG", raising=False)
+    monkeypatch.setattr("acsard.cli.common.PLACES", (Path("acsard.toml"),))
+    parser = argparse.ArgumentParser()
+    mcu.add(parser.add_subparsers())
+    args = parser.parse_args(["mcu", "check", "--yes", "--write"])
+    with pytest.raises(ExitError, match="no configuration file"):
+        args.main(args)
+
+
+def test_write_without_tomlkit_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tomlkit", None)
+    with pytest.raises(ExitError, match=r"pip install 'acsard\[mcu\]'"):
+        called(tmp_path, "--yes", "--write")
+
+
+def test_without_a_terminal_and_without_yes_it_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("lifted\n"))
+    with pytest.raises(ExitError, match="terminal") as end:
+        called(tmp_path)
+    assert end.value.code == Exit.USAGE
+
+
+def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
+    ends = pty.openpty()
+    try:
+        for port in (os.ttyname(ends[1]), "/dev/null"):
+            with pytest.raises(ExitError, match="--wheels-are-lifted") as end:
+                called(tmp_path, "--yes", "--port", port)
+            assert end.value.code == Exit.USAGE
+    finally:
+        for end_fd in ends:
+            os.close(end_fd)
+
+
+@pytest.mark.parametrize("words", [["--yes"], ["--yes", "--wheels-are-lifted"]])
+def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> None:
+    with pytest.raises(ExitError, match="acsard ports") as end:
+        called(tmp_path, *words, "--port", str(tmp_path / "none"))
+    assert int(end.value.code) == 66
+
+
+def test_a_person_is_asked_until_the_answer_is_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))
+    assert mcu.Person().ask("which?", ("fr", "rl")) == "rl"
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "which? [fr/rl]" in err
+    assert "please type fr or rl" in err
+
+
+def test_the_end_of_the_input_ends_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    with pytest.raises(KeyboardInterrupt):
+        mcu.Person().ask("lifted?", ("lifted",))
+
+
+@pytest.mark.parametrize(
+    ("number", "end"),
+    [
+        (signal.SIGINT, KeyboardInterrupt),
+        (signal.SIGTERM, SystemExit),
+        (signal.SIGTSTP, SystemExit),
+    ],
+)
+def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
+    number: signal.Signals, end: type[BaseException]
+) -> None:
+    before = signal.getsignal(number)
+    reached = []
+
+    def signalled() -> None:
+        with mcu.ended_by_signals():
+            try:
+                os.kill(os.getpid(), number)
+            finally:
+                os.kill(os.getpid(), number)
+                reached.append(True)
+
+    with pytest.raises(end):
+        signalled()
+    assert reached == [True]
+    assert signal.getsignal(number) is before
+
+
+def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
+    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
+    head, *rest = mcu.row(finding, colours=False)
+    assert head == "FAIL    watchdog               none"
+    assert all(line.startswith("        ") and len(line) <= 100 for line in rest)
+    assert rest[-1] == "        -> give it one"
+    assert "\033[31m" in mcu.row(finding, colours=True)[0]
