@@ -28,7 +28,8 @@ Where to look, in the order the modules may import each other:
                       which native key, the configuration as parameters
     access.py         who may do what: the topic table -> Zenoh's access rules
     robot.py          the order; guard.py: the last look at every outgoing line
-    sim/              the vehicle and the fake microcontroller
+    sim/              the vehicle, the fake microcontroller, its faults
+    checkup/          what `acsard mcu check` does: one module a question to the board
     matching.py       which message belongs to which line: what `acsard bench` measures
     runtime/          clock, ticker, real_time, serial device and port, Zenoh bus (inbox, outlets,
                       replies), systemd and its journal, logs, control loop, daemon, the bench's rig
