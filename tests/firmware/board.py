@@ -150,6 +150,8 @@ class Status(NamedTuple):
     """When the board last received a byte."""
     answer_ns: int
     """From a byte it received to the first of its next line: how long it took to answer."""
+    wanted_ns: int
+    """When the firmware last wanted a motor to turn, whatever it had for that."""
     set_points: int
     """How often the speeds the firmware wants of the motors have changed."""
     wrong: int

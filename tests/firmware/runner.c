@@ -111,6 +111,7 @@ static char asked_line[160];
 static size_t asked_length;
 static unsigned asked_at, set_points, wrong;
 static uint16_t targets_at;
+static int64_t wanted_ns; /* when it last wanted a motor to turn */
 
 static avr_t *avr;
 static avr_uart_t *uart;
@@ -334,7 +335,7 @@ static void on_byte_from_host(uint8_t byte)
 static void look_at_targets(void)
 {
     struct set_point now;
-    bool stands, right = true;
+    bool stands, right = true; /* a stop always is */
     int i;
 
     if (!targets_at)
@@ -345,6 +346,8 @@ static void look_at_targets(void)
     }
     stands = !memcmp(&now, &in_force, sizeof now);
     in_force = now;
+    if (stands && !right)
+        wanted_ns = virtual_ns();
     if (!stands || !memcmp(&now, &judged, sizeof now))
         return;
     judged = now;
@@ -612,11 +615,11 @@ static void print_status(void)
     printf("{\"virtual_ns\":%" PRId64 ",\"wall_ns\":%" PRId64 ",\"base_ns\":%" PRId64
            ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
            ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
-           ",\"answer_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
+           ",\"answer_ns\":%" PRId64 ",\"wanted_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
            ",\"wrong_one\":[%d,%d,%d,%d],\"open\":%s,\"motors\":[",
            virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
-           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, set_points,
-           wrong, wrong_one.hundredths[0], wrong_one.hundredths[1], wrong_one.hundredths[2],
+           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, wanted_ns,
+           set_points, wrong, wrong_one.hundredths[0], wrong_one.hundredths[1], wrong_one.hundredths[2],
            wrong_one.hundredths[3], opened ? "true" : "false");
     for (i = 0; i < MOTORS; i++)
         printf("%s{\"duty\":%.6f,\"speed\":%.6f,\"counts\":%" PRId64 ",\"since_reset\":%" PRId64
