@@ -381,10 +381,16 @@ class Host:
         raise AssertionError(f"no answer within {within:g} s to {line!r}")
 
     def identity(self) -> Identity:
-        """What the board says of itself when asked."""
+        """What the board says of itself when asked.
+
+        Asked again if half a reply to another host was before it.
+        """
         self.lines()
-        self.send(b"?")
-        return read_identity(self.says(b"!acsard"))
+        while True:
+            self.send(b"?")
+            line = self.says(b"!acsard")
+            if line.startswith(b"!"):
+                return read_identity(line)
 
     def stop(self, within: float = 3.0) -> None:
         """Send stops until one is answered: after a boot the board takes nothing else."""
