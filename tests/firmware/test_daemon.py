@@ -482,7 +482,7 @@ def test_a_lost_line_is_found_again_and_neutral_comes_first(
         assert board.status().wrong == 0
         stands_by = daemon.process.poll()
         assert stands_by is None
-    assert account(board).refused == 0
+    assert account(board).refused <= 1, "a line that the plug cut"
 
 
 @pytest.mark.parametrize(
