@@ -154,18 +154,27 @@ static void on_millisecond(void)
     }
 }
 
-/* After a boot nothing counts but a stop, until one came: a host that has not noticed the reset goes
- * on asking for speeds, and the robot would lurch on with the next line. */
-static bool takes(const struct command *command)
+static bool is_stop(const struct command *command)
 {
     uint8_t i;
 
-    if (REQUIRE_CHECK && checked_seen && !command->checked)
-        return false;
     for (i = 0; i < MOTORS; i++)
-        if (command->hundredths[i] && !stop_seen)
+        if (command->hundredths[i])
             return false;
     return true;
+}
+
+/* After a boot nothing counts but a stop, until one came: a host that has not noticed the reset goes
+ * on asking for speeds, and the robot would lurch on with the next line. It is told of the reset
+ * instead, in case the line we booted with was lost. */
+static bool takes(const struct command *command)
+{
+    if (REQUIRE_CHECK && checked_seen && !command->checked)
+        return false;
+    if (stop_seen || is_stop(command))
+        return true;
+    say_identity();
+    return false;
 }
 
 static void on_command(const struct command *command)

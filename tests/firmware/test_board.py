@@ -22,6 +22,7 @@ from tests.firmware.board import (
     Status,
     build_firmware,
     checked,
+    read_identity,
     read_reply,
     speeds_line,
     until,
@@ -204,21 +205,20 @@ def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
 
 
 def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, host: Host) -> None:
-    """A host that has not noticed the reset goes on asking for speeds."""
-    for line in (
-        speeds_line(DRIVE),
-        checked(speeds_line(DRIVE), 1, "S"),
-        speeds_line((0, 0, 0, 1)),
-    ):
+    """A host that has not noticed the reset goes on asking for speeds: it is told instead."""
+    lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
+    for refused, line in enumerate(lines):
         host.send(line)
-    assert host.identity()[4:] == (0, 3, 0, "power")
+        assert read_identity(host.says(b""))[4:] == (0, refused, 0, "power")
+    assert host.identity().refused == 3
     assert stays_off(board, 50).on_ns == 0
     host.stop()
     host.drive(DRIVE, 0.2)
     board.command("reset")
-    host.says(b"acsard")
+    assert host.says(b"acsard") == BY_PIN
     host.send(checked(speeds_line(DRIVE), 1, "S"))
-    assert host.identity()[4:] == (0, 1, 0, "pin")
+    assert host.says(b"") == BY_PIN
+    stays_off(board, 50)
     host.stop()
     host.drive(DRIVE, 0.2)
     assert board.status().running
