@@ -395,11 +395,15 @@ class Host:
     def stop(self, within: float = 3.0) -> None:
         """Send stops until one is answered: after a boot the board takes nothing else."""
         deadline = time.monotonic() + within
+        self._stopped = False
         self.lines()
         while time.monotonic() < deadline:
             self.send(STOP)
-            if self.lines(0.1):
-                self._stopped = True
+            again = time.monotonic() + 0.2
+            while not self._stopped and time.monotonic() < again:
+                # Before the answer there may be what the board said when it booted.
+                self._stopped = any(len(line) == len(STOP) for _, line in self.lines(0.05))
+            if self._stopped:
                 return
         raise AssertionError(f"no stop answered within {within:g} s")
 

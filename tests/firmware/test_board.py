@@ -143,6 +143,7 @@ def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, hos
     assert is_off(board.status())
     assert host.says(b"acsard") == BY_PIN
     stays_off(board, 400)
+    is_still(board)
     host.stop()
     host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not whole yet
     stays_off(board, 100)
