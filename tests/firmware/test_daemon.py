@@ -141,7 +141,7 @@ def drive_about(board: Board, commander: Commander, length_s: float) -> None:
 
 def skipped(status: Status) -> str:
     """Words that explain a failure: a board that time is taken from is no real one any more."""
-    return f"{status.skipped_ns / MS:.0f} ms skipped, this machine was too slow for them"
+    return f"{status.skipped_ns / MS:.0f} ms skipped for want of a faster machine"
 
 
 def account(board: Board) -> Identity:
