@@ -44,6 +44,9 @@ ANGLE = math.tau / 3200
 COAST = 0.035
 """m: what a wheel of 0.5 m/s rolls on without voltage is 25 mm."""
 
+JITTER = 0.01
+"""m at 0.5 m/s: the stamps of two samples may be 20 ms nearer than the samples were."""
+
 BOOT_NS = 1 * MS
 """After a reset the memory still says for so long what was wanted before."""
 
@@ -258,7 +261,7 @@ def test_every_line_is_executed_and_odometry_says_what_the_wheels_did(
           f"{counted.trips} trips; {ended.set_points} set points, {ended.wrong} wrong; "
           f"missed periods {counters.get('missed_periods', 0)}, superseded "
           f"{counters.get('lines_superseded', 0)}, "
-          f"{skipped(ended)}")  # fmt: skip
+          f"link stale {len(daemon.events('link_stale'))} times, {skipped(ended)}")  # fmt: skip
     print(f"odometry: {off_by}")
     assert counted.lines >= 0.999 * asked
     assert asked >= counters["lines_sent"]
@@ -360,7 +363,7 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
     assert coasted.distance > 0.05
     assert -unseen < said.distance - true.distance < 0.002
     assert abs(said.yaw - true.yaw) < 0.02
-    assert most < 0.002
+    assert most < JITTER
     assert board.status().wrong == 0
 
 
