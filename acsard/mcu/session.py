@@ -78,7 +78,7 @@ class McuSession:
         self._opened = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
-        self._line_ns = -BLIND_PERIOD_NS
+        self._blind_ns = -BLIND_PERIOD_NS
 
     def update(
         self,
@@ -117,15 +117,15 @@ class McuSession:
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         """The line that says these speeds, in the form in force; None when none is due.
 
-        To an MCU that does not answer, and while the check is asked for, only stops leave.
+        To an MCU that does not answer, and while the check is asked for, only stops leave: the
+        first one at once, for it may be doing what it was told last.
         """
         if self.check.state == "asking":
             return self.check.question(now_ns)
         if self.silent(now_ns):
-            if now_ns - self._line_ns < BLIND_PERIOD_NS:
+            if now_ns - self._blind_ns < BLIND_PERIOD_NS:
                 return None
-            speeds = STILL
-        self._line_ns = now_ns
+            self._blind_ns, speeds = now_ns, STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
         return self.check.seal(line, now_ns)
 

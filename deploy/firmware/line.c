@@ -1,6 +1,13 @@
 #include "line.h"
 
+#include "config.h"
 #include "crc.h"
+
+void count_up(uint16_t *counter)
+{
+    if (*counter < UINT16_MAX)
+        ++*counter;
+}
 
 uint8_t line_feed(struct line_reader *reader, uint8_t byte)
 {
@@ -17,6 +24,7 @@ uint8_t line_feed(struct line_reader *reader, uint8_t byte)
     reader->length = 0;
     if (reader->discarding) {
         reader->discarding = false;
+        count_up(&reader->too_long);
         return 0;
     }
     if (length && reader->text[length - 1] == '\r')
@@ -209,5 +217,40 @@ uint8_t line_reply(char *out, const struct command *command, const struct readin
     }
     *at++ = '\r';
     *at++ = '\n';
+    return (uint8_t)(at - out);
+}
+
+static char *put_text(char *at, const char *text)
+{
+    while (*text)
+        *at++ = *text++;
+    return at;
+}
+
+static char *put_decimal(char *at, uint32_t value)
+{
+    char digits[10];
+    uint8_t count = 0;
+
+    do {
+        digits[count++] = (char)('0' + value % 10);
+        value /= 10;
+    } while (value);
+    while (count)
+        *at++ = digits[--count];
+    return at;
+}
+
+uint8_t line_identity(char *out, const struct record *record, const char *reset)
+{
+    char *at = put_text(out, "!acsard-mcu 1");
+
+    at = put_decimal(put_text(at, " counts="), COUNTS_PER_TURN);
+    at = put_decimal(put_text(at, " watchdog_ms="), COMMAND_WATCHDOG_MS);
+    at = put_text(at, " check=1 sample=1");
+    at = put_decimal(put_text(at, " lines="), record->lines);
+    at = put_decimal(put_text(at, " refused="), record->refused);
+    at = put_decimal(put_text(at, " trips="), record->trips);
+    at = put_text(put_text(put_text(at, " reset="), reset), "\r\n");
     return (uint8_t)(at - out);
 }

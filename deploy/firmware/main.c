@@ -21,12 +21,6 @@
 #include "speed.h"
 #include "watchdog.h"
 
-#define TEXT(value) TEXT_OF(value)
-#define TEXT_OF(value) #value
-
-static const char IDENTITY[] = "!acsard-mcu 1 counts=" TEXT(COUNTS_PER_TURN) //
-    " watchdog_ms=" TEXT(COMMAND_WATCHDOG_MS) " check=1 sample=1\r\n";
-
 /* A reading is sent again within REPORT_MS, and renewed without being asked after RENEW_MS, so that
  * the speed in a reply is of a window of 5 to 25 ms, whatever the host's rate. */
 #define REPORT_MS 5
@@ -36,22 +30,50 @@ static struct {
     struct pi pi;
     struct bridge bridge;
     struct speed control, report; /* over one control period; since the last report */
-    float target;                 /* rad/s */
     bool limited;
 } wheels[MOTORS];
+
+/* What the wheels shall do, hundredths of a rad/s. The bench finds it by its name. */
+static int16_t targets[MOTORS] __attribute__((used));
 
 static struct watchdog watchdog;
 static struct snapshot latest;
 static struct reading report;
 static uint32_t report_ms, control_ms;
-static bool checked_seen;
+static bool checked_seen, stop_seen; /* since boot */
+static struct line_reader reader;
+static struct record record;
+static uint8_t reset_flags __attribute__((section(".noinit"))); /* set before the rest is zeroed */
 
 /* The hardware watchdog survives the reset it causes, with 16 ms: off before anything else. */
 void watchdog_off(void) __attribute__((naked, used, section(".init3")));
 void watchdog_off(void)
 {
+    reset_flags = MCUSR;
     MCUSR = 0;
     wdt_disable();
+}
+
+/* A bootloader may have cleared the flags. With the power come others too. */
+static const char *reset_cause(void)
+{
+    if (reset_flags & _BV(PORF))
+        return "power";
+    if (reset_flags & _BV(BORF))
+        return "brown-out";
+    if (reset_flags & _BV(WDRF))
+        return "watchdog";
+    return reset_flags & _BV(EXTRF) ? "pin" : "unknown";
+}
+
+static void say_identity(void)
+{
+    struct record told = record;
+    char text[IDENTITY_MAX];
+    uint16_t room = UINT16_MAX - told.refused;
+
+    told.refused += reader.too_long < room ? reader.too_long : room;
+    serial_write(text, line_identity(text, &told, reset_cause()));
 }
 
 static void motors_off(void)
@@ -60,11 +82,21 @@ static void motors_off(void)
 
     hardware_motors_off();
     for (i = 0; i < MOTORS; i++) {
-        wheels[i].target = 0.0f;
+        targets[i] = 0;
         wheels[i].limited = false;
         pi_reset(&wheels[i].pi);
         bridge_off(&wheels[i].bridge);
     }
+}
+
+static bool motors_have_voltage(void)
+{
+    uint8_t i;
+
+    for (i = 0; i < MOTORS; i++)
+        if (wheels[i].bridge.duty)
+            return true;
+    return false;
 }
 
 static void renew_report(void)
@@ -94,7 +126,7 @@ static void control(bool allowed)
 
         if (!allowed)
             continue;
-        duty = pi_step(&wheels[i].pi, wheels[i].target, speed, wheels[i].limited);
+        duty = pi_step(&wheels[i].pi, (float)targets[i] * 0.01f, speed, wheels[i].limited);
         wheels[i].limited = !bridge_step(bridge, (int16_t)(duty * PWM_TOP));
         hardware_motor(i, bridge->duty, bridge->direction);
     }
@@ -106,8 +138,11 @@ static void on_millisecond(void)
 
     hardware_snapshot(&latest);
     allowed = watchdog_allows(&watchdog, latest.milliseconds);
-    if (!allowed)
+    if (!allowed) {
+        if (motors_have_voltage())
+            count_up(&record.trips);
         motors_off();
+    }
     if (latest.milliseconds - report_ms >= RENEW_MS)
         renew_report();
     if (latest.milliseconds - control_ms >= CONTROL_MS) {
@@ -119,16 +154,39 @@ static void on_millisecond(void)
     }
 }
 
+static bool is_stop(const struct command *command)
+{
+    uint8_t i;
+
+    for (i = 0; i < MOTORS; i++)
+        if (command->hundredths[i])
+            return false;
+    return true;
+}
+
+/* After a boot nothing counts but a stop, until one came: a host that has not noticed the reset goes
+ * on asking for speeds, and the robot would lurch on with the next line. It is told of the reset
+ * instead, in case the line we booted with was lost. */
+static bool takes(const struct command *command)
+{
+    if (REQUIRE_CHECK && checked_seen && !command->checked)
+        return false;
+    if (stop_seen || is_stop(command))
+        return true;
+    say_identity();
+    return false;
+}
+
 static void on_command(const struct command *command)
 {
     char text[REPLY_MAX];
     uint8_t i;
 
-    if (REQUIRE_CHECK && checked_seen && !command->checked)
-        return;
+    stop_seen = true;
     checked_seen |= command->checked;
+    record.lines++;
     for (i = 0; i < MOTORS; i++)
-        wheels[i].target = (float)command->hundredths[i] * 0.01f;
+        targets[i] = command->hundredths[i];
     watchdog_feed(&watchdog, latest.milliseconds);
     if (latest.milliseconds - report_ms >= REPORT_MS)
         renew_report();
@@ -164,12 +222,14 @@ static void on_line(const char *text, uint8_t length)
 {
     struct command command;
 
-    if (line_parse(text, length, &command))
+    if (line_parse(text, length, &command) && takes(&command)) {
         on_command(&command);
-    else if (line_asks(text, length))
-        serial_write(IDENTITY, sizeof IDENTITY - 1);
-    else
+    } else if (line_asks(text, length)) {
+        say_identity();
+    } else {
+        count_up(&record.refused);
         hang(text, length);
+    }
 }
 
 /* Sleep is left by any interrupt; testing and falling asleep cannot be split by one. */
@@ -187,7 +247,6 @@ static void wait(void)
 
 int main(void)
 {
-    static struct line_reader reader;
     uint8_t i;
 
     hardware_start();
@@ -202,7 +261,7 @@ int main(void)
     }
     sei();
     serial_write("\r\n", 2); /* a reset may have cut a reply in two: end it */
-    serial_write(IDENTITY, sizeof IDENTITY - 1);
+    say_identity();
     for (;;) {
         uint8_t byte, length = 0;
 

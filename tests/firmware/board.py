@@ -31,6 +31,8 @@ LATE_S = 0.1
 
 Speeds = tuple[float, float, float, float]
 
+STOP = b"ap00.00,bp00.00,cp00.00,dp00.00"
+
 
 class UnavailableError(Exception):
     """This machine cannot do it; why."""
@@ -115,8 +117,12 @@ class Wire(NamedTuple):
     """One direction of the serial line."""
 
     bytes: int
+    lines: int
+    """Put on it whole, whatever became of them there; empty ones are not counted."""
     lost: int
+    """Bytes."""
     damaged: int
+    """Bytes."""
     last: str
     """The last whole line on it."""
 
@@ -144,6 +150,14 @@ class Status(NamedTuple):
     """When the board last received a byte."""
     answer_ns: int
     """From a byte it received to the first of its next line: how long it took to answer."""
+    wanted_ns: int
+    """When the firmware last wanted a motor to turn, whatever it had for that."""
+    set_points: int
+    """How often the speeds the firmware wants of the motors have changed."""
+    wrong: int
+    """How many of those are in none of the lines the host has sent just before."""
+    wrong_one: Sequence[int]
+    """The last such, hundredths of a rad/s."""
     open: bool
     motors: tuple[Motor, ...]
     to_board: Wire
@@ -244,6 +258,30 @@ def checked(line: bytes, sequence: int, letters: str = "") -> bytes:
     return line + b"*%04X" % binascii.crc_hqx(line, 0)
 
 
+class Identity(NamedTuple):
+    """Who the board says it is, and what it has counted since it booted."""
+
+    counts: int
+    watchdog_ms: int
+    check: int
+    sample: int
+    lines: int
+    refused: int
+    trips: int
+    reset: str
+
+
+def read_identity(line: bytes) -> Identity:
+    """The identity in a line; fails unless all of it is there, in its order."""
+    name, version, *words = line.decode().split(" ")
+    assert (name, version) == ("!acsard-mcu", "1"), line
+    told = dict(word.split("=") for word in words)
+    assert tuple(told) == Identity._fields, line
+    *numbers, reset = told.values()
+    counts, watchdog_ms, check, sample, lines, refused, trips = map(int, numbers)
+    return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, reset)
+
+
 class Reply(NamedTuple):
     """What the board said."""
 
@@ -288,6 +326,7 @@ class Host:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         self._held = b""
         self._sequence = 0
+        self._stopped = False
         self.sent_ns = 0
         """Monotonic time when the last line was handed to the port."""
 
@@ -341,14 +380,44 @@ class Host:
                 return read_reply(got, at)
         raise AssertionError(f"no answer within {within:g} s to {line!r}")
 
+    def identity(self) -> Identity:
+        """What the board says of itself when asked.
+
+        Asked again if half a reply to another host was before it.
+        """
+        self.lines()
+        while True:
+            self.send(b"?")
+            line = self.says(b"!acsard")
+            if line.startswith(b"!"):
+                return read_identity(line)
+
+    def stop(self, within: float = 3.0) -> None:
+        """Send stops until one is answered: after a boot the board takes nothing else."""
+        deadline = time.monotonic() + within
+        self._stopped = False
+        self.lines()
+        while time.monotonic() < deadline:
+            self.send(STOP)
+            again = time.monotonic() + 0.2
+            while not self._stopped and time.monotonic() < again:
+                # Before the answer there may be what the board said when it booted.
+                self._stopped = any(len(line) == len(STOP) for _, line in self.lines(0.05))
+            if self._stopped:
+                return
+        raise AssertionError(f"no stop answered within {within:g} s")
+
     def drive(
         self, speeds: Speeds, seconds: float, letters: str = "S", period: float = 0.01
     ) -> list[Reply]:
         """Send checked lines at an even pace for that long; all replies that came.
 
-        Begins again when other work of this machine kept us from it: the board would stop.
+        The first time it sends a stop before. Begins again when other work of this machine kept us
+        from it: the board would stop.
         """
         replies: list[Reply] = []
+        if not self._stopped:
+            self.stop()
         began = time.monotonic()
         sent, again = 0, 0
         while sent < round(seconds / period):

@@ -15,6 +15,8 @@
  *   mute, unmute                 what the board says is lost
  *   drop to|from N               every Nth byte to or from the board is lost; 0 = none
  *   noise to|from N              one bit of every Nth byte is wrong; 0 = none
+ *   lose to|from PERCENT         so many lines are lost whole, by chance; 0 = none
+ *   type WORD                    a line to the board that the host has not sent
  *   unplug, plug                 the port vanishes; a new one appears
  *   auto_reset MS                opening the port resets the board, which boots for that long; 0 = no
  *   supply on|off                the motors' supply
@@ -58,10 +60,10 @@ enum {
     PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
     TCCR3A = 0x90, TCCR3B = 0x91, ICR3 = 0x96, OCR3A = 0x98,
     TCCR4A = 0xA0, TCCR4B = 0xA1, ICR4 = 0xA6, OCR4A = 0xA8, OCR4B = 0xAA, OCR4C = 0xAC,
-    UCSR0A = 0xC0, UBRR0 = 0xC4,
+    UCSR0A = 0xC0, UBRR0 = 0xC4, MCUSR = 0x54,
     PINK = 0x106
 };
-enum { PCINT2 = 11 };
+enum { PCINT2 = 11, EXTRF = 1 << 1 };
 
 /* Where the PWM of each motor comes from: Mega pins 5, 6, 7, 8. */
 static const struct pwm {
@@ -92,10 +94,24 @@ static struct motor {
 
 static struct wire {
     uint64_t bytes, lost, damaged;
-    unsigned drop, noise, drop_at, noise_at;
+    uint64_t lines; /* put on it whole, empty ones not counted */
+    unsigned drop, noise, lose, drop_at, noise_at, fill;
+    bool losing;
     char line[160], last[160];
     size_t length;
 } to_board, from_board;
+
+/* What the host has asked for, before anything befell it on the wire, and what the firmware makes of
+ * it: no set point may be in force that was not asked for just now. */
+#define ASKED 8
+static struct set_point {
+    int hundredths[MOTORS];
+} asked[ASKED], in_force, judged, wrong_one;
+static char asked_line[160];
+static size_t asked_length;
+static unsigned asked_at, set_points, wrong;
+static uint16_t targets_at;
+static int64_t wanted_ns; /* when it last wanted a motor to turn */
 
 static avr_t *avr;
 static avr_uart_t *uart;
@@ -146,6 +162,11 @@ static int64_t wall_ns(void)
 static int64_t virtual_ns(void)
 {
     return (int64_t)((__int128)avr->cycle * NS_PER_S / F_CPU);
+}
+
+static uint16_t word(uint16_t address)
+{
+    return (uint16_t)(avr->data[address] | avr->data[address + 1] << 8);
 }
 
 /* motors */
@@ -230,11 +251,6 @@ static avr_cycle_count_t on_motor(avr_t *unused, avr_cycle_count_t when, void *w
     return when + (wait < 16.0 ? 16 : (avr_cycle_count_t)wait + 1);
 }
 
-static uint16_t word(uint16_t address)
-{
-    return (uint16_t)(avr->data[address] | avr->data[address + 1] << 8);
-}
-
 /* What the PWM output of a motor gives, 0 to 1: phase correct with its top in ICR is all we know. */
 static double pwm(int index)
 {
@@ -289,10 +305,77 @@ static void on_register(avr_irq_t *irq, uint32_t value, void *unused)
 
 /* the wire */
 
+/* Follows what the host sends. */
+static void on_byte_from_host(uint8_t byte)
+{
+    struct set_point *point = &asked[asked_at % ASKED];
+    int i, end = 0;
+
+    if (byte != '\n') {
+        if (asked_length < sizeof asked_line - 1)
+            asked_line[asked_length++] = (char)byte;
+        return;
+    }
+    asked_line[asked_length] = '\0';
+    asked_length = 0;
+    for (i = 0; i < MOTORS; i++) {
+        int whole, part, used = 0;
+        char letter, sign;
+
+        if (sscanf(asked_line + end, "%c%c%2d.%2d%n", &letter, &sign, &whole, &part, &used) < 4 ||
+            letter != 'a' + i)
+            return;
+        point->hundredths[i] = (whole * 100 + part) * (sign == 'n' ? -1 : 1);
+        end += used + 1;
+    }
+    asked_at++;
+}
+
+/* A set point counts when it has stood from one slice to the next: the firmware may be writing it. */
+static void look_at_targets(void)
+{
+    struct set_point now;
+    bool stands, right = true; /* a stop always is */
+    int i;
+
+    if (!targets_at)
+        return;
+    for (i = 0; i < MOTORS; i++) {
+        now.hundredths[i] = (int16_t)word((uint16_t)(targets_at + 2 * i));
+        right &= !now.hundredths[i];
+    }
+    stands = !memcmp(&now, &in_force, sizeof now);
+    in_force = now;
+    if (stands && !right)
+        wanted_ns = virtual_ns();
+    if (!stands || !memcmp(&now, &judged, sizeof now))
+        return;
+    judged = now;
+    set_points++;
+    for (i = 0; i < ASKED; i++)
+        right |= !memcmp(&now, &asked[i], sizeof now);
+    if (!right) {
+        wrong++;
+        wrong_one = now;
+    }
+}
+
 /* What becomes of a byte on it: -1 when it is lost. */
 static int carried(struct wire *wire, uint8_t byte)
 {
     wire->bytes++;
+    if (!wire->fill)
+        wire->losing = wire->lose && (unsigned)rand() % 100 < wire->lose;
+    wire->fill += byte != '\r';
+    if (byte == '\n') {
+        wire->lines += wire->fill > 1;
+        wire->fill = 0;
+    }
+    if (wire->losing) {
+        wire->lost++;
+        wire->losing = byte != '\n';
+        return -1;
+    }
     if (wire->drop && ++wire->drop_at >= wire->drop) {
         wire->drop_at = 0;
         wire->lost++;
@@ -325,6 +408,7 @@ static avr_cycle_count_t on_byte_to_board(avr_t *unused, avr_cycle_count_t when,
         receiving = false;
         return 0;
     }
+    on_byte_from_host(incoming[incoming_tail % QUEUE]);
     byte = carried(&to_board, incoming[incoming_tail++ % QUEUE]);
     if (byte >= 0) {
         heard_ns = virtual_ns();
@@ -420,6 +504,7 @@ static void reset(unsigned boot_ms)
     if (boot_ms)
         held_until = avr->cycle + (avr_cycle_count_t)boot_ms * (F_CPU / 1000);
     avr_reset(avr);
+    avr->data[MCUSR] = EXTRF;
     after_reset();
 }
 
@@ -488,6 +573,7 @@ static void run_slice(void)
         if (was_reset)
             after_reset();
     }
+    look_at_targets();
     correct_baud_rate();
 }
 
@@ -514,8 +600,8 @@ static void print_text(const char *name, const char *text)
 
 static void print_wire(const char *name, const struct wire *wire)
 {
-    printf(",\"%s\":{\"bytes\":%" PRIu64 ",\"lost\":%" PRIu64 ",\"damaged\":%" PRIu64, name,
-           wire->bytes, wire->lost, wire->damaged);
+    printf(",\"%s\":{\"bytes\":%" PRIu64 ",\"lines\":%" PRIu64 ",\"lost\":%" PRIu64
+           ",\"damaged\":%" PRIu64, name, wire->bytes, wire->lines, wire->lost, wire->damaged);
     print_text("last", wire->last);
     putchar('}');
 }
@@ -529,10 +615,12 @@ static void print_status(void)
     printf("{\"virtual_ns\":%" PRId64 ",\"wall_ns\":%" PRId64 ",\"base_ns\":%" PRId64
            ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
            ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
-           ",\"answer_ns\":%" PRId64 ",\"open\":%s,\"motors\":[",
+           ",\"answer_ns\":%" PRId64 ",\"wanted_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
+           ",\"wrong_one\":[%d,%d,%d,%d],\"open\":%s,\"motors\":[",
            virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
-           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns,
-           opened ? "true" : "false");
+           resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, wanted_ns,
+           set_points, wrong, wrong_one.hundredths[0], wrong_one.hundredths[1], wrong_one.hundredths[2],
+           wrong_one.hundredths[3], opened ? "true" : "false");
     for (i = 0; i < MOTORS; i++)
         printf("%s{\"duty\":%.6f,\"speed\":%.6f,\"counts\":%" PRId64 ",\"since_reset\":%" PRId64
                ",\"flips\":%u,\"flip_duty\":%.4f}",
@@ -560,7 +648,7 @@ static void bench(long ms)
            clock_ns(CLOCK_PROCESS_CPUTIME_ID) - cpu_ns);
 }
 
-static bool set_wire(const char *direction, unsigned long n, bool noise)
+static bool set_wire(const char *direction, unsigned long n, char what)
 {
     struct wire *wire = !strcmp(direction, "to")     ? &to_board
                         : !strcmp(direction, "from") ? &from_board
@@ -568,10 +656,7 @@ static bool set_wire(const char *direction, unsigned long n, bool noise)
 
     if (!wire)
         return false;
-    if (noise)
-        wire->noise = (unsigned)n;
-    else
-        wire->drop = (unsigned)n;
+    *(what == 'n' ? &wire->noise : what == 'l' ? &wire->lose : &wire->drop) = (unsigned)n;
     return true;
 }
 
@@ -605,9 +690,13 @@ static bool obeyed(const char *verb, const char *one, const char *two)
         paused = verb[0] == 'p';
     else if (!strcmp(verb, "mute") || !strcmp(verb, "unmute"))
         muted = verb[0] == 'm';
-    else if (!strcmp(verb, "drop") || !strcmp(verb, "noise"))
-        return set_wire(one, strtoul(two, NULL, 10), verb[0] == 'n');
-    else if (!strcmp(verb, "unplug"))
+    else if (!strcmp(verb, "drop") || !strcmp(verb, "noise") || !strcmp(verb, "lose"))
+        return set_wire(one, strtoul(two, NULL, 10), verb[0]);
+    else if (!strcmp(verb, "type")) {
+        for (; *one; one++)
+            incoming[incoming_head++ % QUEUE] = (uint8_t)*one;
+        incoming[incoming_head++ % QUEUE] = '\n';
+    } else if (!strcmp(verb, "unplug"))
         unplug();
     else if (!strcmp(verb, "auto_reset"))
         auto_reset_ms = (unsigned)strtoul(one, NULL, 10);
@@ -736,6 +825,11 @@ static void power_on(const char *path)
     avr_init(avr);
     firmware.frequency = F_CPU;
     avr_load_firmware(avr, &firmware);
+    for (i = 0; i < firmware.symbolcount; i++)
+        if (!strcmp(firmware.symbol[i]->symbol, "targets"))
+            targets_at = (uint16_t)firmware.symbol[i]->addr;
+    if (!targets_at)
+        fail("%s: has no targets", path);
     avr->sleep = on_sleep;
     core_reset = avr->reset;
     avr->reset = on_reset;

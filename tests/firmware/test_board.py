@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.firmware.board import (
+    STOP,
     Board,
     Host,
     Reply,
@@ -21,6 +22,7 @@ from tests.firmware.board import (
     Status,
     build_firmware,
     checked,
+    read_identity,
     read_reply,
     speeds_line,
     until,
@@ -28,9 +30,16 @@ from tests.firmware.board import (
 
 pytestmark = pytest.mark.firmware
 
-IDENTITY = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
+KNOWN = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
+"""How the line begins with which it says who it is, whatever comes behind."""
 
-ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
+POWERED_ON = KNOWN + b" lines=0 refused=0 trips=0 reset=power"
+
+BY_PIN = KNOWN + b" lines=0 refused=0 trips=0 reset=pin"
+
+BY_WATCHDOG = KNOWN + b" lines=0 refused=0 trips=0 reset=watchdog"
+
+ZERO = STOP
 
 DRIVE: Speeds = (10.0, -5.0, 20.0, -30.0)
 
@@ -83,7 +92,7 @@ def difference(before: int, after: int) -> int:
 def test_it_boots_stopped_and_says_who_it_is(board: Board, host: Host) -> None:
     stays_off(board, 400)
     board.command("reset")
-    assert host.says(b"acsard") == IDENTITY
+    assert host.says(b"acsard") == BY_PIN
     assert stays_off(board, 400).on_ns == 0, "since power on"
 
 
@@ -93,7 +102,7 @@ def test_it_says_who_it_is_when_asked_and_stops_all_the_same(board: Board, host:
     asked = 0
     while board.status().running:
         host.send(b"?")
-        assert host.says(b"!") == IDENTITY
+        assert host.says(b"!").startswith(KNOWN)
         asked += 1
     silent = (board.status().off_ns - fed) / MS
     print(f"stopped {silent:.1f} ms after the last command, asked {asked} times meanwhile")
@@ -132,8 +141,10 @@ def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, hos
     assert board.status().running
     board.command("reset")
     assert is_off(board.status())
-    assert host.says(b"acsard") == IDENTITY
+    assert host.says(b"acsard") == BY_PIN
     stays_off(board, 400)
+    is_still(board)
+    host.stop()
     host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not whole yet
     stays_off(board, 100)
     host.write(b"\r\n")
@@ -156,8 +167,9 @@ def test_the_hardware_watchdog_resets_it_when_something_hangs(
         print(f"{what} hangs -> motors off: {took:.1f} ms")
         assert took <= 150
         assert is_off(status)
-        assert host.says(b"acsard") == IDENTITY
+        assert host.says(b"acsard") == BY_WATCHDOG
         assert stays_off(board, 300).resets == 1, "and it does not go on resetting"
+        host.stop()
         host.drive(DRIVE, 0.2)
         assert board.status().running
 
@@ -191,6 +203,51 @@ def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
         host.lines(0.005)
     print(f"stopped {(status.off_ns - fed) / MS:.1f} ms after the last good line, garbage since")
     assert 250 <= (status.off_ns - fed) / MS <= 350
+
+
+def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, host: Host) -> None:
+    """A host that has not noticed the reset goes on asking for speeds: it is told instead."""
+    lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
+    for refused, line in enumerate(lines):
+        host.send(line)
+        assert read_identity(host.says(b""))[4:] == (0, refused, 0, "power")
+    assert host.identity().refused == 3
+    assert stays_off(board, 50).on_ns == 0
+    host.stop()
+    host.drive(DRIVE, 0.2)
+    board.command("reset")
+    assert host.says(b"acsard") == BY_PIN
+    host.send(checked(speeds_line(DRIVE), 1, "S"))
+    assert host.says(b"") == BY_PIN
+    stays_off(board, 50)
+    host.stop()
+    host.drive(DRIVE, 0.2)
+    assert board.status().running
+
+
+def test_it_counts_lines_refusals_and_stops_for_silence(board: Board, host: Host) -> None:
+    assert host.identity() == (3200, 300, 1, 1, 0, 0, 0, "power")
+    for line in BAD_LINES[1:]:
+        host.send(line)
+    host.send(b"")
+    refused = len(BAD_LINES) - 1
+    assert host.identity()[4:] == (0, refused, 0, "power"), "an empty line is none"
+    host.ask(ZERO)
+    until(lambda: host.identity().lines == 1, 3.0, "it has counted")
+    stays_off(board, 400)
+    assert host.identity().trips == 0, "nothing ran"
+    for trips in (1, 2):
+        host.drive(DRIVE, 0.2)
+        until(lambda: is_off(board.status()), 3.0, "motors off")
+        assert host.identity().trips == trips
+    asked, executed = board.status().to_board.lines, host.identity().lines
+    host.drive(DRIVE, 0.2)
+    executed = host.identity().lines - executed
+    assert executed >= 20
+    assert board.status().to_board.lines == asked + 2 + executed, "the bench counts as it does"
+    assert board.status().wrong == 0
+    board.command("reset")
+    assert host.says(b"acsard") == BY_PIN
 
 
 # driving
@@ -267,7 +324,7 @@ def test_each_line_is_answered_once_with_its_sequence(board: Board, host: Host) 
         assert reply.sequence == sequence
         assert (reply.milliseconds is not None) == (letters == "S")
     wire = board.status().from_board
-    assert wire.bytes - len(IDENTITY) - 4 == 86 * 41 + 85 * 62 + 85 * 41, "and nothing else"
+    assert wire.bytes - len(POWERED_ON) - 4 == 86 * 41 + 85 * 62 + 85 * 41, "and nothing else"
 
 
 def test_a_plain_line_is_answered_plain(board: Board, host: Host) -> None:
@@ -293,11 +350,13 @@ def test_every_dialect_of_a_line_drives(board: Board, host: Host, line: bytes, e
         speeds = [motor.speed for motor in board.status().motors]
         return all(abs(a - b) < 0.5 for a, b in zip(speeds, DRIVE, strict=True))
 
+    host.stop()
     until(there, 5.0, "the speeds are reached")
 
 
 def test_a_line_is_answered_within_three_milliseconds(board: Board, host: Host) -> None:
     took = []
+    host.stop()
     for i in range(50):
         host.ask(checked(speeds_line(DRIVE), i, "S"))
         took.append(board.status().answer_ns / MS)
@@ -320,6 +379,7 @@ def test_the_counts_are_the_true_counts(board: Board, host: Host) -> None:
     # After a reset it counts from zero again.
     board.command("reset")
     host.says(b"acsard")
+    host.stop()
     host.drive(DRIVE, 0.3)
     is_still(board)
     reply = host.ask(checked(ZERO, 7, "S"))
@@ -388,6 +448,7 @@ def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: 
     board.command("drop to 211")
     replies = host.drive(DRIVE, 2.0)
     status = board.status()
+    assert status.wrong == 0
     share = len(replies) / (status.to_board.bytes / 42)
     print(f"{status.to_board.damaged} bytes damaged, {status.to_board.lost} lost; "
           f"{share:.0%} of the lines answered")  # fmt: skip
@@ -400,6 +461,7 @@ def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host:
     """Lines back to back on the wire: more than it can answer, and still it keeps its time."""
     line = checked(speeds_line(DRIVE), 0, "S") + b"\r\n"
     replies: list[Reply] = []
+    host.stop()
     end = time.monotonic() + 2.0
     began = board.status()
     while time.monotonic() < end:
@@ -449,7 +511,7 @@ def test_an_overflow_costs_its_lines_and_spares_the_next(
         host.send(checked(ZERO, 99))
         host.says(b"#63")
         assert board.status().resets == 0
-        answered = (board.status().from_board.bytes - len(IDENTITY) - 4) // 41 - 1
+        answered = (board.status().from_board.bytes - len(POWERED_ON) - 4) // 41 - 1
         print(f"12 lines in a pause of 60 ms: {answered} answered")
         assert 0 < answered < 12
 
@@ -474,9 +536,33 @@ def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Ho
     with Host(path) as again:
         until(lambda: board.status().resets == 1, 3.0, "a reset")
         began = time.monotonic()
-        assert again.says(b"acsard") == IDENTITY
+        assert again.says(b"acsard") == BY_PIN
         print(f"boots for {1000 * (time.monotonic() - began):.0f} ms")
         stays_off(board, 100)
+
+
+def test_the_bench_sees_a_speed_that_was_not_asked_for(board: Board, host: Host) -> None:
+    """A plain line takes a digit with a wrong bit for a digit."""
+    host.stop()
+    board.command("noise to 37")
+    lines = 0
+    while not (status := board.status()).wrong:
+        assert lines < 500
+        host.send(speeds_line(DRIVE))
+        host.lines(0.005)
+        lines += 1
+    print(f"within {lines} lines with a wrong bit: {status.wrong_one}")
+
+
+def test_the_bench_can_lose_lines(board: Board, host: Host) -> None:
+    board.command("lose from 20")
+    replies = host.drive(DRIVE, 1.0)
+    board.command("lose from 0")
+    lost, lines = board.status().from_board.lost, board.status().from_board.lines
+    print(f"{lost / 62:.0f} of {lines} lines lost")
+    assert 0.05 < 1 - len(replies) / lines < 0.4
+    assert len(host.drive(DRIVE, 0.2)) >= 19
+    assert board.status().from_board.lost == lost
 
 
 def test_the_bench_can_mute_and_freeze_the_board(board: Board, host: Host) -> None:

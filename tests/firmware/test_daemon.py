@@ -1,73 +1,539 @@
-"""The real daemon on the real firmware: it drives it, and each catches the end of the other."""
+"""The real daemon on the firmware's real machine code, behind a port, in real time.
+
+Judged by what the board itself has counted and by the true state of the simulated motors. Whoever
+drives is a plain client of the bus.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
+import random
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 
-from tests.firmware.board import Board, Status
-from tests.system.harness import Bus, Daemon, until
+from tests.firmware.board import Board, Host, Identity, Status
+from tests.firmware.conftest import FREE_SPEEDS
+from tests.system.harness import (
+    ZERO,
+    Bus,
+    Commander,
+    Daemon,
+    Following,
+    seconds,
+    twist,
+    until,
+)
 
 pytestmark = pytest.mark.firmware
 
 MS = 1_000_000
 
+RADIUS, TRACK = 0.05, 0.3
+"""m, as the daemon's configuration has them."""
 
-@pytest.fixture
-def daemon(board: Board, tmp_path: Path) -> Iterator[Daemon]:
-    """A daemon with its usual configuration at the board's port."""
-    with Daemon(tmp_path, board.path) as daemon:
-        yield daemon
+ANGLE = math.tau / 3200
+"""rad a count."""
+
+COAST = 0.035
+"""m: what a wheel of 0.5 m/s rolls on without voltage is 25 mm."""
+
+JITTER = 0.01
+"""m at 0.5 m/s: the stamps of two samples may be 20 ms nearer than the samples were."""
+
+BOOT_NS = 1 * MS
+"""After a reset the memory still says for so long what was wanted before."""
+
+Mcu = Mapping[str, object]
+
+PLAIN: Mcu = {"link_check": "off"}
+
+COUNTS: Mcu = {"link_check": "auto", "encoder_counts": 3200}
+
+STRICT: Mcu = {"link_check": "require", "encoder_counts": 3200}
+
+LEGS = [(0.6, 0.0), (0.6, 0.9), (0.0, 1.5), (0.8, -0.4), (-0.3, 0.0), (0.0, 0.0)]
+"""m/s and rad/s: ramps, arcs, a turn on the spot, back, a stop. Every wheel gets on by them."""
+
+LEG_MS = 1200
+
+soak = pytest.mark.soak
 
 
-@pytest.fixture
-def bus(daemon: Daemon) -> Iterator[Bus]:
-    """A client of it, with the link up."""
-    with Bus(daemon.endpoint) as bus:
+class Rig(NamedTuple):
+    """A board, its daemon and a client of it."""
+
+    board: Board
+    daemon: Daemon
+    bus: Bus
+
+
+@contextmanager
+def running(board: Board, where: Path, mcu: Mcu, port: Path | str = "") -> Iterator[Rig]:
+    """A daemon at the board's port and a client of it, with the link up."""
+    config = {"mcu": mcu, "log": {"format": "json"}}
+    with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
-        yield bus
+        yield Rig(board, daemon, bus)
+
+
+def passes(board: Board, ms: float) -> Status:
+    """The state when so much of the board's time has passed."""
+    end = board.status().virtual_ns + ms * MS
+    return until(
+        lambda: status if (status := board.status()).virtual_ns >= end else None,
+        10.0 + ms / 100,
+        f"{ms} ms pass",
+    )
 
 
 def turns(board: Board, speed: float) -> Status | None:
-    """The state when all wheels have that speed."""
+    """The state when all wheels have that speed, rad/s."""
     status = board.status()
     return status if all(abs(motor.speed - speed) < 0.1 for motor in status.motors) else None
 
 
-def test_a_speed_on_the_bus_is_a_speed_of_the_wheels(board: Board, bus: Bus) -> None:
-    with bus.commanding(0.5):
-        until(lambda: turns(board, 0.5 / 0.05), 5.0, "0.5 m/s on wheels of 50 mm")
-        assert bus.state()["mode"] == "driving"
-        counted = [motor.counts for motor in board.status().motors]
-        until(lambda: board.status().motors[0].counts > counted[0] + 3200, 5.0, "one turn")
-        assert bus.state()["mode"] == "driving", "and no fault meanwhile"
-    bus.at_rest()
-    until(lambda: turns(board, 0.0), 3.0, "the wheels stand")
+def drives(board: Board, linear: float = 0.5, within: float = 5.0) -> Status:
+    """The state when the robot goes straight at that speed."""
+    return until(lambda: turns(board, linear / RADIUS), within, f"it drives at {linear} m/s")
 
 
-def test_a_daemon_that_is_killed_is_caught_by_the_board(
-    board: Board, daemon: Daemon, bus: Bus
+def stands(board: Board) -> Status:
+    """The state when no wheel turns any more, to the last count."""
+
+    def look() -> Status | None:
+        status = board.status()
+        still = all(motor.speed == 0.0 and motor.duty == 0.0 for motor in status.motors)
+        return status if still else None
+
+    return until(look, 10.0, "the wheels stand")
+
+
+def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
+    """The commander sends neutral, then a speed."""
+    commander.wish = ZERO
+    before = bus.count("commands")
+    until(lambda: bus.count("commands") >= before + 3, 5.0, "neutral was heard")
+    commander.wish = twist(linear)
+
+
+def moves_nothing(board: Board, since: Status, ms: float) -> None:
+    """No motor was told to turn since then, nor is for so long; those that coast are braked."""
+    status = passes(board, ms)
+    assert status.wanted_ns < since.virtual_ns + BOOT_NS, "not for a moment"
+    for before, after in zip(since.motors, status.motors, strict=True):
+        assert after.speed == 0.0
+        assert abs(after.counts - before.counts) * ANGLE * RADIUS < COAST
+
+
+def drive_about(board: Board, commander: Commander, length_s: float) -> None:
+    """Leg after leg, then neutral."""
+    end = board.status().virtual_ns + length_s * 1000 * MS
+    for leg in itertools.cycle(LEGS):
+        commander.wish = twist(*leg)
+        if passes(board, LEG_MS).virtual_ns >= end:
+            break
+    commander.wish = ZERO
+
+
+def skipped(status: Status) -> str:
+    """Words that explain a failure: a board that time is taken from is no real one any more."""
+    return f"{status.skipped_ns / MS:.0f} ms skipped for want of a faster machine"
+
+
+def account(board: Board) -> Identity:
+    """What the board has counted; nobody else may have its port open."""
+    with Host(board.path) as host:
+        return host.identity()
+
+
+# odometry beside the truth
+
+
+class Path2D(NamedTuple):
+    """How the robot went."""
+
+    distance: float
+    """m, forward less backward."""
+    yaw: float
+    """rad; whole turns count."""
+
+
+def pose(message: Any) -> tuple[float, float, float]:
+    """x, y and yaw of an odometry message."""
+    position, turn = message["pose"]["pose"]["position"], message["pose"]["pose"]["orientation"]
+    return position["x"], position["y"], 2 * math.atan2(turn["z"], turn["w"])
+
+
+def went(odom: Sequence[Any]) -> Path2D:
+    """What the messages add up to, from the origin."""
+    distance = total = 0.0
+    x, y, yaw = 0.0, 0.0, 0.0
+    for message in odom:
+        to_x, to_y, to_yaw = pose(message)
+        turn = math.remainder(to_yaw - yaw, math.tau)
+        heading = yaw + turn / 2
+        distance += (to_x - x) * math.cos(heading) + (to_y - y) * math.sin(heading)
+        total += turn
+        x, y, yaw = to_x, to_y, to_yaw
+    return Path2D(distance, total)
+
+
+def truly(status: Status) -> Path2D:
+    """The same by the simulated encoders."""
+    a, b, c, d = (motor.counts * ANGLE * RADIUS for motor in status.motors)
+    right, left = (a + d) / 2, (b + c) / 2
+    return Path2D((right + left) / 2, (right - left) / TRACK)
+
+
+def leap(odom: Sequence[Any], fastest: float) -> float:
+    """By how many m the longest step between two messages exceeds what `fastest` m/s explains."""
+    most = -math.inf
+    for before, after in itertools.pairwise(odom):
+        (x, y, _), (to_x, to_y, _) = pose(before), pose(after)
+        dt = seconds(after["header"]["stamp"]) - seconds(before["header"]["stamp"])
+        most = max(most, math.hypot(to_x - x, to_y - y) - fastest * dt)
+    return most
+
+
+class Errors(NamedTuple):
+    """Shares by which odometry is off the truth."""
+
+    distance: float
+    yaw: float
+    wheels: tuple[float, ...]
+
+    @property
+    def worst(self) -> float:
+        return max(abs(self.distance), abs(self.yaw), *map(abs, self.wheels))
+
+    def __str__(self) -> str:
+        wheels = ", ".join(f"{wheel:+.3%}" for wheel in self.wheels)
+        return f"distance {self.distance:+.3%}, yaw {self.yaw:+.3%}, wheels {wheels}"
+
+
+def errors(odom: Following, wheels: Following, true: Status) -> Errors:
+    """What is said of a robot that stands by now, beside the truth."""
+    now = time.monotonic()
+    odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
+    turned = wheels.find(lambda message: True, 3.0, "wheels at rest", after=now).value["position"]
+    said, right = went([seen.value for seen in odom.seen]), truly(true)
+    angles = [motor.counts * ANGLE for motor in true.motors]
+    assert min(map(abs, angles)) > 10.0, "far enough to tell"
+    shares = tuple(a / b - 1 for a, b in zip(turned, angles, strict=True))
+    return Errors(said.distance / right.distance - 1, said.yaw / right.yaw - 1, shares)
+
+
+# driving
+
+
+@pytest.mark.parametrize("mcu", [PLAIN, COUNTS], ids=["plain", "counts"])
+@pytest.mark.parametrize("length_s", [8, pytest.param(60, marks=soak)])
+@pytest.mark.timeout(180)
+def test_every_line_is_executed_and_odometry_says_what_the_wheels_did(
+    board: Board, tmp_path: Path, mcu: Mcu, length_s: int
 ) -> None:
-    with bus.commanding(0.5):
-        until(lambda: turns(board, 10.0), 5.0, "it drives")
-        daemon.signal(signal.SIGKILL)
-        killed = time.monotonic_ns()
-        status = until(lambda: None if (s := board.status()).running else s, 3.0, "motors off")
-    wall = (status.base_ns + status.off_ns - killed) / MS
-    silent = (status.off_ns - status.heard_ns) / MS
-    print(f"SIGKILL -> motors off: {wall:.0f} ms; {silent:.1f} ms after the last byte")
-    assert 250 <= silent <= 350
+    with running(board, tmp_path, mcu) as (_, daemon, bus):
+        with bus.follow("odom") as odom, bus.follow("wheel_states") as wheels:
+            began = board.status()
+            with bus.commanding(0.0) as commander:
+                drive_about(board, commander, length_s)
+                status = stands(board)
+            off_by = errors(odom, wheels, status)
+        state = bus.at_rest()
+        daemon.signal(signal.SIGTERM)
+        assert daemon.ended(3.0) == 0
+    ended = passes(board, 50)
+    asked = ended.to_board.lines
+    counted = account(board)
+    counters = state["counters"]
+    rate = (status.to_board.lines - began.to_board.lines) / (
+        (status.virtual_ns - began.virtual_ns) / 1e9
+    )
+    print(f"\n{asked} lines ({counters['lines_sent']} by the daemon before its end), {rate:.1f}/s; "
+          f"{counted.lines} executed = {counted.lines / asked:.3%}, {counted.refused} refused, "
+          f"{counted.trips} trips; {ended.set_points} set points, {ended.wrong} wrong; "
+          f"missed periods {counters.get('missed_periods', 0)}, superseded "
+          f"{counters.get('lines_superseded', 0)}, "
+          f"link stale {len(daemon.events('link_stale'))} times, {skipped(ended)}")  # fmt: skip
+    print(f"odometry: {off_by}")
+    assert counted.lines >= 0.999 * asked
+    assert asked >= counters["lines_sent"]
+    assert rate > 95
+    assert (counted.refused, counted.trips, ended.wrong) == (0, 0, 0)
+    assert (ended.resets, counted.reset) == (0, "power")
+    assert ended.set_points > 100
+    assert off_by.worst < 0.02
 
 
-def test_a_board_that_resets_stands_until_the_daemon_has_seen_it(board: Board, bus: Bus) -> None:
-    with bus.commanding(0.5):
-        until(lambda: turns(board, 10.0), 5.0, "it drives")
-        board.command("reset")
-        assert not board.status().running
-    bus.at_rest()
-    with bus.commanding(0.5):
-        until(lambda: turns(board, 10.0), 5.0, "it drives again")
+# the host ends
+
+
+@pytest.mark.parametrize("times", [5, pytest.param(100, marks=soak)])
+@pytest.mark.timeout(900)
+def test_when_the_daemon_is_killed_the_motors_stop(
+    board: Board, tmp_path: Path, times: int
+) -> None:
+    rng = random.Random(times)
+    silent, wall = [], []
+    for _ in range(times):
+        wish = rng.choice([(0.5, 0.0), (-0.3, 0.0), (0.0, 1.5), (0.4, -0.8)])
+        mcu = rng.choice([PLAIN, COUNTS])
+        with running(board, tmp_path, mcu) as (_, daemon, bus), bus.commanding(*wish):
+            until(lambda: board.status().running, 5.0, "it drives")
+            passes(board, rng.uniform(20.0, 600.0))
+            daemon.signal(signal.SIGKILL)
+            killed = time.monotonic_ns()
+            daemon.ended(3.0)
+            status = until(
+                lambda: None if (status := board.status()).running else status, 3.0, "motors off"
+            )
+        assert status.to_board.last.startswith("a"), "a whole line was the last"
+        silent.append((status.off_ns - status.heard_ns) / MS)
+        wall.append((status.base_ns + status.off_ns - killed) / MS)
+    counted = account(board)
+    within = sum(ms <= 350 for ms in silent)
+    print(f"\nkilled while driving: {within} of {times} within 350 ms of the last line: "
+          f"{min(silent):.1f} to {max(silent):.1f} ms; {min(wall):.0f} to {max(wall):.0f} ms after "
+          f"the signal (wall clock); the board counted {counted.trips}")  # fmt: skip
+    assert within == times
+    assert min(silent) >= 250
+    assert counted.trips == times
+    assert (counted.refused, board.status().wrong) == (0, 0)
+
+
+# the board ends
+
+
+def by_pin(board: Board) -> None:
+    """Somebody presses its button."""
+    board.command("reset")
+
+
+def by_a_hang(board: Board) -> None:
+    """Its main loop stands still, until its own watchdog resets it."""
+    board.command("type !l")
+
+
+def unheard(board: Board) -> None:
+    """By its pin, and the line that says so is lost."""
+    lines = board.status().from_board.lines
+    board.command("lose from 100")
+    board.command("reset")
+    until(lambda: board.status().from_board.lines > lines, 3.0, "it has said that it booted")
+    board.command("lose from 0")
+
+
+def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
+    """The board resets while the robot drives and its commander goes on sending.
+
+    `unseen` m of its way no line told of: it may miss them, but nothing else, and add none.
+    """
+    board, _, bus = rig
+    with bus.follow("odom") as odom:
+        with bus.commanding(0.5) as commander:
+            passes(board, 200)
+            drives(board)
+            how(board)
+            off = until(lambda: s if (s := board.status()).resets else None, 3.0, "a reset")
+            assert not off.running
+            moves_nothing(board, off, 800)
+            state = bus.state()
+            assert (state["link"], state["mode"]) == ("up", "ready")
+            (waiting,) = [one for one in state["sources"] if one["name"] == "app"]
+            assert waiting["waits_for"].startswith("neutral first")
+            coasted = truly(stands(board))
+            gives_way(bus, commander)
+            drives(board)
+        true = truly(stands(board))
+        bus.at_rest()
+        now = time.monotonic()
+        odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
+    said = went([seen.value for seen in odom.seen])
+    most = leap([seen.value for seen in odom.seen], 0.5)
+    print(f"\n{how.__name__}: {true.distance:.3f} m, odometry "
+          f"{1000 * (said.distance - true.distance):+.1f} mm off; "
+          f"longest step {1000 * most:+.2f} mm beyond 0.5 m/s")  # fmt: skip
+    assert coasted.distance > 0.05
+    assert -unseen < said.distance - true.distance < 0.002
+    assert abs(said.yaw - true.yaw) < 0.02
+    assert most < JITTER
+    assert board.status().wrong == 0
+
+
+MODES = {"off": PLAIN, "auto": COUNTS, "require": STRICT}
+
+
+@pytest.mark.parametrize("mode", ["off", "require", pytest.param("auto", marks=soak)])
+def test_a_board_that_is_reset_moves_nothing_before_neutral(
+    board: Board, tmp_path: Path, mode: str
+) -> None:
+    with running(board, tmp_path, MODES[mode]) as rig:
+        resets(rig, by_pin, unseen=0.035)
+    assert account(board).reset == "pin"
+
+
+@pytest.mark.parametrize(
+    "mode", ["off", pytest.param("auto", marks=soak), pytest.param("require", marks=soak)]
+)
+def test_a_reset_that_nobody_heard_of_moves_nothing_before_neutral(
+    board: Board, tmp_path: Path, mode: str
+) -> None:
+    with running(board, tmp_path, MODES[mode]) as rig:
+        resets(rig, unheard, unseen=0.05)
+
+
+@pytest.mark.parametrize(
+    "mode", ["auto", pytest.param("off", marks=soak), pytest.param("require", marks=soak)]
+)
+def test_a_board_that_hangs_moves_nothing_before_neutral(
+    runner: Path, hanging_firmware: Path, tmp_path: Path, mode: str
+) -> None:
+    with Board(runner, hanging_firmware, "--free-speed", FREE_SPEEDS) as board:
+        with running(board, tmp_path, MODES[mode]) as rig:
+            resets(rig, by_a_hang, unseen=0.1)
+        assert account(board).reset == "watchdog"
+
+
+# the wire
+
+
+@pytest.mark.parametrize("mcu", [pytest.param(PLAIN, marks=soak), STRICT], ids=["plain", "checked"])
+@pytest.mark.parametrize("length_s", [1.5, pytest.param(20.0, marks=soak)])
+def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
+    board: Board, tmp_path: Path, mcu: Mcu, length_s: float
+) -> None:
+    """Wrong bits in every sixth to fourth line, lost bytes in as many, each way."""
+    is_checked = mcu is STRICT
+    with running(board, tmp_path, mcu) as (_, _, bus), bus.commanding(0.5) as commander:
+        drives(board)
+        for fault in ("noise", "drop"):
+            before = board.status()
+            board.command(f"{fault} to 211")
+            board.command(f"{fault} from 307")
+            speeds = []
+            while (status := passes(board, 5)).virtual_ns < before.virtual_ns + length_s * 1e9:
+                speeds += [motor.speed for motor in status.motors]
+            board.command(f"{fault} to 0")
+            board.command(f"{fault} from 0")
+            points, wrong = status.set_points - before.set_points, status.wrong - before.wrong
+            heard = status.to_board.lines - before.to_board.lines
+            bad = status.to_board.damaged + status.to_board.lost
+            bad -= before.to_board.damaged + before.to_board.lost
+            state = bus.state()
+            print(f"\n{fault}: {heard} lines with {bad} bad bytes: {points} changes of set points, "
+                  f"{wrong} to speeds nobody asked for {list(status.wrong_one) if wrong else ''}; "
+                  f"slowest wheel {min(speeds):.2f} rad/s, then {state['mode']}, "
+                  f"link {state['link']}; {skipped(status)}")  # fmt: skip
+            if is_checked:
+                assert wrong == 0
+                assert state["mode"] == "driving"
+                assert min(speeds) > 9.5
+            elif state["mode"] == "fault":
+                bus.get("srv/clear")
+                gives_way(bus, commander)
+            drives(board)
+        print("the daemon refused:", rejects(bus))
+    counted = account(board)
+    print(f"the board executed {counted.lines} lines and refused {counted.refused}")
+    if is_checked:
+        assert board.status().wrong == 0
+        assert counted.trips == 0
+
+
+def rejects(bus: Bus) -> dict[str, int]:
+    """The lines it has refused, by reason."""
+    counters = bus.state()["counters"]
+    return {name: count for name, count in counters.items() if name.startswith("line_")}
+
+
+@pytest.mark.parametrize("mcu", [pytest.param(PLAIN, marks=soak), STRICT], ids=["plain", "checked"])
+def test_a_lost_line_is_found_again_and_neutral_comes_first(
+    board: Board, tmp_path: Path, mcu: Mcu
+) -> None:
+    """The board falls silent, then its plug is pulled; the commander never stops sending."""
+    port = tmp_path / "mcu"
+    port.symlink_to(board.path)
+    with running(board, tmp_path, mcu, port) as (_, daemon, bus), bus.commanding(0.5) as commander:
+        with bus.follow("state") as states:
+
+            def link(word: str, since: float) -> float:
+                """After how many ms the link was that."""
+                seen = states.find(
+                    lambda state: state["link"] == word, 3.0, f"link {word}", after=since
+                )
+                return 1000 * (seen.at - since)
+
+            drives(board)
+            at = time.monotonic()
+            board.command("mute")
+            stale = link("stale", at)
+            off = stands(board)
+            stopped = (off.wanted_ns + off.base_ns) / MS - at * 1000
+            # After less than a second it would ramp up again by itself.
+            passes(board, 1200)
+            at = time.monotonic()
+            board.command("unmute")
+            back = link("up", at)
+            moves_nothing(board, off, 600)
+            print(f"\nmute -> stale {stale:.0f} ms, told to stop {stopped:.0f} ms; "
+                  f"unmute -> up {back:.0f} ms")  # fmt: skip
+            assert stale < 200
+            assert stopped < 200
+            assert back < 600
+            gives_way(bus, commander)
+            drives(board)
+
+            at = time.monotonic()
+            port.unlink()
+            board.command("unplug")
+            down = link("down", at)
+            off = until(lambda: None if (s := board.status()).running else s, 3.0, "motors off")
+            silent = (off.off_ns - off.heard_ns) / MS
+            port.symlink_to(board.plug())
+            at = time.monotonic()
+            back = link("up", at)
+            moves_nothing(board, off, 600)
+            print(f"unplug -> down {down:.0f} ms, no voltage {silent:.0f} ms after the last byte; "
+                  f"plug -> up {back:.0f} ms")  # fmt: skip
+            assert down < 250
+            assert silent <= 350
+            assert back < 1500
+            gives_way(bus, commander)
+            drives(board)
+        assert board.status().wrong == 0
+        assert daemon.process.poll() is None
+    assert account(board).refused <= 1, "a line that the plug cut"
+
+
+@pytest.mark.parametrize(
+    ("mcu", "length_s"),
+    [(COUNTS, 5), pytest.param(COUNTS, 60, marks=soak), pytest.param(PLAIN, 60, marks=soak)],
+    ids=["counts-5", "counts-60", "plain-60"],
+)
+@pytest.mark.timeout(180)
+def test_by_counts_a_fifth_of_the_lines_lost_loses_no_distance(
+    board: Board, tmp_path: Path, mcu: Mcu, length_s: int
+) -> None:
+    with running(board, tmp_path, mcu) as (_, daemon, bus):
+        with bus.follow("odom") as odom, bus.follow("wheel_states") as wheels:
+            board.command("lose from 20")
+            with bus.commanding(0.0) as commander:
+                drive_about(board, commander, length_s)
+                status = stands(board)
+                off_by = errors(odom, wheels, status)
+            board.command("lose from 0")
+        stale = len(daemon.events("link_stale"))
+    wire = status.from_board
+    lost = wire.lost / wire.bytes
+    print(f"\n{lost:.1%} of {wire.lines} replies lost, link stale {stale} times; {off_by}; "
+          f"{skipped(status)}")  # fmt: skip
+    assert 0.15 < lost < 0.25
+    if mcu is COUNTS:
+        assert off_by.worst < 0.001

@@ -17,7 +17,7 @@ from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.settings import WheelMap
 from acsard.values import WheelSpeeds
-from tests.firmware.board import checked, read_reply, speeds_line
+from tests.firmware.board import checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
 
 
@@ -35,6 +35,7 @@ class ReaderC(ctypes.Structure):
         ("text", ctypes.c_char * 128),
         ("length", ctypes.c_uint8),
         ("discarding", ctypes.c_bool),
+        ("too_long", ctypes.c_uint16),
     )
 
 
@@ -43,6 +44,14 @@ class ReadingC(ctypes.Structure):
         ("milliseconds", ctypes.c_uint16),
         ("counts", ctypes.c_uint16 * 4),
         ("hundredths", ctypes.c_int16 * 4),
+    )
+
+
+class RecordC(ctypes.Structure):
+    _fields_ = (
+        ("lines", ctypes.c_uint32),
+        ("refused", ctypes.c_uint16),
+        ("trips", ctypes.c_uint16),
     )
 
 
@@ -71,6 +80,12 @@ class Parser:
         self._asks = library.line_asks
         self._asks.argtypes = (ctypes.c_char_p, ctypes.c_uint8)
         self._asks.restype = ctypes.c_bool
+        self._identity = library.line_identity
+        self._identity.argtypes = (ctypes.c_char_p, ctypes.c_void_p, ctypes.c_char_p)
+        self._identity.restype = ctypes.c_uint8
+        self._count_up = library.count_up
+        self._count_up.argtypes = (ctypes.c_void_p,)
+        self._count_up.restype = None
         self._reader = ReaderC()
         self._pointer = ctypes.addressof(self._reader)
         self._command = CommandC()
@@ -102,6 +117,24 @@ class Parser:
 
     def asks(self, line: bytes) -> bool:
         return bool(self._asks(line, len(line)))
+
+    @property
+    def too_long(self) -> int:
+        return int(self._reader.too_long)
+
+    def identity(self, lines: int, refused: int, trips: int, reset: bytes) -> bytes:
+        """The line that says who it is, with its end."""
+        record = RecordC(lines, refused, trips)
+        out = ctypes.create_string_buffer(128)
+        length = self._identity(out, ctypes.addressof(record), reset)
+        assert length <= 128
+        return out.raw[:length]
+
+    def counted_up(self, count: int) -> int:
+        """The next count."""
+        counter = ctypes.c_uint16(count)
+        self._count_up(ctypes.addressof(counter))
+        return counter.value
 
     def reply(self, command: Command, ms: int, counts: list[int], hundredths: list[int]) -> bytes:
         """The answer, with its end."""
@@ -217,6 +250,12 @@ def test_noise_without_a_line_end_is_forgotten_and_the_next_line_counts(parser: 
     assert parser.stream(b" " * (127 - len(ZERO)) + ZERO + b"\r\n") == []
 
 
+def test_lines_too_long_to_be_any_are_counted(parser: Parser) -> None:
+    before = parser.too_long
+    parser.stream(b"a" * 1000 + b"\n" + ZERO + b"\n" + b"b" * 127 + b"\n" + b"c" * 128 + b"\n")
+    assert parser.too_long == before + 2
+
+
 def test_only_a_lone_question_mark_asks(parser: Parser) -> None:
     assert parser.asks(b"?")
     assert not any(parser.asks(line) for line in (b"??", b" ?", b"? ", ZERO + b"?", b"!"))
@@ -316,6 +355,29 @@ def test_no_single_bit_error_makes_a_line_end_where_the_rest_is_a_line(parser: P
             bad = _with(line, bit // 8, line[bit // 8] ^ (1 << bit % 8))
             if b"\n" in bad:
                 assert parser.stream(bad + b"\r\n") == [], bad
+
+
+# who it is
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 65535), st.integers(0, 65535))
+def test_it_says_who_it_is_in_a_line_that_is_no_feedback_and_not_too_long_for_the_host(
+    parser: Parser, lines: int, refused: int, trips: int
+) -> None:
+    line = parser.identity(lines, refused, trips, b"brown-out")
+    assert read_identity(line.removesuffix(b"\r\n"))[4:] == (lines, refused, trips, "brown-out")
+    ((heard, _),) = LineReader().feed(line)
+    assert heard.startswith(b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1 ")
+    with pytest.raises(FrameError):
+        Codec(WheelMap()).decode(heard)
+
+
+def test_its_longest_line_leaves_room_for_a_finer_encoder(parser: Parser) -> None:
+    assert len(parser.identity(2**32 - 1, 65535, 65535, b"brown-out")) == 119
+
+
+def test_a_counter_that_is_full_stays_so(parser: Parser) -> None:
+    assert [parser.counted_up(count) for count in (0, 65534, 65535)] == [1, 65535, 65535]
 
 
 # replies

@@ -627,6 +627,22 @@ def test_the_note_behind_a_reason_says_the_check_in_force() -> None:
     assert Bench(AUTO).checked().session.note == " (serial lines checked)"
 
 
+def test_the_first_stop_of_a_silence_leaves_at_once() -> None:
+    """What the MCU was told last, a period ago, was to drive."""
+    bench = Bench().up()
+    while not bench.session.silent(bench.now_ns):
+        assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+        bench.wait(10)
+    assert bench.line() == bench.session.codec.stop
+
+
+def test_an_mcu_that_has_started_again_is_stopped_at_once() -> None:
+    bench = Bench().up()
+    assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+    bench.wait(10, BOOTED)
+    assert bench.line() == bench.session.codec.stop
+
+
 def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
     bench = Bench().up()
     bench.wait(150)
