@@ -87,6 +87,7 @@ ORDER = (
     "runtime.certificates",
     "runtime.host",
     "runtime.daemon",
+    "runtime.bench_child",
     "runtime.bench_record",
     "runtime.bench_wire",
     "runtime.bench_rig",

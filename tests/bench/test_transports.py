@@ -26,7 +26,8 @@ from acsard.messages.schema import Message
 from acsard.messages.topics import full_key
 from acsard.ros.trees import left_out
 from acsard.runtime import clock, outlets
-from acsard.runtime.bench_rig import Rig, processor_ns
+from acsard.runtime.bench_child import processor_ns
+from acsard.runtime.bench_rig import Rig
 from acsard.runtime.daemon import SIMULATOR
 from acsard.runtime.outlets import direct
 from acsard.runtime.zenoh_bus import ZenohBus
