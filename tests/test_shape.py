@@ -101,6 +101,7 @@ ORDER = (
     "cli.hz",
     "cli.top_text",
     "cli.top_view",
+    "cli.top_feed",
     "cli.top",
     "cli.drive",
     "cli.call",
