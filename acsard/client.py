@@ -102,7 +102,7 @@ class Client:
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
         """The raw samples of any key below the robot's id."""
-        subscriber = self._subscribe(name)
+        subscriber = self.subscribe(name)
         quiet_since = time.monotonic()
         try:
             while timeout is None or time.monotonic() - quiet_since < timeout:
@@ -122,7 +122,11 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def _subscribe(self, name: str) -> Any:
+    def subscribe(self, name: str) -> Any:
+        """A queue of the raw samples of a key: `try_recv` gives the next or None; `undeclare` it.
+
+        For a loop of your own, which must not wait here.
+        """
         try:
             return self._declare(name)
         except zenoh.ZError:
@@ -211,7 +215,7 @@ class AsyncClient:
     async def messages(self, name: str) -> AsyncIterator[Any]:
         """The typed messages of a published key as they come, until the loop over them ends."""
         decoder = _decoder(name)
-        subscriber = self._client._subscribe(name)
+        subscriber = self._client.subscribe(name)
         try:
             while True:
                 sample = subscriber.try_recv()

@@ -35,6 +35,10 @@ def test_every_verb_named_in_the_readme_exists() -> None:
     assert {a or b for a, b in named} <= verbs
 
 
+def test_no_placeholder_waits_for_its_text() -> None:
+    assert re.findall(r"^[ \t]*([A-Z][A-Z_]{2,})[ \t]*$", README.read_text(), re.M) == []
+
+
 if __name__ == "__main__":
     text = README.read_text()
     README.write_text(TABLE.sub(lambda m: m[1] + table() + m[2], text))

@@ -20,14 +20,14 @@ POINTS = {
 """What is measured from outside, and between which points; "here" is another process."""
 
 OWN = {
-    "period_lateness": "period due -> control task runs",
-    "step_time": "control task runs -> its work done",
+    "period_lateness": "period due (of several missed, the first) -> its step",
+    "step_time": "start of a step -> its work done",
     "command_age": "command arrived -> each line that follows it",
-    "command_to_wire": "command arrived -> first line that follows it",
-    "feedback_to_bus": "end of a feedback line -> its last message handed to the bus",
-    "mcu_round_trip": "line handed to the port -> end of its answer",
+    "command_to_wire": "command arrived in its source's turn -> first line after it",
+    "feedback_to_bus": "feedback line read -> its last message handed to the bus",
+    "mcu_round_trip": "line -> end of its answer, matched by time unless checked",
 }
-"""What the daemon measures of itself, within its own process."""
+"""What the daemon measures of itself, within its own process, as `figures.Name` defines it."""
 
 
 class Machine(Struct, frozen=True):
@@ -66,7 +66,8 @@ class Result(Struct, frozen=True, omit_defaults=False):
     """Feedback lines that became odometry here."""
     lines_waiting_max: int | None
     """Newer feedback lines handed over by the time of a sample, at the most."""
-    periods: int
+    lines_sent: int
+    """Lines the daemon handed to the port, counted up to the same moment as `missed_periods`."""
     missed_periods: int
     cpu_percent_following: float
     """Of one core, with one subscriber of odometry and no commands."""
@@ -143,7 +144,9 @@ def _about(result: Result) -> list[str]:
     m = result.machine
     permitted = "permitted" if m.realtime_permitted else "not permitted"
     used = "used by the daemon" if result.realtime else "not used by the daemon"
-    port = "simulated microcontroller" if result.simulated else f"{result.port}, zero speeds only"
+    port = "simulated microcontroller, plain lines"
+    if not result.simulated:
+        port = f"{result.port}, zero speeds only"
     return [
         f"machine   {m.cpu}, {m.cores} cores, Linux {m.kernel}, Python {m.python}",
         f"          real-time scheduling {permitted}, {used}",
@@ -163,7 +166,7 @@ def _counts(result: Result) -> list[str]:
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),
         ("feedback lines", f"{r.lines_told}{said} became odometry here{waiting}"),
-        ("periods missed", f"{r.missed_periods} of {r.periods}"),
+        ("periods missed", f"{r.missed_periods}, beside {r.lines_sent} lines sent"),
         ("processor", f"{r.cpu_percent_following:.1f} % of a core with one subscriber"),
         ("", f"{r.cpu_percent_commanded:.1f} % with 25 commands a second as well"),
         ("memory", f"{r.resident_mb:.0f} MB resident"),

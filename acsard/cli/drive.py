@@ -130,7 +130,7 @@ def _loop(robot: object, teleop: Teleop) -> None:
     from acsard.messages.schema import RobotState
 
     assert isinstance(robot, Client)
-    decoder, states = Decoder(RobotState), robot._subscribe("state")
+    decoder, states = Decoder(RobotState), robot.subscribe("state")
     shown, heard = "", time.monotonic()
     while True:
         ready, _, _ = select.select([sys.stdin], [], [], PERIOD_S)

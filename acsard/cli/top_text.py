@@ -61,14 +61,6 @@ def ago(seconds: float | None) -> str:
     return f"{seconds / 86400:.0f} d"
 
 
-def share(part: int, whole: int) -> str:
-    """`part` of `whole` in percent; never a rounded zero for what is not none."""
-    percent = 100.0 * part / whole if 0 < part <= whole < 10**15 else 0.0
-    if 0.0 < percent < 0.01:
-        return "<0.01 %"
-    return f"{percent:.2g} %" if percent < 10.0 else f"{percent:.0f} %"
-
-
 def rate(later: int, earlier: int, seconds: float) -> str:
     """How often a counter counts, in 7 characters; "-" when that cannot be told."""
     # A clock that was set, a daemon that was started anew: no rate is better than a wrong one.

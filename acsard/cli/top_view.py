@@ -22,7 +22,6 @@ from acsard.cli.top_text import (
     rate,
     row,
     rule,
-    share,
     signed,
 )
 from acsard.figures import NAMES
@@ -30,7 +29,7 @@ from acsard.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.values import NS_PER_S
 
 SILENT_S = 2.0
-"""Without a state for this long there is no news, and all below is old."""
+"""Without a state for this long at least there is no news, and all below is old."""
 
 WIDEST = 116
 """Wider than this a line is harder to read, not easier."""
@@ -52,14 +51,14 @@ MODES = {
 LINKS = {"up": "green", "booting": "yellow"}
 
 FIGURES = {
-    "period_lateness": ("period begins late", "how late a control period begins"),
-    "step_time": ("work of one step", "from a wake-up to the end of that step's work"),
+    "period_lateness": ("period due → step", "from a period due (the first missed) to its step"),
+    "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
-    "command_to_wire": ("arrival → first line", "from a command's arrival to the first such line"),
-    "feedback_to_bus": ("line in → published", "from a feedback line to its last message"),
-    "mcu_round_trip": ("line out → answer in", "from a line to the end of the MCU's answer"),
+    "command_to_wire": ("arrival → first line", "from arrival in its turn to the first such line"),
+    "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
+    "mcu_round_trip": ("line out → answer in", "from a line to its answer; unchecked: by time"),
 }
-"""What each figure is, in few words and in more. An arrow is from one moment to another."""
+"""`figures.Name` in few words and in more. An arrow is from one moment to another."""
 
 
 class Seen(Struct, frozen=True):
@@ -75,12 +74,14 @@ class Seen(Struct, frozen=True):
     undecodable: int = 0
     """Messages in the state's place that are none."""
     hint: str = ""
+    silence: float = SILENT_S
+    """The age from which on it is a silence, s."""
 
 
 def screen(seen: Seen, width: int, height: int | None = None) -> Group:
     """The screen as lines of at most `width` cells, at most `height` of them (None: all)."""
     width = max(20, min(WIDEST, width))
-    silent = seen.age >= SILENT_S
+    silent = seen.age >= seen.silence
     head = [_header(seen, width), *(_no_news(seen, width) if silent else _mode(seen, width))]
     sections: list[list[Text]] = []
     if seen.state is not None:
@@ -234,7 +235,7 @@ def _link(seen: Seen, state: RobotState, width: int) -> list[Text]:
         row("lines", f"in {counted('lines')} out {counted('lines_sent')}").append(
             f" superseded {count(superseded)}"
         ),
-        row("commands", f"   {counted('commands')} ").append_text(_missed(state)),
+        row("commands", f"   {counted('commands')} ").append_text(_missed(state, before)),
     ]
     if overrun:
         lines[-1].append(f"  bus overrun {count(overrun)}", "yellow")
@@ -248,12 +249,10 @@ def _port(info: Info) -> str:
     return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
 
 
-def _missed(state: RobotState) -> Text:
-    missed, lateness = state.counters.get("missed_periods", 0), state.figures.get(NAMES[0])
-    held = lateness.since_start.count if lateness else state.counters.get("lines_sent", 0)
-    # As in `diagnostics`: from 1 % on it is a warning.
-    style = "bold yellow" if 100 * missed > max(1, held) else ""
-    return Text(f"missed periods {count(missed)} ({share(missed, held + missed)})", style)
+def _missed(state: RobotState, before: RobotState) -> Text:
+    missed = state.counters.get("missed_periods", 0)
+    grows = missed > before.counters.get("missed_periods", 0)
+    return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator
 
+from msgspec.structs import asdict
+
 from acsard.mcu.wire import wire_use
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -73,17 +75,9 @@ class Report:
         self._start = start
         self._sample: Sample | None = None
         self._outputs: Outputs | None = None
-        rates = config.rates
-        self._rates = {
-            "odom": _Rate(rates.odom),
-            "wheel_states": _Rate(rates.wheel_states),
-            "cmd_vel_out": _Rate(rates.cmd_vel_out),
-            "state": _Rate(rates.state),
-            "diagnostics": _Rate(rates.diagnostics),
-        }
-        diagonal = config.odometry.twist_covariance_diagonal
+        self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
         self._twist_covariance = [0.0] * 36
-        self._twist_covariance[::7] = diagonal
+        self._twist_covariance[::7] = config.odometry.twist_covariance_diagonal
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look

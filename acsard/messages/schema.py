@@ -6,7 +6,7 @@ structs refuse unknown fields, so a misspelt axis is an error and not a standsti
 
 from __future__ import annotations
 
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 from msgspec import Meta, Struct
 
@@ -18,8 +18,7 @@ Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
-T = TypeVar("T")
-Few = Annotated[list[T], Meta(max_length=64)]
+FEW = Meta(max_length=64)
 """More joints than any robot of ours; what a stranger sends must not take long to refuse."""
 
 
@@ -137,10 +136,10 @@ class JointState(Message, frozen=True):
     """Per joint `name`: `position` rad (continuous), `velocity` rad/s, `effort` N m (unused)."""
 
     header: Header = Header()
-    name: Few[str] = []
-    position: Few[float] = []
-    velocity: Few[float] = []
-    effort: Few[float] = []
+    name: Annotated[list[str], FEW] = []
+    position: Annotated[list[float], FEW] = []
+    velocity: Annotated[list[float], FEW] = []
+    effort: Annotated[list[float], FEW] = []
 
 
 class SourceState(Message, frozen=True):
@@ -190,8 +189,7 @@ class RobotState(Message, frozen=True):
     certificate: str = ""
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
-    """How fast it is: period_lateness, step_time, command_age, command_to_wire, feedback_to_bus,
-    mcu_round_trip; at most a second old."""
+    """How fast it is, by the names in `figures.py`; at most a second old."""
 
 
 class KeyValue(Message, frozen=True):

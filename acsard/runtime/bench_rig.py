@@ -10,10 +10,8 @@ same keys can stand in the daemon's place.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import random
-import signal
 import socket
 import subprocess
 import sys
@@ -35,6 +33,7 @@ from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.messages.topics import full_key
 from acsard.runtime import clock
+from acsard.runtime.bench_child import END_S, daemon_ended, end_with_us, ended, leave, processor_ns
 from acsard.runtime.bench_record import Record, Sample, Seen, Sent
 from acsard.runtime.bench_wire import Part
 from acsard.runtime.exits import Exit, ExitError
@@ -47,13 +46,16 @@ T = TypeVar("T")
 
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
-START_S, END_S = 15.0, 5.0
-"""A start takes 0.3 s, and 2 s more where opening the port resets the board; an end 0.2 s."""
-
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
+START_S = 15.0
+"""A start takes 0.3 s, and 2 s more where opening the port resets the board."""
 
 SETTLED = 10
 """Odometry samples after which the link is up and the start is over."""
+
+LOOK_S = 0.5
+"""Between two looks at whether all processes are there."""
+
+FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
 """Between two commands, evenly spread: they fall anywhere within a period."""
@@ -64,20 +66,6 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def processor_ns(pid: int) -> int:
-    """Processor time of all threads of a process so far."""
-    return sum(
-        int(task.joinpath("schedstat").read_text().split()[0])
-        for task in Path(f"/proc/{pid}/task").iterdir()
-    )
-
-
-def resident_mb(pid: int) -> float:
-    """Memory in use."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.partition("VmRSS:")[2].split()[0]) / 1024
 
 
 class Rig:
@@ -144,9 +132,12 @@ class Rig:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        stack.callback(_leave, wire)
+        stack.callback(leave, wire)
         assert wire.stdout is not None
-        return wire.stdout.readline().decode().strip()
+        device = wire.stdout.readline().decode().strip()
+        if not device:
+            raise ended(FAR_END, wire.wait())
+        return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
         hidden = ("INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG")
@@ -160,9 +151,9 @@ class Rig:
                 stderr=log,
                 env={key: value for key, value in os.environ.items() if key not in hidden},
                 start_new_session=True,
-                preexec_fn=_end_with_us,
+                preexec_fn=end_with_us,
             )
-        stack.callback(_leave, self.process)
+        stack.callback(leave, self.process)
 
     def _connect(self) -> zenoh.Session | None:
         try:
@@ -189,16 +180,12 @@ class Rig:
             return ""
 
     def _alive(self) -> None:
-        """Raises the program's own end as ours."""
+        """Raises the program's own end as ours, and that of the wire."""
+        if self._wire is not None and self._wire.poll() is not None:
+            raise ended(FAR_END, self._wire.returncode)
         code = self.process.poll()
         if code is not None:
-            said = self._log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
-            known = code in Exit.__members__.values()
-            text = said[-1].removeprefix("acsard: ")
-            raise ExitError(
-                Exit(code) if known and code else Exit.FAILURE,
-                text if known and code else f"the daemon ended with {code}: {text}",
-            )
+            raise daemon_ended(code, self._log)
 
     # measuring
 
@@ -208,7 +195,10 @@ class Rig:
     def follow(self, seconds: float) -> float:
         """Only listen for so long; the share of a core the program took."""
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
-        time.sleep(seconds)
+        end_ns = began_ns + int(seconds * NS_PER_S)
+        while (left_ns := end_ns - clock.mono_ns()) > 0:
+            time.sleep(min(LOOK_S, left_ns / NS_PER_S))
+            self._alive()
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
@@ -222,6 +212,7 @@ class Rig:
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         while clock.mono_ns() - began_ns < seconds * NS_PER_S:
             time.sleep(phases.uniform(*SPACING_S))
+            self._alive()
             self._sent.append(self._put(wheel_speed(number)))
             number += 1
         time.sleep(0.1)  # the last one's line
@@ -257,20 +248,15 @@ class Rig:
 
     def leave(self) -> None:
         """End the program."""
-        _leave(self.process)
+        leave(self.process)
 
     def end(self) -> Record:
         """End the program and tell what was recorded; the rig is used up."""
         window_ns = (self._settled_ns, clock.mono_ns())
         time.sleep(0.1)  # what was under way
+        self._alive()
         self.leave()
-        seen = None
-        if self._wire is not None:
-            assert self._wire.stdin is not None
-            assert self._wire.stdout is not None
-            self._wire.stdin.close()
-            seen = msgspec.msgpack.decode(self._wire.stdout.read(), type=Seen)
-            self._wire.wait(END_S)
+        seen = None if self._wire is None else _told(self._wire)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -283,17 +269,12 @@ class Rig:
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
 
 
-def _end_with_us() -> None:
-    """In the child: a parent that is killed leaves no daemon behind."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
-def _leave(process: subprocess.Popen[bytes]) -> None:
-    """End a child: it is asked first."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+def _told(wire: subprocess.Popen[bytes]) -> Seen:
+    """End the far end; all it saw."""
+    assert wire.stdin is not None
+    assert wire.stdout is not None
+    wire.stdin.close()
+    told = wire.stdout.read()
+    if wire.wait(END_S):
+        raise ended(FAR_END, wire.returncode)
+    return msgspec.msgpack.decode(told, type=Seen)

@@ -25,18 +25,21 @@ pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 
 SECONDS = 4.0
 MISSED = 0.01
-TRIES = 2
-"""One stall of the whole machine must not decide."""
+MADE_FOR = 100.0
+"""Hz."""
+
+TRIES = 3
+"""A stall of the whole machine must not decide: at 100 Hz one of 50 ms is more than `MISSED`."""
 
 PRIORITY = 50
 """Of the daemon, below the simulated wire's."""
 
 
-def periods_and_missed(running: Rig) -> tuple[int, int, int]:
+def taken(running: Rig) -> tuple[float, int, int]:
+    """The time in s, periods missed and feedback lines heard so far, all of one moment."""
     state = running.state()
     counters = state.counters
-    begun = state.figures["period_lateness"].since_start.count
-    return begun, counters.get("missed_periods", 0), counters["lines"]
+    return state.stamp.to_ns() / 1e9, counters.get("missed_periods", 0), counters["lines"]
 
 
 def scheduled(running: Rig, realtime: bool) -> None:
@@ -53,15 +56,13 @@ def missed_share(rate: float, realtime: bool) -> float:
     words = (sys.executable, "-m", "tests.bench.unlimited", "--rate", str(rate))
     with rig(config(), words, wire_baud_rate=BAUD_RATE) as running:
         scheduled(running, realtime)
-        before = periods_and_missed(running)
+        before = taken(running)
         used = running.follow(SECONDS)
-        begun, missed, lines = (
-            b - a for a, b in zip(before, periods_and_missed(running), strict=True)
-        )
+        seconds, missed, lines = (b - a for a, b in zip(before, taken(running), strict=True))
         running.leave()
-    share = missed / max(1, begun + missed)
+    share = missed / max(1.0, seconds * rate)
     print(
-        f"  {rate:6.0f} Hz: {100 * share:5.2f} % missed, {begun / SECONDS:.0f} steps and "
+        f"  {rate:6.0f} Hz: {100 * share:5.2f} % missed, {rate * (1 - share):.0f} steps and "
         f"{lines / SECONDS:.0f} feedback lines a second, {100 * used:.0f} % of a core"
     )
     return share
@@ -74,15 +75,15 @@ def test_the_highest_control_rate(realtime: bool) -> None:
 
     how = "SCHED_FIFO" if realtime else "normal"
     print(f"\nhighest control rate with less than 1 % of the periods missed, {how} scheduling")
-    good, bad = 0.0, 500.0
+    good, bad = 0.0, MADE_FOR
     while bad <= 16000.0 and holds(bad):
         good, bad = bad, 2 * bad
-    for _ in range(3):
+    for _ in range(3 if good else 0):
         middle = (good + bad) / 2
         good, bad = (middle, bad) if holds(middle) else (good, middle)
     print(f"  {good:.0f} Hz")
-    # Others on the machine decide it when nothing keeps them back.
-    assert good >= (5 * 100.0 if realtime else 0.0)  # of what it is made for
+    # Others on the machine decide how much more when nothing keeps them back.
+    assert good >= (5 * MADE_FOR if realtime else MADE_FOR)
 
 
 HOGS_S = 120
@@ -117,7 +118,7 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
         print(
             f"\nlateness at 100 Hz, {'all cores busy' if busy else 'idle'}, "
             f"{'SCHED_FIFO' if realtime else 'normal'} scheduling: p50 {late.p50:.0f}, "
-            f"p99 {late.p99:.0f}, max {late.max:.0f} us; {missed} of {late.count} missed"
+            f"p99 {late.p99:.0f}, max {late.max:.0f} us; {missed} periods missed"
         )
         # What was asked for is what was measured.
         assert late.count + missed > 900

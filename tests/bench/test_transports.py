@@ -26,7 +26,8 @@ from acsard.messages.schema import Message
 from acsard.messages.topics import full_key
 from acsard.ros.trees import left_out
 from acsard.runtime import clock, outlets
-from acsard.runtime.bench_rig import Rig, processor_ns
+from acsard.runtime.bench_child import processor_ns
+from acsard.runtime.bench_rig import Rig
 from acsard.runtime.daemon import SIMULATOR
 from acsard.runtime.outlets import direct
 from acsard.runtime.zenoh_bus import ZenohBus
@@ -91,7 +92,9 @@ def test_the_cost_of_each_transport() -> None:
     for name, us in costs.items():
         more = f"{us - costs['nobody']:+7.0f}" if name != "nobody" else ""
         print(f"  {name:16}{us:7.0f}{more}   {us / 100:.1f} % of a core")
-    assert costs["both"] > costs["nobody"]
+    # The messages are built once for both forms.
+    alone = costs["native msgpack"] + costs["bridge CDR"] - 2 * costs["nobody"]
+    assert costs["both"] - costs["nobody"] < alone
 
 
 @pytest.mark.bench
@@ -114,14 +117,14 @@ def test_the_cost_of_more_subscribers() -> None:
         print(f"  {name:>3}{us:7.0f}   {us / 100:.1f} % of a core")
     each = (costs["16"] - costs["1"]) / 15
     print(f"  each further client {each:.0f} us")
-    # It is built and encoded once for all of them.
-    assert costs["16"] < 16 * costs["1"]
+    # It is built and encoded once for all of them: a further one only has it sent.
+    assert each < (costs["1"] - costs["0"]) / 2
 
 
-def missed_and_periods(running: Rig) -> tuple[int, int]:
+def missed_and_due(running: Rig) -> tuple[int, float]:
+    """Periods missed so far, and those due since 1970: both of one moment."""
     state = running.state()
-    periods = state.figures["period_lateness"].since_start.count
-    return state.counters.get("missed_periods", 0), periods
+    return state.counters.get("missed_periods", 0), state.stamp.to_ns() / 1e9 * config().rate_hz
 
 
 @pytest.mark.bench
@@ -136,7 +139,7 @@ def test_the_cost_of_more_robots() -> None:
                 stack.enter_context(rig(sibling(one, which), port=SIMULATOR))
                 for which in range(number)
             ]
-            before = [missed_and_periods(robot) for robot in robots]
+            before = [missed_and_due(robot) for robot in robots]
             used = [processor_ns(robot.process.pid) for robot in robots]
             began_ns = clock.mono_ns()
             time.sleep(seconds)
@@ -145,17 +148,17 @@ def test_the_cost_of_more_robots() -> None:
                 (processor_ns(robot.process.pid) - ns) / took_ns
                 for robot, ns in zip(robots, used, strict=True)
             ]
-            after = [missed_and_periods(robot) for robot in robots]
+            after = [missed_and_due(robot) for robot in robots]
             for robot in robots:
                 robot.leave()
         missed = sum(b[0] - a[0] for a, b in zip(before, after, strict=True))
-        periods = sum(b[1] - a[1] for a, b in zip(before, after, strict=True)) + missed
+        periods = sum(b[1] - a[1] for a, b in zip(before, after, strict=True))
         shares[number] = median(costs)
         print(
             f"  {number:3} robots: {100 * median(costs):.1f} % of a core each "
             f"(most {100 * max(costs):.1f} %), {100 * sum(costs):.0f} % of "
             f"{100 * len(os.sched_getaffinity(0))} % together; "
-            f"{missed} of {periods} periods missed ({100 * missed / periods:.2f} %)"
+            f"{missed} of {periods:.0f} periods missed ({100 * missed / periods:.2f} %)"
         )
     # They share nothing: each costs about what one alone costs.
     assert shares[4] < 3 * shares[1]

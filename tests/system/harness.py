@@ -76,6 +76,19 @@ def environment(**more: str) -> dict[str, str]:
 # processes
 
 
+def children(pid: int, words: str) -> list[int]:
+    """The children of a process whose command line has these words."""
+    found = []
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        try:
+            line = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
+        except OSError:
+            continue  # gone meanwhile
+        if words in line:
+            found.append(int(child))
+    return found
+
+
 class Program:
     """A process whose output is collected while it runs; leaving ends it, whatever happened."""
 

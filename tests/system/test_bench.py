@@ -3,18 +3,46 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
-from tests.system.harness import ZERO_LINE, Daemon, Peer, Program, acsard, finish
+import pytest
+from msgspec.structs import replace
+
+from acsard.cli.bench import bench_config, measure
+from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import Config, ControlConfig
+from tests.system.harness import (
+    ZERO_LINE,
+    Daemon,
+    Peer,
+    Program,
+    acsard,
+    children,
+    finish,
+    until,
+)
+
+CHECKED = """\
+[mcu]
+link_check = "auto"
+encoder_counts = 3200
+[control]
+auto_activate = false
+"""
 
 
 def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
-    """Both at once: they share nothing."""
-    simulated = Program(acsard("bench", "--seconds", "3", "--json"), tmp_path)
-    real = Program(acsard("bench", "--seconds", "3", "--json", "--port", str(peer.path)), tmp_path)
+    """Both at once: they share nothing. What the simulator does not need, it leaves out."""
+    (tmp_path / "acsard.toml").write_text(CHECKED)
+    (tmp_path / "real").mkdir()
+    words = acsard("bench", "--seconds", "3", "--json")
+    simulated = Program(words, tmp_path)
+    real = Program([*words, "--port", str(peer.path)], tmp_path / "real")
     with simulated, real:
         assert simulated.ended(30.0) == 0, simulated
         assert real.ended(30.0) == 0, real
@@ -36,8 +64,8 @@ def is_sane(result: dict[str, Any]) -> None:
         assert 0 < figure["p50"] <= figure["p99"] <= figure["max"]
     # Nothing arrives before it was sent, and no median takes longer than a period.
     assert result["outside"]["command_to_wire"]["p50"] < 10_000
-    begun = result["own"]["period_lateness"]["count"]
-    assert begun + result["missed_periods"] == result["periods"] > 200
+    assert result["lines_sent"] > 200
+    assert result["missed_periods"] < result["lines_sent"]
     assert 0 < result["cpu_percent_following"] < 100
     assert result["resident_mb"] > 10
     assert 50 < result["start_up_ms"] < 10_000
@@ -55,6 +83,33 @@ def test_a_port_that_is_not_there_is_66(tmp_path: Path) -> None:
     done = finish(acsard("bench", "--port", str(tmp_path / "nothing")), tmp_path)
     assert (done.code, done.out) == (66, "")
     assert "is not there" in done.err
+
+
+@pytest.mark.parametrize("what", ["/tmp", "/etc/passwd"])
+def test_a_port_that_is_no_device_is_66_at_once(tmp_path: Path, what: str) -> None:
+    done = finish(acsard("bench", "--port", what), tmp_path)
+    assert (done.code, done.out) == (66, "")
+    assert done.err.startswith(f"acsard: {what} is not a serial port")
+
+
+def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason() -> None:
+    config = bench_config(Config(), simulated=True)
+    config = replace(config, control=ControlConfig(auto_activate=False))
+    with pytest.raises(ExitError, match=r"none of the \d+ commands .* says: switched off") as told:
+        measure(config, "", 1.0)
+    assert told.value.code == Exit.FAILURE
+
+
+@pytest.mark.parametrize(
+    ("words", "who"),
+    [("acsard run", "the daemon"), ("bench_wire", "the simulated microcontroller's process")],
+)
+def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str, who: str) -> None:
+    with Program(acsard("bench", "--seconds", "30"), tmp_path) as bench:
+        pid = until(lambda: next(iter(children(bench.pid, words)), None), 15.0, words)
+        os.kill(pid, signal.SIGKILL)
+        assert bench.ended(20.0) == 1
+        assert bench.err == [f"acsard: {who} was ended by signal 9"]
 
 
 def test_a_port_that_a_daemon_has_is_75_and_says_whose(tmp_path: Path, peer: Peer) -> None:

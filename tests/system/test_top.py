@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.system.harness import Bus, Daemon, Program, acsard, environment, until
+from tests.system.harness import Bus, Daemon, Program, acsard, environment, finish, until
 from tests.system.test_cli import ON_TERMINAL, Terminal
 
 SIZE = 80, 24
@@ -105,3 +105,12 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
     assert during != after
     with Terminal() as fresh:
         assert after == fresh.settings
+
+
+def test_once_shows_the_state_of_this_moment_however_seldom_it_is_published(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config={"rates": {"state": 0.1}}) as daemon:
+        done = finish(acsard("top", "--once", "--config", str(daemon.config)), tmp_path)
+    assert (done.code, done.err) == (0, "")
+    assert re.search(r"^ [A-Z]+  ", done.out, re.M)
+    assert "NO NEWS" not in done.out
+    assert re.search(r"lines +in +[\d.]+/s of [\d,]+ +out", done.out)

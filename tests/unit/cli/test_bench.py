@@ -9,12 +9,13 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli.bench import bench_config, duration, write
+from acsard.cli.bench import bench_config, check_device, duration, write
 from acsard.cli.bench_table import OWN, POINTS, Machine, Result, table, this_machine
 from acsard.config import parse
 from acsard.figures import NAMES
 from acsard.matching import Summary, staircase
-from acsard.settings import BusConfig, Config, LimitsConfig, McuConfig
+from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
 
 RESULT = Result(
     machine=Machine("a processor", 4, "6.1", "3.13.0", "0.1.0", realtime_permitted=False),
@@ -31,7 +32,7 @@ RESULT = Result(
     lines_said=2000,
     lines_told=2000,
     lines_waiting_max=1,
-    periods=2000,
+    lines_sent=2000,
     missed_periods=0,
     cpu_percent_following=3.0,
     cpu_percent_commanded=3.5,
@@ -64,6 +65,11 @@ def test_the_table_names_the_machine() -> None:
     text = table(RESULT)
     for part in ("a processor", "4 cores", "Linux 6.1", "Python 3.13.0", "not permitted"):
         assert part in text
+
+
+def test_the_table_says_that_the_simulator_has_plain_lines() -> None:
+    assert "simulated microcontroller, plain lines" in table(RESULT)
+    assert "plain lines" not in table(REAL)
 
 
 def test_what_a_real_port_hides_is_said_to_be_left_out() -> None:
@@ -120,7 +126,35 @@ def test_on_the_simulator_every_speed_is_within_the_limits() -> None:
     assert fastest * config.drive.wheel_radius < config.limits.linear_speed
 
 
-@pytest.mark.parametrize("text", ["0", "0.5", "-1", "inf", "nan"])
-def test_a_duration_has_a_second_at_least(text: str) -> None:
+def test_on_the_simulator_lines_are_plain_and_the_robot_is_active_whatever_is_configured() -> None:
+    users = Config(
+        mcu=McuConfig(link_check="auto", encoder_counts=3200, trailing_comma=True),
+        control=ControlConfig(rate=50.0, auto_activate=False),
+    )
+    config = bench_config(users, simulated=True)
+    assert config.mcu == McuConfig(trailing_comma=True)
+    assert config.control == ControlConfig(rate=50.0)
+    real = bench_config(users, simulated=False)
+    assert (real.mcu, real.control) == (users.mcu, users.control)
+
+
+@pytest.mark.parametrize("name", ["nothing", "file", "."])
+def test_what_is_no_device_is_no_port(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ExitError, match=r"`acsard ports` lists") as told:
+        check_device(str(tmp_path / name))
+    assert told.value.code == Exit.NO_PORT
+
+
+def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
+    link = tmp_path / "acsar"
+    link.symlink_to("/dev/null")
+    check_device(str(link))
+
+
+@pytest.mark.parametrize("text", ["0", "0.5", "-1", "inf", "nan", "600.1", "86400"])
+def test_a_duration_is_from_a_second_to_ten_minutes(text: str) -> None:
+    assert duration("1") == 1.0
+    assert duration("600") == 600.0
     with pytest.raises(argparse.ArgumentTypeError):
         duration(text)

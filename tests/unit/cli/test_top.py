@@ -1,4 +1,4 @@
-"""`acsard top` beside its screen: what it says without its library, when a daemon is another."""
+"""`acsard top` beside its screen: what it says without its library."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import argparse
 import sys
 
 import pytest
-from msgspec.structs import replace
 
 from acsard.cli import top
 from acsard.runtime.exits import Exit, ExitError
-from tests.unit.cli.test_top_view import BEFORE, STATE
 
 
 def test_without_its_library_it_says_which_extra_to_install(
@@ -22,9 +20,3 @@ def test_without_its_library_it_says_which_extra_to_install(
     with pytest.raises(ExitError, match=r"pip install 'acsard\[top\]'") as told:
         top.main(argparse.Namespace())
     assert told.value.code == Exit.FAILURE
-
-
-def test_counters_that_began_again_are_another_daemon_s() -> None:
-    assert not top.anew(BEFORE, STATE)
-    assert top.anew(STATE, BEFORE)
-    assert top.anew(STATE, replace(STATE, counters={}))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from acsard.cli.top_text import ago, bar, clean, count, duration, ends, rate, rule, share, signed
+from acsard.cli.top_text import ago, bar, clean, count, duration, ends, rate, rule, signed
 from acsard.cli.top_text import row as labelled
 
 
@@ -80,15 +80,6 @@ def test_a_count_is_readable_however_large(number: int, text: str) -> None:
 )  # fmt: skip
 def test_an_age_is_told_in_its_own_unit(seconds: float | None, text: str) -> None:
     assert ago(seconds) == text
-
-
-@pytest.mark.parametrize(
-    ("part", "whole", "text"),
-    [(0, 0, "0 %"), (0, 9, "0 %"), (1, 10**6, "<0.01 %"), (12, 48_000, "0.025 %"), (1, 4, "25 %"),
-     (5, 3, "0 %")],
-)  # fmt: skip
-def test_a_share_is_zero_only_for_none(part: int, whole: int, text: str) -> None:
-    assert share(part, whole) == text
 
 
 @pytest.mark.parametrize(

@@ -166,10 +166,11 @@ def test_rates_are_taken_between_two_states() -> None:
     assert "-/s of 1,200" in line_with("superseded", replace(SEEN, state=BEFORE, before=STATE))
 
 
-def test_missed_periods_are_a_share_of_all() -> None:
-    assert "missed periods 3 (0.033 %)" in line_with("missed")
-    without = of(figures={}, counters={"missed_periods": 25, "lines_sent": 75})
-    assert "missed periods 25 (25 %)" in line_with("missed", without)
+def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
+    assert line_with("missed").endswith("missed periods 3")
+    grown = of(counters=STATE.counters | {"missed_periods": 4})
+    assert "\x1b[33mmissed periods 4\x1b[0m" in painted(grown)
+    assert "\x1b[33mmissed" not in painted(SEEN)
 
 
 def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
@@ -231,6 +232,11 @@ def test_silence_is_said_big(state: RobotState | None) -> None:
     assert "NO NEWS FOR 3 s: is the daemon running?" in lines_of(seen)[2]
     assert painted(seen).count("41m") == 3  # three lines in red
     assert not any("DRIVING" in line for line in lines_of(seen))
+
+
+def test_a_slow_state_is_not_silent_before_its_time() -> None:
+    assert "NO NEWS" not in "".join(lines_of(replace(SEEN, age=9.0, silence=30.0)))
+    assert "NO NEWS FOR 30 s" in lines_of(replace(SEEN, age=30.0, silence=30.0))[2]
 
 
 def test_what_was_known_before_the_silence_stays_dimmed() -> None:
