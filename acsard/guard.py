@@ -97,12 +97,13 @@ class Guard:
         return found[0], found[1], found[2], found[3]
 
     def _sealed(self, line: bytes) -> bool:
-        """From column 31 on: the dialect's comma, `#`, two digits, perhaps `S`, a right check."""
+        """From column 31 on: the dialect's comma, `#`, two digits, perhaps `S` or `H`, a right
+        check."""
         body, check = line[:-7], line[-7:]
         comma, mark = self._stop[31:-2], body[31:]
         digits = mark[len(comma) + 1 : len(comma) + 3]
         return (
-            mark in (comma + b"#" + digits, comma + b"#" + digits + b"S")
+            mark in [comma + b"#" + digits + letter for letter in (b"", b"S", b"H")]
             and len(digits) == 2
             and all(digit in _HEX for digit in digits)
             and check == b"*%04X\r\n" % _crc(body)

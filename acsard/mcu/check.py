@@ -23,6 +23,10 @@ SEQUENCES = 256
 ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
+ASK_NOTHING = b"H"
+"""A request letter that asks for nothing, which an MCU ignores: a line that comes back with it is
+an echo, for no reply has one."""
+
 # The plain part's characters too: zero bytes in front of a line do not change an XMODEM check.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Literal
 
-from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.mcu.frames import FrameError
 from acsard.mcu.wire import line_bytes, wire_ns
 from acsard.settings import McuConfig
@@ -54,8 +54,11 @@ class Negotiation:
         """It answers, but not as it must: asked on and on, and nothing drives meanwhile."""
         self.settled_ns = 0
         """When asking last ended."""
-        sampled = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else ()
-        self._letters = (*sampled, *(b"",) * TRIES)
+        first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
+        self._letters = (*first, *(b"",) * TRIES)
+        self._question = b""
+        """The last one, if an echo of it can be told from an answer."""
+        self._echo = False
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
@@ -78,7 +81,7 @@ class Negotiation:
         # The port makes the first line after an opening a plain stop, whatever it is given.
         self._plain_next = fresh
         if fresh:
-            self.refused = self._knows = False
+            self.refused = self._knows = self._echo = False
 
     # what leaves
 
@@ -102,7 +105,10 @@ class Negotiation:
         if plain:
             return self._stop
         self._open = True
-        return self._sealed(self._stop, self._letters[self._failed], now_ns)
+        letters = self._letters[self._failed]
+        line = self._sealed(self._stop, letters, now_ns)
+        self._question = line.removesuffix(b"\r\n") if letters else b""
+        return line
 
     def unsent(self) -> None:
         """The last line did not go out: nobody can answer it."""
@@ -117,6 +123,12 @@ class Negotiation:
         return seal(line, self._sequence, letters)
 
     # what comes back
+
+    def echoed(self, line: bytes) -> bool:
+        """Is this our own question? Then nothing that comes back can be believed: it never is."""
+        if self._question and line == self._question:
+            self._echo = self.refused = True
+        return self._echo
 
     def heard_plain(self) -> None:
         """A whole plain line came while asking: the MCU is awake, so silence is an answer too."""
@@ -150,6 +162,9 @@ class Negotiation:
         asked_ns = self._asked_ns
         if self.state != "asking" or not (self._awake and self._open) or asked_ns is None:
             return
+        if self._echo:
+            self._failed = 0  # it goes on asking, and nothing drives
+            return
         if now_ns - asked_ns < self._answer_ns:
             return
         self._open = False
@@ -175,6 +190,11 @@ class Negotiation:
         """Why there is no driving, with the mend, when that is because of the check; else ""."""
         if not self.refused:
             return ""
+        if self._echo:
+            return (
+                "what is sent comes back: transmit and receive are joined, or the adapter (RS-485) "
+                "repeats what it sends; mend that, then replug it"
+            )
         if self._knows:
             return (
                 "the microcontroller answered with a check before and now does not: its replies "

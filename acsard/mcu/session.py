@@ -236,6 +236,10 @@ class McuSession:
         if line.startswith(IDENTITY):
             self._restart(f"has started: {line.decode('ascii', 'replace')}")
             return None
+        if self.check.state == "asking" and self.check.echoed(line):
+            self.rejects["echo"] += 1
+            self._miss()
+            return None
         try:
             if self.check.state == "checked" or (self.check.state == "asking" and b"#" in line):
                 reply = unseal(line)

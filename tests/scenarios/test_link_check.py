@@ -550,3 +550,23 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
         assert stopped(world)
         assert world.state.link == "up", seed
         assert "fault" not in {event.name for event in world.events}, (seed, world.events)
+
+
+class Echo(FakeMcu):
+    """No microcontroller at all: what is sent comes back 5 ms later."""
+
+    def receive(self, now_ns: int, data: bytes) -> None:
+        self._schedule(now_ns + 5 * MS, "sent", data)
+
+
+@pytest.mark.parametrize("check", ["auto", "require"])
+@pytest.mark.parametrize("counts", [0, 3200])
+def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:
+    world = World(config(check, counts), plugged=False)
+    echo = Echo(world.config, world.now_ns)
+    world.port.plug(echo)
+    world.run(0.3)
+    world.drive(0.5, seconds=5.0)
+    assert world.state.link == "booting"
+    assert "what is sent comes back" in world.state.reason
+    assert moving([line for _, line in world.port.sent]) == []

@@ -131,12 +131,12 @@ def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
     assert bench.stale(sequence_of(question))
 
 
-def test_three_questions_without_an_answer_settle_for_plain() -> None:
+def test_a_question_of_each_kind_without_an_answer_settles_for_plain() -> None:
     bench = Bench()
     bench.ask()
     bench.check.heard_plain()
     asked = bench.ask(1000)
-    assert [kind(line) for line in asked] == ["checked"] * TRIES
+    assert [kind(line) for line in asked] == ["checked"] * (1 + TRIES)
     assert (bench.check.state, bench.check.in_force) == ("plain", "plain")
     assert bench.check.seal(GO, bench.now_ns) == GO
 
@@ -179,7 +179,7 @@ def test_silence_is_no_refusal_however_long() -> None:
 def test_a_slow_wire_is_given_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
     bench.check.heard_plain()
-    bench.ask(3 * 190)
+    bench.ask(4 * 190)
     assert bench.check.in_force == "being asked for"
     bench.ask(100)
     assert bench.check.in_force == "plain"
@@ -338,3 +338,23 @@ def test_the_pace_of_questions_is_bounded() -> None:
     bench = Bench(REQUIRE)
     bench.check.heard_plain()
     assert len(bench.ask(1000)) <= 25
+
+
+def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None:
+    for mcu in (AUTO, REQUIRE, SAMPLES):
+        bench = Bench(mcu)
+        bench.check.heard_plain()
+        for _ in range(50):
+            for line in bench.ask():
+                assert bench.check.echoed(line[:-2])
+        assert (bench.check.state, bench.check.refused) == ("asking", True)
+        assert "what is sent comes back" in bench.check.refusal()
+        bench.check.begin(fresh=True)
+        assert not bench.check.refused
+
+
+def test_an_answer_is_no_echo() -> None:
+    bench = Bench()
+    (_, question) = bench.ask(110)
+    answer = question.replace(b"H", b"")[:-2]
+    assert not bench.check.echoed(answer)
