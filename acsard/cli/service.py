@@ -24,7 +24,13 @@ HOME = "/opt/acsard/venv"
 INSTALLED = (
     ("systemctl", "daemon-reload"),
     ("udevadm", "control", "--reload"),
-    ("udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=usb-serial"),
+    (
+        "udevadm",
+        "trigger",
+        "--subsystem-match=tty",
+        "--subsystem-match=usb-serial",
+        "--subsystem-match=misc",
+    ),
     ("systemctl", "enable", "--now", UNIT),
 )
 LEAVING = (("systemctl", "disable", "--now", UNIT),)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.runtime.real_time import DOZE
 from tests.system.harness import Bus, Daemon
 
 POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -26,6 +27,11 @@ def locked_kb(pid: int) -> int:
     return int(status.partition("VmLck:")[2].split()[0])
 
 
+def held(pid: int) -> set[str]:
+    """The files it has open."""
+    return {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}
+
+
 @needs_permission
 def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
@@ -38,6 +44,7 @@ def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path
         assert len(policies) > 3, "the bus has threads"
         assert set(policies.values()) == {os.SCHED_OTHER}
         assert locked_kb(daemon.pid) > 0
+        assert not Path(DOZE).exists() or DOZE in held(daemon.pid)
         assert daemon.events("real_time") == []
 
 
@@ -46,6 +53,7 @@ def test_it_can_be_switched_off(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"control": {"real_time": False}}) as daemon:
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         assert locked_kb(daemon.pid) == 0
+        assert DOZE not in held(daemon.pid)
         assert daemon.events("real_time") == []
 
 
@@ -56,7 +64,7 @@ def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_pat
         bus.linked()
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         (event,) = daemon.events("real_time")
-    assert "real-time scheduling and locked memory" in event["text"]
+    assert "no permission for real-time scheduling, locked memory" in event["text"]
     assert "control.real_time = false" in event["text"]
 
 
