@@ -23,7 +23,9 @@
 
 /* The wheels. Bit 0 is motor a, bit 3 motor d. */
 
+#ifndef COUNTS_PER_TURN
 #define COUNTS_PER_TURN 3200   /* encoder edges (both edges of both channels) per turn of the WHEEL */
+#endif
 #define MOTOR_REVERSED 0x0     /* the motor turns backwards for `p`: swap its wires, or set its bit */
 #define ENCODER_REVERSED 0x0   /* it counts down when the motor turns in its `p` direction */
 #define FREE_SPEED 50.0f       /* rad/s of a lifted wheel at full duty */

@@ -68,9 +68,9 @@ def build_firmware(where: Path, *defines: str) -> Path:
     return where / "firmware.elf"
 
 
-def build_library(where: Path) -> Path:
+def build_library(where: Path, *defines: str) -> Path:
     """What of the firmware is not hardware, for this machine."""
-    _run(["make", f"BUILD={where}", "host"], FIRMWARE)
+    _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}", "host"], FIRMWARE)
     return where / "libfirmware.so"
 
 

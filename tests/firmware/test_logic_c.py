@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
@@ -28,7 +29,7 @@ class WatchdogC(ctypes.Structure):
 class SpeedC(ctypes.Structure):
     _fields_ = (
         ("count", ctypes.c_uint16),
-        ("still", ctypes.c_bool),
+        ("way", ctypes.c_int8),
         ("edge", ctypes.c_uint32),
         ("read", ctypes.c_uint32),
         ("value", ctypes.c_float),
@@ -50,8 +51,18 @@ class BridgeC(ctypes.Structure):
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
     """The library with its types told."""
+    return told(library)
+
+
+@pytest.fixture(scope="session")
+def coarse(coarse_library: ctypes.CDLL) -> ctypes.CDLL:
+    """The same for a coarse encoder."""
+    return told(coarse_library)
+
+
+def told(library: ctypes.CDLL) -> ctypes.CDLL:
     u16, u32, single = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_float
-    told: list[tuple[str, list[Any], Any]] = [
+    types: list[tuple[str, list[Any], Any]] = [
         ("watchdog_start", [], None),
         ("watchdog_feed", [u32], None),
         ("watchdog_allows", [u32], ctypes.c_bool),
@@ -62,7 +73,7 @@ def logic(library: ctypes.CDLL) -> ctypes.CDLL:
         ("bridge_off", [], None),
         ("bridge_step", [ctypes.c_int16], ctypes.c_bool),
     ]
-    for name, arguments, result in told:
+    for name, arguments, result in types:
         function = getattr(library, name)
         function.argtypes = [ctypes.c_void_p, *arguments]
         function.restype = result
@@ -166,6 +177,119 @@ def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
         count = max(0, 1 + math.floor((300 * 2000 - first) * COUNTS_PER_TURN / math.tau / TICKS))
         edge = round(began + count * math.tau / COUNTS_PER_TURN * TICKS)
         assert logic.speed_update(at, count, edge, 300 * 2000) <= 1.0
+
+
+def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> list[tuple[int, int]]:
+    """When the count of such an angle (in counts) became what."""
+    found, last = [], math.floor(angle(0.0))
+    for i in range(round(seconds / step)):
+        now = math.floor(angle(i * step))
+        while last != now:
+            last += 1 if now > last else -1
+            found.append((round(i * step * TICKS), last))
+    return found
+
+
+def said_of(
+    library: ctypes.CDLL, edges: Iterable[tuple[int, int]], windows: Iterable[int], start: int = 0
+) -> Iterator[tuple[int, float, int, int]]:
+    """Counts turned, what is said, the window, and the time, of counts that became so."""
+    wheel = SpeedC()
+    at = ctypes.addressof(wheel)
+    waiting = list(edges)[::-1]
+    count = last = edge = now = 0
+    library.speed_start(at, 0, start % 2**32)
+    for window in windows:
+        now += window
+        while waiting and waiting[-1][0] <= now:
+            edge, count = waiting.pop()
+        value = library.speed_update(
+            at, count % 65536, (start + edge) % 2**32, (start + now) % 2**32
+        )
+        yield count - last, value, window, now
+        last = count
+
+
+PITCH = math.tau / COUNTS_PER_TURN
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 60_000), st.sampled_from((-1, 1, 1))), max_size=200),
+    st.lists(st.integers(9_000, 50_000), min_size=1, max_size=200),
+    st.integers(0, 2**32 - 1),
+)
+def test_whatever_the_edges_no_more_is_said_than_the_window_allows(
+    logic: ctypes.CDLL, steps: list[tuple[int, int]], windows: list[int], start: int
+) -> None:
+    """Edges at random times, some reversing, some microseconds apart."""
+    times = itertools.accumulate(step for step, _ in steps)
+    counts = itertools.accumulate(way for _, way in steps)
+    before, way = 0.0, 0
+    said = said_of(logic, zip(times, counts, strict=True), windows, start)
+    for turned, value, window, _ in said:
+        one = PITCH / (window / TICKS)
+        if not turned:
+            assert abs(value) <= abs(before)
+            assert value * before >= 0.0
+        else:
+            assert value * turned >= 0.0
+            counted = abs(turned)
+            most = counted + 1 if turned * way > 0 else counted - 1
+            assert (counted - 1) * one * 0.999 <= abs(value) <= most * one * 1.001
+            way = 1 if turned > 0 else -1
+        before = value
+
+
+CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0, 1)]
+"""An edge crossed and crossed back after 100 us, on either side of the end of a window."""
+
+
+@pytest.mark.parametrize(
+    ("edges", "most"),
+    [
+        (CHATTER, 0.0),
+        ([(time + 100_000 * (i % 2), count) for i, (time, count) in enumerate(CHATTER[:2])], 0.0),
+        (edges_of(lambda t: 0.5 + 0.8 * math.sin(math.tau * 50 * t), 1.0, 1e-5), 0.8 * 50),
+        (edges_of(lambda t: 0.5 + 0.8 * math.sin(math.tau * 23 * t), 1.0, 1e-5), 0.8 * 23),
+        (edges_of(lambda t: 0.5 + 1.5 * math.sin(math.tau * 37 * t), 1.0, 1e-5), 1.5 * 37),
+        (edges_of(lambda t: 0.5 + 3.0 * math.sin(math.tau * 11 * t), 1.0, 1e-5), 3.0 * 11),
+    ],
+    ids=["chatter", "twice", "50 Hz", "23 Hz", "37 Hz", "11 Hz"],
+)
+def test_a_wheel_that_trembles_is_not_said_to_race(
+    logic: ctypes.CDLL, edges: list[tuple[int, int]], most: float
+) -> None:
+    """No more than the fastest it truly is, and one count in a window; `most` in counts, as of a
+    sine its amplitude times its frequency."""
+    for window in (10_000, 20_000, 40_000):
+        said = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
+        assert max(map(abs, said)) <= (most * math.tau + TICKS / window) * PITCH
+        if not most:
+            assert max(map(abs, said)) == 0.0
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.3, 0.4, 0.5, 0.6, 0.9, 2.0, -0.2, -0.6])
+@pytest.mark.parametrize("every", [0.005, 0.01, 0.02])
+def test_a_coarse_encoder_says_its_true_speed_however_slow(
+    coarse: ctypes.CDLL, speed: float, every: float
+) -> None:
+    """96 counts a turn: at 0.2 rad/s one in 330 ms."""
+    edges = edges_of(lambda t: speed / math.tau * 96 * t, 20.0, 1e-4)
+    told = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
+    settled = [value for _, value, _, now in told if now > 2.0 * TICKS]
+    assert sum(settled) / len(settled) == pytest.approx(speed, rel=0.1)
+    assert max(map(abs, settled)) < 1.1 * abs(speed)
+    assert max(abs(value) for _, value, _, _ in told) < 1.1 * abs(speed), "nor at the first edge"
+
+
+def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctypes.CDLL) -> None:
+    """Its 32 bits come round in 36 minutes; then an edge long ago would look recent."""
+    rests = [100 * TICKS] * 30
+    far = sum(rests)
+    edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
+    said = [value for _, value, _, _ in said_of(logic, edges, [10_000, *rests, 10_000, 10_000])]
+    assert abs(said[-2]) < 1e-5
+    assert said[-1] == pytest.approx(PITCH / 0.005, rel=0.01)
 
 
 @given(st.floats(-1e6, 1e6))
