@@ -245,7 +245,7 @@ uint8_t line_identity(char *out, const struct record *record, const char *reset)
 {
     char *at = put_text(out, "!acsard-mcu 1");
 
-    at = put_decimal(put_text(at, " counts="), COUNTS_PER_TURN);
+    at = put_decimal(put_text(at, " counts="), (uint32_t)(COUNTS_PER_TURN));
     at = put_decimal(put_text(at, " watchdog_ms="), COMMAND_WATCHDOG_MS);
     at = put_text(at, " check=1 sample=1");
     at = put_decimal(put_text(at, " lines="), record->lines);

@@ -169,12 +169,13 @@ static bool is_stop(const struct command *command)
  * instead, in case the line we booted with was lost. */
 static bool takes(const struct command *command)
 {
+    if (is_stop(command))
+        return true; /* whoever says it, and however */
     if (REQUIRE_CHECK && checked_seen && !command->checked)
         return false;
-    if (stop_seen || is_stop(command))
-        return true;
-    say_identity();
-    return false;
+    if (!stop_seen)
+        say_identity();
+    return stop_seen;
 }
 
 static void on_command(const struct command *command)
@@ -210,12 +211,6 @@ static void hang(const char *text, uint8_t length)
     while (text[1] == 'i' || text[1] == 'l')
         ;
 }
-#else
-static void hang(const char *text, uint8_t length)
-{
-    (void)text;
-    (void)length;
-}
 #endif
 
 static void on_line(const char *text, uint8_t length)
@@ -228,7 +223,9 @@ static void on_line(const char *text, uint8_t length)
         say_identity();
     } else {
         count_up(&record.refused);
+#ifdef TEST_HANG
         hang(text, length);
+#endif
     }
 }
 
