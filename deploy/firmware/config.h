@@ -45,6 +45,12 @@
 #define RISE_TICKS 10          /* control ticks from zero to full duty; falling is immediate */
 #define REVERSE_TICKS 2        /* control ticks at zero duty before a bridge changes direction */
 
+/* What no healthy wheel does: see supervise.h. All motors are off then, until the host is silent. */
+
+#define RUNAWAY_DUTY 0.75f     /* of full voltage, against which it turns ... */
+#define RUNAWAY_MS 150         /* ... without getting slower for this long */
+#define STUCK_MS 1000          /* or it stands at full voltage for this long; above `fault_time` */
+
 /* Pins. The eight encoder channels share one port, so that one short interrupt reads all wheels at
  * one moment: channel A of motors a to d on bits 0, 2, 4, 6, channel B on bits 1, 3, 5, 7. */
 

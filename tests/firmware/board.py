@@ -268,6 +268,7 @@ class Identity(NamedTuple):
     lines: int
     refused: int
     trips: int
+    runaways: int
     reset: str
 
 
@@ -278,8 +279,8 @@ def read_identity(line: bytes) -> Identity:
     told = dict(word.split("=") for word in words)
     assert tuple(told) == Identity._fields, line
     *numbers, reset = told.values()
-    counts, watchdog_ms, check, sample, lines, refused, trips = map(int, numbers)
-    return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, reset)
+    counts, watchdog_ms, check, sample, lines, refused, trips, runaways = map(int, numbers)
+    return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, runaways, reset)
 
 
 class Reply(NamedTuple):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TOP = 400
@@ -48,6 +48,15 @@ class BridgeC(ctypes.Structure):
     )
 
 
+class SupervisorC(ctypes.Structure):
+    _fields_ = (
+        ("against", ctypes.c_uint16),
+        ("stuck", ctypes.c_uint16),
+        ("count", ctypes.c_uint16),
+        ("size", ctypes.c_float),
+    )
+
+
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
     """The library with its types told."""
@@ -72,6 +81,8 @@ def told(library: ctypes.CDLL) -> ctypes.CDLL:
         ("pi_step", [single, single, ctypes.c_bool], single),
         ("bridge_off", [], None),
         ("bridge_step", [ctypes.c_int16], ctypes.c_bool),
+        ("supervise_start", [], None),
+        ("supervise_step", [ctypes.c_int16, single, u16], ctypes.c_bool),
     ]
     for name, arguments, result in types:
         function = getattr(library, name)
@@ -373,3 +384,177 @@ def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
             assert zero_for >= 2, "rest before the other direction"
         zero_for = zero_for + 1 if bridge.duty == 0 else 0
         driven = bridge.direction if bridge.duty else driven
+
+
+# supervision
+
+
+class Wheel:
+    """A motor under the firmware's control, a control period at a time, as main.c does it."""
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        *,
+        lag: float = 0.05,
+        free_speed: float = 50.0,
+        counts: int = COUNTS_PER_TURN,
+        encoder: int = 1,
+    ) -> None:
+        self.library, self.lag, self.free_speed = library, lag, free_speed
+        self.counts, self.encoder = counts, encoder
+        self.force = 0.0
+        """From outside, a share of what stalls the motor."""
+        self.friction = 0.0
+        """The same, against whatever it does."""
+        self.speed, self.angle, self.duty, self.now = 0.0, 0.0, 0.0, 0
+        self.count = self.edge = 0
+        self.off_ms: int | None = None
+        self.parts = PiC(), BridgeC(), SpeedC(), SupervisorC()
+        self.pi, self.bridge, self.speeds, self.supervisor = map(ctypes.addressof, self.parts)
+        library.pi_reset(self.pi)
+        library.speed_start(self.speeds, 0, 0)
+        library.supervise_start(self.supervisor)
+        self.limited = False
+
+    def run(self, target: float, ms: int) -> bool:
+        """So long, or until its motor is switched off; True when it was."""
+        for _ in range(ms // 5):
+            self._turn()
+            if self._control(target):
+                self.off_ms = self.now // 2000
+                return True
+        return False
+
+    def _turn(self) -> None:
+        for _ in range(25):  # 0.2 ms each
+            pull = self.duty + self.force - self.speed / self.free_speed
+            grip = self.friction
+            if self.speed == 0.0 and abs(pull) <= grip:
+                change = 0.0
+            else:
+                along = self.speed if self.speed else pull
+                change = (pull - math.copysign(grip, along)) * self.free_speed / self.lag * 0.0002
+            after = self.speed + change
+            self.speed = 0.0 if after * self.speed < 0.0 and abs(pull) <= grip else after
+            self.now += 400
+            self.angle += self.speed * 0.0002 * self.encoder
+            count = math.floor(self.angle / math.tau * self.counts)
+            if count != self.count:
+                self.count, self.edge = count, self.now
+
+    def _control(self, target: float) -> bool:
+        library, bridge = self.library, self.parts[1]
+        seen = library.speed_update(
+            self.speeds, self.count % 65536, self.edge % 2**32, self.now % 2**32
+        )
+        had = bridge.duty * bridge.direction
+        if library.supervise_step(self.supervisor, had, seen, self.count % 65536):
+            return True
+        wanted = int(library.pi_step(self.pi, target, seen, self.limited) * TOP)
+        self.limited = not library.bridge_step(self.bridge, wanted)
+        self.duty = bridge.duty * bridge.direction / TOP
+        return False
+
+
+BACKWARDS = -1
+
+DEAD = 0
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.05, 0.2, 0.5])
+@pytest.mark.parametrize("start", [3.0, -3.0, 0.5, 20.0])
+def test_a_wheel_with_its_encoder_backwards_is_switched_off(
+    logic: ctypes.CDLL, lag: float, start: float
+) -> None:
+    wheel = Wheel(logic, lag=lag, encoder=BACKWARDS)
+    if not wheel.run(start, 100):
+        assert wheel.run(0.0, 2000), "though it shall stand"
+    print(f"lag {lag}, {start} rad/s for 100 ms, then zero: off after {wheel.off_ms} ms")
+    assert wheel.off_ms is not None
+    if lag <= 0.05:
+        assert wheel.off_ms <= 500
+
+
+@pytest.mark.parametrize("touched", [0.2, 0.5, -2.0, 10.0])
+def test_a_wheel_with_its_encoder_backwards_that_is_touched_is_switched_off(
+    logic: ctypes.CDLL, touched: float
+) -> None:
+    wheel = Wheel(logic, encoder=BACKWARDS)
+    assert not wheel.run(0.0, 1000)
+    wheel.speed = touched
+    assert wheel.run(0.0, 2000)
+    assert wheel.off_ms is not None
+    print(f"touched to {touched} rad/s: off after {wheel.off_ms - 1000} ms")
+    assert wheel.off_ms - 1000 <= (500 if abs(touched) >= 0.5 else 600), "growing from nothing"
+
+
+@pytest.mark.parametrize("target", [3.0, 20.0, -45.0])
+def test_a_wheel_that_shows_no_counts_is_switched_off_after_a_second_of_full_voltage(
+    logic: ctypes.CDLL, target: float
+) -> None:
+    dead, jammed = Wheel(logic, encoder=DEAD), Wheel(logic)
+    jammed.friction = 2.0
+    for wheel in (dead, jammed):
+        assert wheel.run(target, 5000)
+        assert wheel.off_ms is not None
+        until_full = 50 + 1000 * (1 - abs(target) / 50) / (abs(target) * 0.4)
+        assert wheel.off_ms == pytest.approx(1000 + until_full, rel=0.06)
+
+
+def test_a_dead_channel_counts_as_a_dead_encoder(logic: ctypes.CDLL) -> None:
+    """It counts one up and one down."""
+    supervisor = SupervisorC()
+    at = ctypes.addressof(supervisor)
+    logic.supervise_start(at)
+    steps = [logic.supervise_step(at, TOP, 0.0, tick % 2) for tick in range(300)]
+    assert steps.index(True) == 199
+    logic.supervise_start(at)
+    assert not any(logic.supervise_step(at, TOP, 0.0, tick // 50) for tick in range(1000)), "slow"
+
+
+FORCES = st.floats(-0.5, 0.5)
+
+ACTIONS = st.tuples(
+    st.sampled_from([0.0, 0.0, 0.2, -0.2, 1.0, -5.0, 12.0, 30.0, -30.0, 60.0, -99.0]),
+    st.integers(20, 700),
+    st.one_of(st.just(0.0), st.just(0.0), FORCES),
+    st.one_of(st.none(), st.none(), st.floats(-20.0, 20.0)),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.floats(0.02, 1.0), st.floats(25.0, 80.0), st.floats(0.0, 0.3), st.booleans(),
+    st.lists(ACTIONS, min_size=3, max_size=12),
+)  # fmt: skip
+def test_a_healthy_wheel_is_never_switched_off(
+    logic: ctypes.CDLL,
+    coarse: ctypes.CDLL,
+    lag: float,
+    free_speed: float,
+    friction: float,
+    is_coarse: bool,
+    actions: list[tuple[float, int, float, float | None]],
+) -> None:
+    """Light or a whole robot's weight, stronger or weaker than it is said to be, with much
+    friction; driven, reversed, pushed with half of what stalls it; knocked, as long as it is light."""
+    library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
+    wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)
+    wheel.friction = friction
+    for target, ms, force, knocked in actions:
+        wheel.force = force
+        if knocked is not None and lag <= 0.1:
+            wheel.speed = knocked
+        assert not wheel.run(target, ms)
+
+
+def test_a_wheel_that_is_blocked_for_less_than_a_second_is_not_switched_off(
+    logic: ctypes.CDLL,
+) -> None:
+    wheel = Wheel(logic)
+    for target in (20.0, -20.0, 45.0, -45.0) * 3:
+        wheel.friction = 2.0
+        assert not wheel.run(target, 900)
+        wheel.friction = 0.0
+        assert not wheel.run(target, 300)
