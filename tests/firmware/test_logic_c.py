@@ -523,7 +523,7 @@ ACTIONS = st.tuples(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(
     st.floats(0.02, 1.0), st.floats(25.0, 80.0), st.floats(0.0, 0.3), st.booleans(),
     st.lists(ACTIONS, min_size=3, max_size=12),
@@ -538,7 +538,7 @@ def test_a_healthy_wheel_is_never_switched_off(
     actions: list[tuple[float, int, float, float | None]],
 ) -> None:
     """Light or a whole robot's weight, stronger or weaker than it is said to be, with much
-    friction; driven, reversed, pushed with half of what stalls it; knocked, as long as it is light."""
+    friction; driven, reversed, pushed with half of what stalls it, and knocked if light."""
     library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
     wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)
     wheel.friction = friction
