@@ -21,16 +21,23 @@ void speed_start(struct speed *speed, uint16_t count, uint32_t now)
     speed->value = 0.0f;
 }
 
-/* Of one count or more. `same`: the same way as the last. */
+/* Of one count or more: them by their time, but at least one less and at most one more by the window.
+ * `same`: the same way as the last. One division only: they are slow. Products fit as long as the
+ * hardware watchdog lets a window last, at 120 000 edges a second. */
 static float size_of(uint16_t counts, bool same, uint32_t taken, uint32_t window)
 {
-    float least = (float)(counts - 1u) / (float)window;
-    float most = (float)(counts + 1u) / (float)window;
-    float size = taken ? (float)counts / (float)taken : most;
+    bool least = !same, most = false;
 
-    if (!same || size < least)
-        return least;
-    return size > most ? most : size;
+    if (taken > window) {
+        uint32_t longer = taken - window;
+
+        least |= counts > 1 && (longer > window || longer * (counts - 1u) > window);
+    } else {
+        most = (window - taken) * (counts + 1u) > window;
+    }
+    if (least)
+        return (float)(counts - 1u) / (float)window;
+    return most ? (float)(counts + 1u) / (float)window : (float)counts / (float)taken;
 }
 
 float speed_update(struct speed *speed, uint16_t count, uint32_t edge, uint32_t now)
