@@ -293,9 +293,18 @@ def test_a_coarse_encoder_says_its_true_speed_however_slow(
     assert max(abs(value) for _, value, _, _ in told) < 1.1 * abs(speed), "nor at the first edge"
 
 
+def test_a_quick_start_is_not_hidden_by_the_time_waited(logic: ctypes.CDLL) -> None:
+    for waited in (0, 40_000, 10_000_000, 2**30 - 4_500):
+        last = waited + 20_000
+        edges = [(5_000, 1), *((last - 4_000 + 1_000 * i, 2 + i) for i in range(5))]
+        said = list(said_of(logic, edges, [10_000, *([waited] * bool(waited)), 10_000]))
+        assert said[-1][0] == 5
+        assert said[-1][1] >= 4 * PITCH / 0.005 * 0.999
+
+
 def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctypes.CDLL) -> None:
     """Its 32 bits come round in 36 minutes; then an edge long ago would look recent."""
-    rests = [100 * TICKS] * 30
+    rests = [2**32 // 32] * 32
     far = sum(rests)
     edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
     said = [value for _, value, _, _ in said_of(logic, edges, [10_000, *rests, 10_000, 10_000])]
@@ -509,8 +518,10 @@ def test_a_dead_channel_counts_as_a_dead_encoder(logic: ctypes.CDLL) -> None:
     logic.supervise_start(at)
     steps = [logic.supervise_step(at, TOP, 0.0, tick % 2) for tick in range(300)]
     assert steps.index(True) == 199
-    logic.supervise_start(at)
-    assert not any(logic.supervise_step(at, TOP, 0.0, tick // 50) for tick in range(1000)), "slow"
+    for way in (1, -1):
+        logic.supervise_start(at)
+        slow = [way * (tick // 50) % 65536 for tick in range(1000)]
+        assert not any(logic.supervise_step(at, TOP, 0.0, count) for count in slow)
 
 
 FORCES = st.floats(-0.5, 0.5)
