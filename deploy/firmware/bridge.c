@@ -32,7 +32,7 @@ bool bridge_step(struct bridge *bridge, int16_t wanted)
         bridge->direction = direction;
         return size == 0;
     }
-    if (size > bridge->duty + RISE)
+    if (size - bridge->duty > RISE) /* their sum would overflow at a low PWM_HZ */
         bridge->duty = (int16_t)(bridge->duty + RISE);
     else
         bridge->duty = size;

@@ -6,9 +6,7 @@
 #ifndef CONFIG_H
 #define CONFIG_H
 
-#ifndef F_CPU
 #define F_CPU 16000000UL
-#endif
 
 /* The line */
 
@@ -17,13 +15,16 @@
 #endif
 #define COMMAND_WATCHDOG_MS 300 /* without a valid line for this long the motors stop; at most 500 */
 #ifndef REQUIRE_CHECK
-#define REQUIRE_CHECK 0        /* 1: once a checked line was taken, plain ones are refused until reset.
-                                * A host restarted with link_check = "off" then cannot drive. */
+#define REQUIRE_CHECK 0        /* 1: once a checked line was taken, plain ones are refused until reset,
+                                * but for a stop (all zero), which is never refused. A host restarted
+                                * with link_check = "off" then can stop and cannot drive. */
 #endif
 
 /* The wheels. Bit 0 is motor a, bit 3 motor d. */
 
+#ifndef COUNTS_PER_TURN
 #define COUNTS_PER_TURN 3200   /* encoder edges (both edges of both channels) per turn of the WHEEL */
+#endif
 #define MOTOR_REVERSED 0x0     /* the motor turns backwards for `p`: swap its wires, or set its bit */
 #define ENCODER_REVERSED 0x0   /* it counts down when the motor turns in its `p` direction */
 #define FREE_SPEED 50.0f       /* rad/s of a lifted wheel at full duty */
@@ -38,9 +39,17 @@
 
 /* The power stage */
 
+#ifndef PWM_HZ
 #define PWM_HZ 20000UL         /* above hearing; check what your driver takes (L298: 2000 or less) */
+#endif
 #define RISE_TICKS 10          /* control ticks from zero to full duty; falling is immediate */
 #define REVERSE_TICKS 2        /* control ticks at zero duty before a bridge changes direction */
+
+/* What no healthy wheel does: see supervise.h. All motors are off then, until the host is silent. */
+
+#define RUNAWAY_DUTY 0.75f     /* of full voltage, against which it turns ... */
+#define RUNAWAY_MS 150         /* ... without getting slower for this long */
+#define STUCK_MS 1000          /* or it stands at full voltage for this long; above `fault_time` */
 
 /* Pins. The eight encoder channels share one port, so that one short interrupt reads all wheels at
  * one moment: channel A of motors a to d on bits 0, 2, 4, 6, channel B on bits 1, 3, 5, 7. */
@@ -75,9 +84,9 @@
 #define CONTROL_MS (1000 / CONTROL_HZ)
 #define STAMP_HZ (F_CPU / 8UL) /* the clock of the encoder edges: 0.5 us */
 
-#if PWM_HZ < 250
-#error "the PWM period must fit its timer"
-#endif
+_Static_assert((COUNTS_PER_TURN) > 0 && (COUNTS_PER_TURN) <= 65535L,
+               "counts per turn: of the wheel, all four edges");
+_Static_assert(F_CPU / (2UL * PWM_HZ) <= 32767, "the PWM period must fit its timer");
 #if COMMAND_WATCHDOG_MS > 500
 #error "the motors must stop within 500 ms of silence"
 #endif

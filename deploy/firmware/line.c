@@ -241,16 +241,22 @@ static char *put_decimal(char *at, uint32_t value)
     return at;
 }
 
+static char *put_at_most(char *at, uint16_t value, uint16_t most)
+{
+    return put_decimal(at, value < most ? value : most);
+}
+
 uint8_t line_identity(char *out, const struct record *record, const char *reset)
 {
     char *at = put_text(out, "!acsard-mcu 1");
 
-    at = put_decimal(put_text(at, " counts="), COUNTS_PER_TURN);
+    at = put_decimal(put_text(at, " counts="), (uint32_t)(COUNTS_PER_TURN));
     at = put_decimal(put_text(at, " watchdog_ms="), COMMAND_WATCHDOG_MS);
     at = put_text(at, " check=1 sample=1");
     at = put_decimal(put_text(at, " lines="), record->lines);
-    at = put_decimal(put_text(at, " refused="), record->refused);
-    at = put_decimal(put_text(at, " trips="), record->trips);
+    at = put_at_most(put_text(at, " refused="), record->refused, 999);
+    at = put_at_most(put_text(at, " trips="), record->trips, 999);
+    at = put_at_most(put_text(at, " runaways="), record->runaways, 9);
     at = put_text(put_text(put_text(at, " reset="), reset), "\r\n");
     return (uint8_t)(at - out);
 }

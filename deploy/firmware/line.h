@@ -10,7 +10,7 @@
 
 #define LINE_MAX 128  /* bytes with the line end; the longest line is under 70, more is noise */
 #define REPLY_MAX 64  /* bytes of the longest reply with CR LF: 62 */
-#define IDENTITY_MAX 128 /* the host takes no longer line; with all counters full it has 119 */
+#define IDENTITY_MAX 128 /* the host takes no longer line; with all counters full it has 126 */
 #define LETTERS "abcd"
 
 struct line_reader {
@@ -46,17 +46,19 @@ struct reading {
 /* Writes the answer to `command` with CR LF, no terminator; returns its length, at most REPLY_MAX. */
 uint8_t line_reply(char *out, const struct command *command, const struct reading *reading);
 
-/* What became of the lines since boot. */
+/* What became of the lines since boot, and of the wheels. */
 struct record {
-    uint32_t lines;   /* commands executed; begins again after 2^32: 497 days at 100 Hz */
-    uint16_t refused; /* lines that are neither a command taken nor a question; up to 65535 */
-    uint16_t trips;   /* silences that cut motors which had voltage; up to 65535 */
+    uint32_t lines;    /* commands executed; begins again after 2^32: 497 days at 100 Hz */
+    uint16_t refused;  /* lines that are neither a command taken nor a question; up to 65535 */
+    uint16_t trips;    /* silences that cut motors which had voltage; up to 65535 */
+    uint16_t runaways; /* how often a wheel that did not do as told has cut them; up to 65535 */
 };
 
 /* Adds one, but stays at the largest: a counter that wrapped would say that all is well. */
 void count_up(uint16_t *counter);
 
-/* Writes who we are, our record and why we were reset with CR LF; returns its length. */
+/* Writes who we are, our record and why we were reset with CR LF; returns its length. For want of room
+ * `refused` and `trips` say 999 for more than that, and `runaways` 9. */
 uint8_t line_identity(char *out, const struct record *record, const char *reset);
 
 #endif

@@ -1,8 +1,8 @@
 /* The robot's microcontroller: a line comes in, four wheels turn at its speeds, a line goes out.
  *
  * It keeps the motors stopped from boot until a whole valid line came, stops them when none came for
- * COMMAND_WATCHDOG_MS, and is reset by its own hardware watchdog when this loop or the control in it
- * hangs; after a reset they are stopped again.
+ * COMMAND_WATCHDOG_MS or a wheel runs away, and is reset by its own hardware watchdog when this loop or
+ * the control in it hangs; after a reset they are stopped again.
  *
  * The interrupts only count edges, milliseconds and bytes; all else happens in the loop below, so
  * nothing but its own data needs a guard.
@@ -19,6 +19,7 @@
 #include "pi.h"
 #include "serial.h"
 #include "speed.h"
+#include "supervise.h"
 #include "watchdog.h"
 
 /* A reading is sent again within REPORT_MS, and renewed without being asked after RENEW_MS, so that
@@ -30,6 +31,7 @@ static struct {
     struct pi pi;
     struct bridge bridge;
     struct speed control, report; /* over one control period; since the last report */
+    struct supervisor supervisor;
     bool limited;
 } wheels[MOTORS];
 
@@ -41,6 +43,7 @@ static struct snapshot latest;
 static struct reading report;
 static uint32_t report_ms, control_ms;
 static bool checked_seen, stop_seen; /* since boot */
+static bool astray; /* a wheel did not do as told: off until the host is silent */
 static struct line_reader reader;
 static struct record record;
 static uint8_t reset_flags __attribute__((section(".noinit"))); /* set before the rest is zeroed */
@@ -86,6 +89,7 @@ static void motors_off(void)
         wheels[i].limited = false;
         pi_reset(&wheels[i].pi);
         bridge_off(&wheels[i].bridge);
+        supervise_start(&wheels[i].supervisor);
     }
 }
 
@@ -126,23 +130,31 @@ static void control(bool allowed)
 
         if (!allowed)
             continue;
+        if (supervise_step(&wheels[i].supervisor, (int16_t)(bridge->duty * bridge->direction),
+                           speed, latest.counts[i]))
+            astray = true;
         duty = pi_step(&wheels[i].pi, (float)targets[i] * 0.01f, speed, wheels[i].limited);
         wheels[i].limited = !bridge_step(bridge, (int16_t)(duty * PWM_TOP));
         hardware_motor(i, bridge->duty, bridge->direction);
+    }
+    if (allowed && astray) {
+        motors_off();
+        count_up(&record.runaways);
     }
 }
 
 static void on_millisecond(void)
 {
-    bool allowed;
+    bool fed, allowed;
 
     hardware_snapshot(&latest);
-    allowed = watchdog_allows(&watchdog, latest.milliseconds);
-    if (!allowed) {
-        if (motors_have_voltage())
-            count_up(&record.trips);
+    fed = watchdog_allows(&watchdog, latest.milliseconds);
+    if (!fed && motors_have_voltage())
+        count_up(&record.trips);
+    astray = astray && fed;
+    allowed = fed && !astray;
+    if (!allowed)
         motors_off();
-    }
     if (latest.milliseconds - report_ms >= RENEW_MS)
         renew_report();
     if (latest.milliseconds - control_ms >= CONTROL_MS) {
@@ -169,12 +181,13 @@ static bool is_stop(const struct command *command)
  * instead, in case the line we booted with was lost. */
 static bool takes(const struct command *command)
 {
+    if (is_stop(command))
+        return true; /* whoever says it, and however */
     if (REQUIRE_CHECK && checked_seen && !command->checked)
         return false;
-    if (stop_seen || is_stop(command))
-        return true;
-    say_identity();
-    return false;
+    if (!stop_seen)
+        say_identity();
+    return stop_seen;
 }
 
 static void on_command(const struct command *command)
@@ -186,7 +199,7 @@ static void on_command(const struct command *command)
     checked_seen |= command->checked;
     record.lines++;
     for (i = 0; i < MOTORS; i++)
-        targets[i] = command->hundredths[i];
+        targets[i] = astray ? 0 : command->hundredths[i];
     watchdog_feed(&watchdog, latest.milliseconds);
     if (latest.milliseconds - report_ms >= REPORT_MS)
         renew_report();
@@ -210,12 +223,6 @@ static void hang(const char *text, uint8_t length)
     while (text[1] == 'i' || text[1] == 'l')
         ;
 }
-#else
-static void hang(const char *text, uint8_t length)
-{
-    (void)text;
-    (void)length;
-}
 #endif
 
 static void on_line(const char *text, uint8_t length)
@@ -228,7 +235,9 @@ static void on_line(const char *text, uint8_t length)
         say_identity();
     } else {
         count_up(&record.refused);
+#ifdef TEST_HANG
         hang(text, length);
+#endif
     }
 }
 

@@ -68,9 +68,9 @@ def build_firmware(where: Path, *defines: str) -> Path:
     return where / "firmware.elf"
 
 
-def build_library(where: Path) -> Path:
+def build_library(where: Path, *defines: str) -> Path:
     """What of the firmware is not hardware, for this machine."""
-    _run(["make", f"BUILD={where}", "host"], FIRMWARE)
+    _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}", "host"], FIRMWARE)
     return where / "libfirmware.so"
 
 
@@ -268,6 +268,7 @@ class Identity(NamedTuple):
     lines: int
     refused: int
     trips: int
+    runaways: int
     reset: str
 
 
@@ -278,8 +279,8 @@ def read_identity(line: bytes) -> Identity:
     told = dict(word.split("=") for word in words)
     assert tuple(told) == Identity._fields, line
     *numbers, reset = told.values()
-    counts, watchdog_ms, check, sample, lines, refused, trips = map(int, numbers)
-    return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, reset)
+    counts, watchdog_ms, check, sample, lines, refused, trips, runaways = map(int, numbers)
+    return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, runaways, reset)
 
 
 class Reply(NamedTuple):

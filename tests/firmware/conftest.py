@@ -32,6 +32,13 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 
 @pytest.fixture(scope="session")
+def coarse_library(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """The same for an encoder of 96 counts a turn, said as a product."""
+    where = tmp_path_factory.mktemp("coarse")
+    return ctypes.CDLL(str(build_library(where, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")))
+
+
+@pytest.fixture(scope="session")
 def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The ELF as a user builds it."""
     lacking = missing()

@@ -33,11 +33,11 @@ pytestmark = pytest.mark.firmware
 KNOWN = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
 """How the line begins with which it says who it is, whatever comes behind."""
 
-POWERED_ON = KNOWN + b" lines=0 refused=0 trips=0 reset=power"
+POWERED_ON = KNOWN + b" lines=0 refused=0 trips=0 runaways=0 reset=power"
 
-BY_PIN = KNOWN + b" lines=0 refused=0 trips=0 reset=pin"
+BY_PIN = KNOWN + b" lines=0 refused=0 trips=0 runaways=0 reset=pin"
 
-BY_WATCHDOG = KNOWN + b" lines=0 refused=0 trips=0 reset=watchdog"
+BY_WATCHDOG = KNOWN + b" lines=0 refused=0 trips=0 runaways=0 reset=watchdog"
 
 ZERO = STOP
 
@@ -210,7 +210,7 @@ def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, hos
     lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
     for refused, line in enumerate(lines):
         host.send(line)
-        assert read_identity(host.says(b""))[4:] == (0, refused, 0, "power")
+        assert read_identity(host.says(b""))[4:] == (0, refused, 0, 0, "power")
     assert host.identity().refused == 3
     assert stays_off(board, 50).on_ns == 0
     host.stop()
@@ -226,12 +226,12 @@ def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, hos
 
 
 def test_it_counts_lines_refusals_and_stops_for_silence(board: Board, host: Host) -> None:
-    assert host.identity() == (3200, 300, 1, 1, 0, 0, 0, "power")
+    assert host.identity() == (3200, 300, 1, 1, 0, 0, 0, 0, "power")
     for line in BAD_LINES[1:]:
         host.send(line)
     host.send(b"")
     refused = len(BAD_LINES) - 1
-    assert host.identity()[4:] == (0, refused, 0, "power"), "an empty line is none"
+    assert host.identity()[4:] == (0, refused, 0, 0, "power"), "an empty line is none"
     host.ask(ZERO)
     until(lambda: host.identity().lines == 1, 3.0, "it has counted")
     stays_off(board, 400)
@@ -585,15 +585,139 @@ def test_the_bench_can_mute_and_freeze_the_board(board: Board, host: Host) -> No
     assert read_reply(host.says(b"#02")).sequence == 2
 
 
-@pytest.mark.parametrize("fault", ["dead", "swapped"])
-def test_it_does_not_watch_over_its_encoders(board: Board, host: Host, fault: str) -> None:
-    """That is for the host, and for the check with lifted wheels."""
-    board.command(f"encoder b {fault}")
-    replies = host.drive((5.0, 5.0, 5.0, 5.0), 1.0)
-    motors = board.status().motors
-    assert motors[1].duty == 1.0
-    assert motors[0].speed == pytest.approx(5.0, rel=0.01)
-    assert replies[-1].speeds[1] == 0.0 if fault == "dead" else replies[-1].speeds[1] < -40.0
+def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
+    """Drive on until a wheel that does not do as told has cut all motors."""
+    began = board.status().virtual_ns
+    while (status := board.status()).running or not status.off_ns > began:
+        assert (status.virtual_ns - began) / MS < 1000 * within, status.motors
+        host.drive(speeds, 0.02)
+    return status
+
+
+def stays_cut(board: Board, host: Host) -> None:
+    """Lines are answered and move nothing, until the host was silent."""
+    before = board.status()
+    replies = host.drive(DRIVE, 0.7)
+    assert len(replies) >= 60
+    assert replies[-1].milliseconds is not None
+    assert board.status().on_ns == before.on_ns, "not for a moment"
+    assert (told := host.identity()).runaways == 1
+    assert told.trips == 0, "the silence had nothing to cut"
+    stays_off(board, 400)
+    replies = host.drive((5.0, 0.0, 5.0, 5.0), 0.5)
+    assert board.status().running, "silence has freed them"
+
+
+def test_a_wheel_with_its_encoder_backwards_is_cut_though_it_shall_stand(
+    board: Board, host: Host
+) -> None:
+    board.command("encoder b swapped")
+    host.drive((3.0, 3.0, 3.0, 3.0), 0.1)
+    began = board.status().virtual_ns
+    status = is_cut(board, host, STOPPED, 0.5)
+    print(f"3 rad/s for 100 ms, then zero: off {100 + (status.off_ns - began) / MS:.0f} ms after "
+          f"the first line, turning {status.motors[1].speed:.1f} rad/s")  # fmt: skip
+    stays_cut(board, host)
+
+
+@pytest.mark.parametrize("speed", [5.0, -20.0])
+def test_a_wheel_with_its_encoder_backwards_is_cut_while_it_is_driven(
+    board: Board, host: Host, speed: float
+) -> None:
+    board.command("encoder b swapped")
+    host.stop()
+    began = board.status().virtual_ns
+    status = is_cut(board, host, (speed, speed, speed, speed), 0.5)
+    print(f"{speed} rad/s: off after {(status.off_ns - began) / MS:.0f} ms")
+    stays_cut(board, host)
+
+
+@pytest.mark.parametrize("touched", [0.5, -2.0])
+def test_a_wheel_with_its_encoder_backwards_that_is_touched_at_rest_is_cut(
+    board: Board, host: Host, touched: float
+) -> None:
+    board.command("encoder b swapped")
+    host.drive(STOPPED, 0.2)
+    assert is_off(board.status())
+    board.command(f"push b {touched}")
+    began = board.status().virtual_ns
+    status = is_cut(board, host, STOPPED, 0.6)
+    print(f"touched to {touched} rad/s: off after {(status.off_ns - began) / MS:.0f} ms")
+    assert (status.off_ns - began) / MS <= 500
+    stays_cut(board, host)
+
+
+def test_a_wheel_with_a_dead_encoder_is_cut_after_a_second_of_full_voltage(
+    board: Board, host: Host
+) -> None:
+    board.command("encoder b dead")
+    host.stop()
+    began = board.status().virtual_ns
+    status = is_cut(board, host, (20.0, 20.0, 20.0, 20.0), 2.0)
+    print(f"20 rad/s asked of a dead encoder: off after {(status.off_ns - began) / MS:.0f} ms")
+    assert 1000 <= (status.off_ns - began) / MS <= 1300
+    stays_cut(board, host)
+
+
+def test_a_reset_frees_motors_that_were_cut(board: Board, host: Host) -> None:
+    board.command("encoder b swapped")
+    is_cut(board, host, (9.0, 9.0, 9.0, 9.0), 0.8)
+    board.command("encoder b ok")
+    board.command("reset")
+    assert host.says(b"acsard") == BY_PIN
+    host.stop()
+    host.drive(DRIVE, 0.2)
+    assert board.status().running
+
+
+def test_a_healthy_robot_is_never_cut(board: Board, host: Host) -> None:
+    """Quick reversals, wheels that are heavy, blocked and let go, knocked."""
+    host.drive(DRIVE, 0.2)
+    for i, speed in enumerate((40.0, -40.0, 1.0, -1.0, 60.0, -60.0, 0.0, 99.0, -99.0, 0.2, -30.0)):
+        board.command(f"load a {0.9 * (i % 2)}")
+        board.command(f"load b {i % 3 // 2}")
+        host.drive((speed, -speed, speed, speed), 0.12 + 0.1 * (i % 4))
+        board.command(f"push c {20.0 * (-1) ** i}")
+        board.command(f"push d {-speed / 2}")
+    for sign in (1, -1) * 5:
+        host.drive((50.0 * sign,) * 4, 0.1)
+    for i in range(20):
+        for motor in "abcd":
+            board.command(f"push {motor} {(i - 10) * 2.0}")
+        host.drive(STOPPED, 0.05)
+    board.command("load b 1")
+    host.drive((30.0,) * 4, 0.8)
+    board.command("load b 0.97")
+    host.drive((30.0,) * 4, 2.5)
+    assert (told := host.identity()).runaways == 0
+    assert told.trips == 0
+
+
+def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_path: Path) -> None:
+    coarse = build_firmware(tmp_path, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")
+    with Board(runner, coarse, "--counts", "96") as board, Host(board.path) as host:
+        for speed in (0.4, -0.4, 20.0, -20.0, 1.0, -1.0):
+            host.drive((speed, -speed, speed, speed), 0.5)
+        host.drive((0.5, 0.5, -0.5, 0.5), 2.0)
+        said = [reply.speeds[0] for reply in host.drive((0.5, 0.5, -0.5, 0.5), 3.0)]
+        true = statistics.mean(said)
+        print(f"0.5 rad/s at 96 counts a turn: says {true:.2f} +- {statistics.pstdev(said):.2f}")
+        assert true == pytest.approx(0.5, rel=0.15)
+        assert max(said) < 2.0
+        assert host.identity()[:1] == (96,)
+        assert host.identity().runaways == 0
+
+
+def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(
+    runner: Path, tmp_path: Path
+) -> None:
+    """Where duty and its rise together pass 16 bits."""
+    slow = build_firmware(tmp_path, "-DPWM_HZ=250UL")
+    with Board(runner, slow) as board, Host(board.path) as host:
+        host.drive((49.0, -49.0, 49.0, 49.0), 0.4)
+        for _ in range(20):
+            host.drive((49.0, -49.0, 49.0, 49.0), 0.02)
+            assert min(abs(motor.duty) for motor in board.status().motors) > 0.9
 
 
 @pytest.mark.parametrize("baud_rate", [9600, 57600])
@@ -610,15 +734,19 @@ def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: 
         assert replies[-1].speeds == pytest.approx(DRIVE, rel=0.02)
 
 
-def test_with_require_check_a_plain_line_is_refused_after_a_checked_one(
+def test_with_require_check_a_plain_line_but_a_stop_is_refused_after_a_checked_one(
     runner: Path, tmp_path: Path
 ) -> None:
     strict = build_firmware(tmp_path, "-DREQUIRE_CHECK=1")
     with Board(runner, strict) as board, Host(board.path) as host:
         assert host.ask(ZERO).line == ZERO
         host.ask(checked(ZERO, 1))
-        host.send(ZERO)
+        host.send(speeds_line(DRIVE))
         assert host.ask(checked(ZERO, 2)).sequence == 2, "and no answer before that"
+        host.drive(DRIVE, 0.2)
+        assert host.ask(ZERO).line.startswith(b"ap"), "but a stop is never refused"
+        assert host.identity().refused == 1
+        is_still(board)
         board.command("reset")
         host.says(b"acsard")
         assert host.ask(ZERO).line == ZERO

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TOP = 400
@@ -28,7 +29,7 @@ class WatchdogC(ctypes.Structure):
 class SpeedC(ctypes.Structure):
     _fields_ = (
         ("count", ctypes.c_uint16),
-        ("still", ctypes.c_bool),
+        ("way", ctypes.c_int8),
         ("edge", ctypes.c_uint32),
         ("read", ctypes.c_uint32),
         ("value", ctypes.c_float),
@@ -47,11 +48,30 @@ class BridgeC(ctypes.Structure):
     )
 
 
+class SupervisorC(ctypes.Structure):
+    _fields_ = (
+        ("against", ctypes.c_uint16),
+        ("stuck", ctypes.c_uint16),
+        ("count", ctypes.c_uint16),
+        ("size", ctypes.c_float),
+    )
+
+
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
     """The library with its types told."""
+    return told(library)
+
+
+@pytest.fixture(scope="session")
+def coarse(coarse_library: ctypes.CDLL) -> ctypes.CDLL:
+    """The same for a coarse encoder."""
+    return told(coarse_library)
+
+
+def told(library: ctypes.CDLL) -> ctypes.CDLL:
     u16, u32, single = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_float
-    told: list[tuple[str, list[Any], Any]] = [
+    types: list[tuple[str, list[Any], Any]] = [
         ("watchdog_start", [], None),
         ("watchdog_feed", [u32], None),
         ("watchdog_allows", [u32], ctypes.c_bool),
@@ -61,8 +81,10 @@ def logic(library: ctypes.CDLL) -> ctypes.CDLL:
         ("pi_step", [single, single, ctypes.c_bool], single),
         ("bridge_off", [], None),
         ("bridge_step", [ctypes.c_int16], ctypes.c_bool),
+        ("supervise_start", [], None),
+        ("supervise_step", [ctypes.c_int16, single, u16], ctypes.c_bool),
     ]
-    for name, arguments, result in told:
+    for name, arguments, result in types:
         function = getattr(library, name)
         function.argtypes = [ctypes.c_void_p, *arguments]
         function.restype = result
@@ -168,6 +190,128 @@ def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
         assert logic.speed_update(at, count, edge, 300 * 2000) <= 1.0
 
 
+def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> list[tuple[int, int]]:
+    """When the count of such an angle (in counts) became what."""
+    found, last = [], math.floor(angle(0.0))
+    for i in range(round(seconds / step)):
+        now = math.floor(angle(i * step))
+        while last != now:
+            last += 1 if now > last else -1
+            found.append((round(i * step * TICKS), last))
+    return found
+
+
+def said_of(
+    library: ctypes.CDLL, edges: Iterable[tuple[int, int]], windows: Iterable[int], start: int = 0
+) -> Iterator[tuple[int, float, int, int]]:
+    """Counts turned, what is said, the window, and the time, of counts that became so."""
+    wheel = SpeedC()
+    at = ctypes.addressof(wheel)
+    waiting = list(edges)[::-1]
+    count = last = edge = now = 0
+    library.speed_start(at, 0, start % 2**32)
+    for window in windows:
+        now += window
+        while waiting and waiting[-1][0] <= now:
+            edge, count = waiting.pop()
+        value = library.speed_update(
+            at, count % 65536, (start + edge) % 2**32, (start + now) % 2**32
+        )
+        yield count - last, value, window, now
+        last = count
+
+
+PITCH = math.tau / COUNTS_PER_TURN
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 60_000), st.sampled_from((-1, 1, 1))), max_size=200),
+    st.lists(st.integers(9_000, 50_000), min_size=1, max_size=200),
+    st.integers(0, 2**32 - 1),
+)
+def test_whatever_the_edges_no_more_is_said_than_the_window_allows(
+    logic: ctypes.CDLL, steps: list[tuple[int, int]], windows: list[int], start: int
+) -> None:
+    """Edges at random times, some reversing, some microseconds apart."""
+    times = itertools.accumulate(step for step, _ in steps)
+    counts = itertools.accumulate(way for _, way in steps)
+    before, way = 0.0, 0
+    said = said_of(logic, zip(times, counts, strict=True), windows, start)
+    for turned, value, window, _ in said:
+        one = PITCH / (window / TICKS)
+        if not turned:
+            assert abs(value) <= abs(before)
+            assert value * before >= 0.0
+        else:
+            assert value * turned >= 0.0
+            counted = abs(turned)
+            most = counted + 1 if turned * way > 0 else counted - 1
+            assert (counted - 1) * one * 0.999 <= abs(value) <= most * one * 1.001
+            way = 1 if turned > 0 else -1
+        before = value
+
+
+CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0, 1)]
+"""An edge crossed and crossed back after 100 us, on either side of the end of a window."""
+
+
+@pytest.mark.parametrize(
+    ("edges", "most"),
+    [
+        (CHATTER, 0.0),
+        ([(time + 100_000 * (i % 2), count) for i, (time, count) in enumerate(CHATTER[:2])], 0.0),
+        (edges_of(lambda t: 0.5 + 0.8 * math.sin(math.tau * 50 * t), 1.0, 1e-5), 0.8 * 50),
+        (edges_of(lambda t: 0.5 + 0.8 * math.sin(math.tau * 23 * t), 1.0, 1e-5), 0.8 * 23),
+        (edges_of(lambda t: 0.5 + 1.5 * math.sin(math.tau * 37 * t), 1.0, 1e-5), 1.5 * 37),
+        (edges_of(lambda t: 0.5 + 3.0 * math.sin(math.tau * 11 * t), 1.0, 1e-5), 3.0 * 11),
+    ],
+    ids=["chatter", "twice", "50 Hz", "23 Hz", "37 Hz", "11 Hz"],
+)
+def test_a_wheel_that_trembles_is_not_said_to_race(
+    logic: ctypes.CDLL, edges: list[tuple[int, int]], most: float
+) -> None:
+    """No more than the fastest it truly is, and one count in a window; `most` in counts, as of a
+    sine its amplitude times its frequency."""
+    for window in (10_000, 20_000, 40_000):
+        said = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
+        assert max(map(abs, said)) <= (most * math.tau + TICKS / window) * PITCH
+        if not most:
+            assert max(map(abs, said)) == 0.0
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.3, 0.4, 0.5, 0.6, 0.9, 2.0, -0.2, -0.6])
+@pytest.mark.parametrize("every", [0.005, 0.01, 0.02])
+def test_a_coarse_encoder_says_its_true_speed_however_slow(
+    coarse: ctypes.CDLL, speed: float, every: float
+) -> None:
+    """96 counts a turn: at 0.2 rad/s one in 330 ms."""
+    edges = edges_of(lambda t: speed / math.tau * 96 * t, 20.0, 1e-4)
+    told = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
+    settled = [value for _, value, _, now in told if now > 2.0 * TICKS]
+    assert sum(settled) / len(settled) == pytest.approx(speed, rel=0.1)
+    assert max(map(abs, settled)) < 1.1 * abs(speed)
+    assert max(abs(value) for _, value, _, _ in told) < 1.1 * abs(speed), "nor at the first edge"
+
+
+def test_a_quick_start_is_not_hidden_by_the_time_waited(logic: ctypes.CDLL) -> None:
+    for waited in (0, 40_000, 10_000_000, 2**30 - 4_500):
+        last = waited + 20_000
+        edges = [(5_000, 1), *((last - 4_000 + 1_000 * i, 2 + i) for i in range(5))]
+        said = list(said_of(logic, edges, [10_000, *([waited] * bool(waited)), 10_000]))
+        assert said[-1][0] == 5
+        assert said[-1][1] >= 4 * PITCH / 0.005 * 0.999
+
+
+def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctypes.CDLL) -> None:
+    """Its 32 bits come round in 36 minutes; then an edge long ago would look recent."""
+    rests = [2**32 // 32] * 32
+    far = sum(rests)
+    edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
+    said = [value for _, value, _, _ in said_of(logic, edges, [10_000, *rests, 10_000, 10_000])]
+    assert abs(said[-2]) < 1e-5
+    assert said[-1] == pytest.approx(PITCH / 0.005, rel=0.01)
+
+
 @given(st.floats(-1e6, 1e6))
 def test_hundredths_are_rounded_and_bounded(logic: ctypes.CDLL, value: float) -> None:
     said = logic.speed_hundredths(value)
@@ -249,3 +393,179 @@ def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
             assert zero_for >= 2, "rest before the other direction"
         zero_for = zero_for + 1 if bridge.duty == 0 else 0
         driven = bridge.direction if bridge.duty else driven
+
+
+# supervision
+
+
+class Wheel:
+    """A motor under the firmware's control, a control period at a time, as main.c does it."""
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        *,
+        lag: float = 0.05,
+        free_speed: float = 50.0,
+        counts: int = COUNTS_PER_TURN,
+        encoder: int = 1,
+    ) -> None:
+        self.library, self.lag, self.free_speed = library, lag, free_speed
+        self.counts, self.encoder = counts, encoder
+        self.force = 0.0
+        """From outside, a share of what stalls the motor."""
+        self.friction = 0.0
+        """The same, against whatever it does."""
+        self.speed, self.angle, self.duty, self.now = 0.0, 0.0, 0.0, 0
+        self.count = self.edge = 0
+        self.off_ms: int | None = None
+        self.parts = PiC(), BridgeC(), SpeedC(), SupervisorC()
+        self.pi, self.bridge, self.speeds, self.supervisor = map(ctypes.addressof, self.parts)
+        library.pi_reset(self.pi)
+        library.speed_start(self.speeds, 0, 0)
+        library.supervise_start(self.supervisor)
+        self.limited = False
+
+    def run(self, target: float, ms: int) -> bool:
+        """So long, or until its motor is switched off; True when it was."""
+        for _ in range(ms // 5):
+            self._turn()
+            if self._control(target):
+                self.off_ms = self.now // 2000
+                return True
+        return False
+
+    def _turn(self) -> None:
+        for _ in range(25):  # 0.2 ms each
+            pull = self.duty + self.force - self.speed / self.free_speed
+            grip = self.friction
+            if self.speed == 0.0 and abs(pull) <= grip:
+                change = 0.0
+            else:
+                along = self.speed if self.speed else pull
+                change = (pull - math.copysign(grip, along)) * self.free_speed / self.lag * 0.0002
+            after = self.speed + change
+            self.speed = 0.0 if after * self.speed < 0.0 and abs(pull) <= grip else after
+            self.now += 400
+            self.angle += self.speed * 0.0002 * self.encoder
+            count = math.floor(self.angle / math.tau * self.counts)
+            if count != self.count:
+                self.count, self.edge = count, self.now
+
+    def _control(self, target: float) -> bool:
+        library, bridge = self.library, self.parts[1]
+        seen = library.speed_update(
+            self.speeds, self.count % 65536, self.edge % 2**32, self.now % 2**32
+        )
+        had = bridge.duty * bridge.direction
+        if library.supervise_step(self.supervisor, had, seen, self.count % 65536):
+            return True
+        wanted = int(library.pi_step(self.pi, target, seen, self.limited) * TOP)
+        self.limited = not library.bridge_step(self.bridge, wanted)
+        self.duty = bridge.duty * bridge.direction / TOP
+        return False
+
+
+BACKWARDS = -1
+
+DEAD = 0
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.05, 0.2, 0.5])
+@pytest.mark.parametrize("start", [3.0, -3.0, 0.5, 20.0])
+def test_a_wheel_with_its_encoder_backwards_is_switched_off(
+    logic: ctypes.CDLL, lag: float, start: float
+) -> None:
+    wheel = Wheel(logic, lag=lag, encoder=BACKWARDS)
+    if not wheel.run(start, 100):
+        assert wheel.run(0.0, 2000), "though it shall stand"
+    print(f"lag {lag}, {start} rad/s for 100 ms, then zero: off after {wheel.off_ms} ms")
+    assert wheel.off_ms is not None
+    if lag <= 0.05:
+        assert wheel.off_ms <= 500
+
+
+@pytest.mark.parametrize("touched", [0.2, 0.5, -2.0, 10.0])
+def test_a_wheel_with_its_encoder_backwards_that_is_touched_is_switched_off(
+    logic: ctypes.CDLL, touched: float
+) -> None:
+    wheel = Wheel(logic, encoder=BACKWARDS)
+    assert not wheel.run(0.0, 1000)
+    wheel.speed = touched
+    assert wheel.run(0.0, 2000)
+    assert wheel.off_ms is not None
+    print(f"touched to {touched} rad/s: off after {wheel.off_ms - 1000} ms")
+    assert wheel.off_ms - 1000 <= (500 if abs(touched) >= 0.5 else 600), "growing from nothing"
+
+
+@pytest.mark.parametrize("target", [3.0, 20.0, -45.0])
+def test_a_wheel_that_shows_no_counts_is_switched_off_after_a_second_of_full_voltage(
+    logic: ctypes.CDLL, target: float
+) -> None:
+    dead, jammed = Wheel(logic, encoder=DEAD), Wheel(logic)
+    jammed.friction = 2.0
+    for wheel in (dead, jammed):
+        assert wheel.run(target, 5000)
+        assert wheel.off_ms is not None
+        until_full = 50 + 1000 * (1 - abs(target) / 50) / (abs(target) * 0.4)
+        assert wheel.off_ms == pytest.approx(1000 + until_full, rel=0.06)
+
+
+def test_a_dead_channel_counts_as_a_dead_encoder(logic: ctypes.CDLL) -> None:
+    """It counts one up and one down."""
+    supervisor = SupervisorC()
+    at = ctypes.addressof(supervisor)
+    logic.supervise_start(at)
+    steps = [logic.supervise_step(at, TOP, 0.0, tick % 2) for tick in range(300)]
+    assert steps.index(True) == 199
+    for way in (1, -1):
+        logic.supervise_start(at)
+        slow = [way * (tick // 50) % 65536 for tick in range(1000)]
+        assert not any(logic.supervise_step(at, TOP, 0.0, count) for count in slow)
+
+
+FORCES = st.floats(-0.5, 0.5)
+
+ACTIONS = st.tuples(
+    st.sampled_from([0.0, 0.0, 0.2, -0.2, 1.0, -5.0, 12.0, 30.0, -30.0, 60.0, -99.0]),
+    st.integers(20, 700),
+    st.one_of(st.just(0.0), st.just(0.0), FORCES),
+    st.one_of(st.none(), st.none(), st.floats(-20.0, 20.0)),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.floats(0.02, 1.0), st.floats(25.0, 80.0), st.floats(0.0, 0.3), st.booleans(),
+    st.lists(ACTIONS, min_size=3, max_size=12),
+)  # fmt: skip
+def test_a_healthy_wheel_is_never_switched_off(
+    logic: ctypes.CDLL,
+    coarse: ctypes.CDLL,
+    lag: float,
+    free_speed: float,
+    friction: float,
+    is_coarse: bool,
+    actions: list[tuple[float, int, float, float | None]],
+) -> None:
+    """Light or a whole robot's weight, stronger or weaker than it is said to be, with much
+    friction; driven, reversed, pushed with half of what stalls it, and knocked if light."""
+    library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
+    wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)
+    wheel.friction = friction
+    for target, ms, force, knocked in actions:
+        wheel.force = force
+        if knocked is not None and lag <= 0.1:
+            wheel.speed = knocked
+        assert not wheel.run(target, ms)
+
+
+def test_a_wheel_that_is_blocked_for_less_than_a_second_is_not_switched_off(
+    logic: ctypes.CDLL,
+) -> None:
+    wheel = Wheel(logic)
+    for target in (20.0, -20.0, 45.0, -45.0) * 3:
+        wheel.friction = 2.0
+        assert not wheel.run(target, 900)
+        wheel.friction = 0.0
+        assert not wheel.run(target, 300)

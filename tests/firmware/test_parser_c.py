@@ -52,6 +52,7 @@ class RecordC(ctypes.Structure):
         ("lines", ctypes.c_uint32),
         ("refused", ctypes.c_uint16),
         ("trips", ctypes.c_uint16),
+        ("runaways", ctypes.c_uint16),
     )
 
 
@@ -122,9 +123,9 @@ class Parser:
     def too_long(self) -> int:
         return int(self._reader.too_long)
 
-    def identity(self, lines: int, refused: int, trips: int, reset: bytes) -> bytes:
+    def identity(self, lines: int, refused: int, trips: int, runaways: int, reset: bytes) -> bytes:
         """The line that says who it is, with its end."""
-        record = RecordC(lines, refused, trips)
+        record = RecordC(lines, refused, trips, runaways)
         out = ctypes.create_string_buffer(128)
         length = self._identity(out, ctypes.addressof(record), reset)
         assert length <= 128
@@ -360,12 +361,16 @@ def test_no_single_bit_error_makes_a_line_end_where_the_rest_is_a_line(parser: P
 # who it is
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 65535), st.integers(0, 65535))
+counters = st.one_of(st.integers(0, 1100), st.integers(0, 65535))
+
+
+@given(st.integers(0, 2**32 - 1), counters, counters, counters)
 def test_it_says_who_it_is_in_a_line_that_is_no_feedback_and_not_too_long_for_the_host(
-    parser: Parser, lines: int, refused: int, trips: int
+    parser: Parser, lines: int, refused: int, trips: int, runaways: int
 ) -> None:
-    line = parser.identity(lines, refused, trips, b"brown-out")
-    assert read_identity(line.removesuffix(b"\r\n"))[4:] == (lines, refused, trips, "brown-out")
+    line = parser.identity(lines, refused, trips, runaways, b"brown-out")
+    told = (lines, min(refused, 999), min(trips, 999), min(runaways, 9), "brown-out")
+    assert read_identity(line.removesuffix(b"\r\n"))[4:] == told
     ((heard, _),) = LineReader().feed(line)
     assert heard.startswith(b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1 ")
     with pytest.raises(FrameError):
@@ -373,7 +378,15 @@ def test_it_says_who_it_is_in_a_line_that_is_no_feedback_and_not_too_long_for_th
 
 
 def test_its_longest_line_leaves_room_for_a_finer_encoder(parser: Parser) -> None:
-    assert len(parser.identity(2**32 - 1, 65535, 65535, b"brown-out")) == 119
+    assert len(parser.identity(2**32 - 1, 65535, 65535, 65535, b"brown-out")) == 126
+
+
+def test_counts_said_as_a_product_are_told_as_a_number(coarse_library: ctypes.CDLL) -> None:
+    assert (
+        Parser(coarse_library)
+        .identity(0, 0, 0, 0, b"pin")
+        .startswith(b"!acsard-mcu 1 counts=96 watchdog_ms=")
+    )
 
 
 def test_a_counter_that_is_full_stays_so(parser: Parser) -> None:
