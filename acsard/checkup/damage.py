@@ -47,7 +47,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broke
         Broken("neither p nor n", line(a, b, "cq" + c[2:], d)),
         Broken("cut short", line(a, b, c, d)[:20] + b"\r\n"),
         Broken("cut inside the last number", line(a, b, c, d)[:30] + b"\r\n"),
-        Broken("cut inside the last number", line(a, b, c, d)[:28] + b"\r\n"),
+        Broken("cut inside the last number", line(a, b, c, d)[:27] + b"\r\n"),
         Broken("over-long", line(*(a, b, c, d) * 5), whole=True),
         Broken("garbage before it", b"\xff~" + line(a, b, c, d), whole=True),
     ]
