@@ -46,7 +46,7 @@ def test_a_port_that_is_not_there_ends_with_66(tmp_path: Path) -> None:
 
 
 def test_without_a_terminal_it_refuses_with_2(tmp_path: Path) -> None:
-    ended = finish(acsard("mcu", "check"), tmp_path)
+    ended = finish(acsard("mcu", "check", "--port", "sim"), tmp_path)
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
 
