@@ -21,6 +21,8 @@ def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
     assert all(any(b.line.endswith(end) for b in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
     for broken in lines:
         assert protocol.whole(broken.line) is None, broken.what
+        if "last number" in broken.what:
+            continue  # the host reads replies with other decimals
         with pytest.raises(FrameError):
             Codec(WheelMap()).decode(broken.line.rstrip())
 
