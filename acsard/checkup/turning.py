@@ -9,11 +9,16 @@ from collections.abc import Iterator, Sequence
 from statistics import fmean
 from typing import Literal
 
-from acsard.checkup.bench import SPEED, ZERO, Bench, Reply
+from msgspec import structs
+
+from acsard.checkup import motion
+from acsard.checkup.bench import SPEED, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, motor_name
+from acsard.checkup.motion import Reply
 from acsard.checkup.outside import Operator
-from acsard.checkup.wheels import TOLERANCE, Channel, moving
+from acsard.checkup.wheels import PROBE_MOVES, TOLERANCE, Channel, moving
 from acsard.mcu.frames import Motors
+from acsard.values import NS_PER_S
 
 RAMP_S = 0.2
 HOLD_S = 1.4
@@ -22,10 +27,20 @@ HOLD_S = 1.4
 DEAD_S = 0.6
 """A motor that shows nothing by then is not held longer: its control loop may be winding up."""
 
+LONGEST_HOLD_S = 4.5
+"""A motor that still speeds up after `HOLD_S` is held up to this long."""
+
+PROBE_S = 0.2
+PROBE_SPEED = 0.5 * SPEED
+"""The first a motor is told: so short that one without a working encoder, which the firmware may
+drive up to full speed, does not get far."""
+
+LET_GO_S = 0.7
+"""Silence after a probe that its encoder did not follow: the firmware may regulate zeros into a
+runaway, and its watchdog cuts the motor. Longer than any watchdog that is right."""
+
 CHUNKS = 8
 """Over so many tenths of a second the speed of an encoder is taken that is not steady before."""
-
-UNSEEN_S = 0.5
 
 STALL_S = 0.15
 """A pause of ours this long makes what was measured worthless: it is measured again."""
@@ -59,7 +74,7 @@ def run_up(bench: Bench, motors: Motors) -> Motors:
     chunk_s = max(0.1, 2.5 * bench.gap_s)
     steady, means = 0, ZERO
     chunks: list[Sequence[Reply]] = []
-    while len(chunks) * chunk_s < HOLD_S and steady < 2:
+    while steady < 2 and (len(chunks) * chunk_s < HOLD_S or _speeds_up(bench, motors, chunks)):
         chunks.append(bench.drive(motors, chunk_s))
         # A coarse encoder needs more of them, a quick one is seen to be steady before.
         means = mean([reply for chunk in chunks[1:][-CHUNKS:] or chunks for reply in chunk])
@@ -70,6 +85,14 @@ def run_up(bench: Bench, motors: Motors) -> Motors:
         if len(chunks) * chunk_s >= DEAD_S and not moves:
             break
     return means
+
+
+def _speeds_up(bench: Bench, motors: Motors, chunks: Sequence[object]) -> bool:
+    """A motor is not at the speed it was told yet, and getting there."""
+    if len(chunks) * max(0.1, 2.5 * bench.gap_s) >= LONGEST_HOLD_S:
+        return False
+    shares = motion.trend(bench.replies, bench.wire.now_ns(), bench.gap_s)
+    return any(share > 1 / motion.FALLS for share, told in zip(shares, motors, strict=True) if told)
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
@@ -83,7 +106,7 @@ def mean(replies: Sequence[Reply]) -> Motors:
 def channels(bench: Bench, operator: Operator) -> Iterator[tuple[Channel, Finding | None]]:
     """Each motor in turn; with the last one, what is to say of the trailing comma."""
     for motor in range(4):
-        operator.say(f"{motor_name(bench.mcu, motor)} turns, forth and back")
+        operator.say(f"{motor_name(bench.mcu, motor)} turns: a moment first, then forth and back")
         channel, stopped = _both_ways(bench, motor)
         comma = None
         if motor == 3:
@@ -97,29 +120,65 @@ def channels(bench: Bench, operator: Operator) -> Iterator[tuple[Channel, Findin
 
 
 def _both_ways(bench: Bench, motor: int) -> tuple[Channel, Literal["rest", "comma"]]:
+    seen = probe(bench, motor)
+    if seen is not None:
+        return Channel(motor, seen, ZERO, probed=True), "rest"
     forth = turn(bench, motor, SPEED)
-    stopped = _rest(bench, motor, forth)
+    if motor not in moving(forth):
+        _let_go(bench)
+        return Channel(motor, forth, ZERO), "rest"
+    stopped = bench.rest()
     back = turn(bench, motor, -SPEED)
-    stopped = "comma" if "comma" in (_rest(bench, motor, back), stopped) else "rest"
+    if motor not in moving(back):
+        _let_go(bench)
+    stopped = "comma" if "comma" in (bench.rest(), stopped) else "rest"
     return Channel(motor, forth, back), stopped
 
 
-def _rest(bench: Bench, motor: int, seen: Motors) -> Literal["rest", "comma"]:
-    """Come to rest; a motor whose encoder shows nothing is given the time for it unseen."""
-    stopped = bench.rest()
-    if motor not in moving(seen):
-        bench.drive(ZERO, UNSEEN_S)
-    return stopped
+def probe(bench: Bench, motor: int) -> Motors | None:
+    """Turn a motor slowly and shortly; None when its own encoder follows, and it turns on.
+
+    Else what the encoders showed of it, in rad/s, of the second try: a coarse encoder may need
+    more to show anything, and a jump of one count is nothing yet. It stands by then.
+    """
+    shown = _probe(bench, motor, PROBE_SPEED)
+    if shown is None:
+        return None
+    if not any(abs(speed) >= PROBE_MOVES for speed in shown):
+        return _probe(bench, motor, SPEED)
+    return _probe(bench, motor, PROBE_SPEED)
+
+
+def _probe(bench: Bench, motor: int, speed: float) -> Motors | None:
+    bench.begin()
+    began_ns = bench.wire.now_ns()
+    own = 0.0
+    while bench.wire.now_ns() - began_ns < PROBE_S * NS_PER_S and own > -4 * PROBE_MOVES * PROBE_S:
+        bench.drive(one(motor, speed), bench.period_s)
+        own = motion.covered(bench.replies, began_ns)[motor]
+    if own >= PROBE_MOVES * PROBE_S:
+        return None
+    _let_go(bench)
+    a, b, c, d = (angle / PROBE_S for angle in motion.covered(bench.replies, began_ns))
+    shown = (a, b, c, d)
+    return None if shown[motor] >= PROBE_MOVES else shown
+
+
+def _let_go(bench: Bench) -> None:
+    """Zeros once, then silence until the watchdog has cut the motors; they stand afterwards."""
+    bench.zeros()
+    bench.listen(LET_GO_S)
+    bench.rest()
 
 
 def _with_other_comma(bench: Bench, dead: Channel) -> tuple[Channel, Finding]:
     """The last motor does nothing: does it with the comma at the line's end turned round?"""
     bench.comma = not bench.comma
-    forth = turn(bench, dead.motor, SPEED)
-    if not moving(forth):
-        bench.rest()
+    shown = probe(bench, dead.motor)
+    forth = ZERO if shown is not None else turn(bench, dead.motor, SPEED)
+    if dead.motor not in moving(forth):
         bench.comma = not bench.comma
-        _rest(bench, dead.motor, forth)
+        _let_go(bench)
         text = "motor d shows nothing either way: it cannot be told"
         return dead, Finding("trailing comma", "SKIPPED", "", text)
     if bench.comma:
@@ -176,9 +235,9 @@ def _seen(bench: Bench, operator: Operator, channel: Channel) -> Channel:
     if which is None:
         return channel
     if which == "none":
-        return Channel(channel.motor, channel.forth, channel.back, 4)
+        return structs.replace(channel, wheel=4)
     way = operator.ask(
         "which way did it turn first: forward (as when the robot drives ahead) or back?",
         ("forward", "back"),
     )
-    return Channel(channel.motor, channel.forth, channel.back, ANSWERS[which], way != "back")
+    return structs.replace(channel, wheel=ANSWERS[which], forward=way != "back")

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from acsard.checkup import counts
-from acsard.checkup.bench import PERIOD_S, REST_S, SPEED, ZERO, Bench, Reply
+from acsard.checkup.bench import PERIOD_S, REST_S, SPEED, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, StoppedError
+from acsard.checkup.motion import Reply
 from acsard.checkup.turning import mean, run_up
 from acsard.mcu.frames import Motors
 from acsard.mcu.wire import FIELD
