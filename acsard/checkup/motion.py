@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from statistics import fmean
 
 from msgspec import Struct
@@ -53,19 +54,29 @@ def fastest(replies: Sequence[Reply], above: float, per_turn: int) -> tuple[int,
         return None
     last_ns = near[-1].at_ns
     recent = [r for r in near if r.at_ns > last_ns - SPEED_S * NS_PER_S]
-    if len(recent) < 3:
-        recent = list(near[-3:])
+    if len(recent) < 4:
+        recent = list(near[-4:])
     counted = [r for r in recent if r.reading and r.at_ns > last_ns - COUNTS_S * NS_PER_S]
     for motor in range(4):
-        speeds = sorted((reply.motors[motor] for reply in recent), key=abs)
-        if abs(speeds[-1]) <= above:
+        if max(abs(reply.motors[motor]) for reply in recent) <= above:
             continue
-        mean = fmean(speeds[:-1] or [0.0])
-        known = _by_counts(counted, motor, per_turn)
-        speed = max(mean, known, key=abs)
+        mean = _mean_without_highest(recent, motor)
+        speed = max(mean, _by_counts(counted, motor, per_turn), key=abs)
         if abs(speed) > above:
             return motor, speed
     return None
+
+
+def _mean_without_highest(replies: Sequence[Reply], motor: int) -> float:
+    """The mean over time, without the reply that adds most to it: it may be one count, or wrong."""
+    ran = []
+    for before, after in pairwise(replies):
+        # Not more than a silence tells, not less than nothing: a late host reads several at once.
+        seconds = min(SPEED_S, max(0.001, (after.at_ns - before.at_ns) / NS_PER_S))
+        ran.append((after.motors[motor] * seconds, seconds))
+    ran.sort(key=lambda piece: abs(piece[0]))
+    seconds = sum(seconds for _, seconds in ran[:-1])
+    return sum(angle for angle, _ in ran[:-1]) / seconds if seconds else 0.0
 
 
 def _by_counts(replies: Sequence[Reply], motor: int, per_turn: int) -> float:

@@ -39,6 +39,9 @@ LET_GO_S = 0.7
 """Silence after a probe that its encoder did not follow: the firmware may regulate zeros into a
 runaway, and its watchdog cuts the motor. Longer than any watchdog that is right."""
 
+COAST_S = 2.5
+"""The same for one that was seen to turn: it must stand before the next zeros are regulated."""
+
 CHUNKS = 8
 """Over so many tenths of a second the speed of an encoder is taken that is not steady before."""
 
@@ -138,12 +141,16 @@ def _both_ways(bench: Bench, motor: int) -> tuple[Channel, Literal["rest", "comm
 def probe(bench: Bench, motor: int) -> Motors | None:
     """Turn a motor slowly and shortly; None when its own encoder follows, and it turns on.
 
-    Else what the encoders showed of it, in rad/s, of the second try: a coarse encoder may need
-    more to show anything, and a jump of one count is nothing yet. It stands by then.
+    Else what the encoders showed of it, in rad/s. A second try is for coarse encoders: they may
+    need more to show anything, and one count back is nothing yet. It stands by then.
     """
+    began_ns = bench.wire.now_ns()
     shown = _probe(bench, motor, PROBE_SPEED)
     if shown is None:
         return None
+    seen = [r.motors[motor] for r in bench.replies if r.at_ns > began_ns and r.motors[motor]]
+    if len(seen) >= 3 and max(seen) < 0:
+        return shown  # no need to drive a reversed one away twice
     if not any(abs(speed) >= PROBE_MOVES for speed in shown):
         return _probe(bench, motor, SPEED)
     return _probe(bench, motor, PROBE_SPEED)
@@ -158,16 +165,17 @@ def _probe(bench: Bench, motor: int, speed: float) -> Motors | None:
         own = motion.covered(bench.replies, began_ns)[motor]
     if own >= PROBE_MOVES * PROBE_S:
         return None
-    _let_go(bench)
+    moved = max(map(abs, motion.covered(bench.replies, began_ns))) >= PROBE_MOVES * PROBE_S
+    _let_go(bench, COAST_S if moved else LET_GO_S)
     a, b, c, d = (angle / PROBE_S for angle in motion.covered(bench.replies, began_ns))
     shown = (a, b, c, d)
     return None if shown[motor] >= PROBE_MOVES else shown
 
 
-def _let_go(bench: Bench) -> None:
+def _let_go(bench: Bench, silent_s: float = LET_GO_S) -> None:
     """Zeros once, then silence until the watchdog has cut the motors; they stand afterwards."""
     bench.zeros()
-    bench.listen(LET_GO_S)
+    bench.listen(silent_s)
     bench.rest()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 
 from acsard.checkup import procedure
+from acsard.checkup.bench import FAREWELL, SPEED
 from acsard.checkup.findings import Finding, WireLostError
 from acsard.mcu.frames import Codec
 from acsard.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.sim import protocol
 from acsard.values import WHEELS
 from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured
 
@@ -55,8 +58,36 @@ def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
         assert int(checked["watchdog"].figure.split()[0]) == pytest.approx(300, abs=60)
 
 
-def test_a_coarse_encoder_is_no_runaway() -> None:
-    assert check(config=Config(sim=SimConfig(encoder_counts=64))).failed == []
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 64])
+@pytest.mark.parametrize("fault", [(), ("no_check",)])
+def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -> None:
+    config = Config(sim=SimConfig(encoder_counts=per_turn))
+    assert check(*fault, config=config).failed == []
+
+
+@pytest.mark.parametrize("lag", [0.7, 0.8, 0.9, 1.0])
+@pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
+def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
+    checked = check(fault, config=Config(sim=SimConfig(motor_time_constant=lag)))
+    assert checked.failed == []
+    assert checked["trailing comma"].figure == "not needed"
+    assert "mcu.trailing_comma" not in checked.changes
+
+
+def test_a_heavy_last_wheel_that_does_need_its_comma_is_found() -> None:
+    config = Config(sim=SimConfig(motor_time_constant=0.5))
+    checked = check("comma_latched", config=config)
+    assert checked["trailing comma"].figure == "needed"
+
+
+def test_a_wheel_without_an_encoder_is_not_told_to_turn_back() -> None:
+    robot = Robot("plain_only", "stuck_encoder=b")
+    Checked(robot)
+    assert not any(b"bn" in line for line in robot.sent)
+
+
+def test_the_person_is_told_what_can_happen() -> None:
+    assert "dead or reversed can reach full speed" in procedure.CONFIRM
 
 
 def test_every_step_has_a_finding() -> None:
@@ -313,63 +344,68 @@ def test_a_runaway_stops_it_at_once() -> None:
 
 
 class Regulates(Robot):
-    """Its firmware regulates: a motor whose encoder is dead or reversed goes to full speed, also
-    when told zero, unless it stands; only the watchdog cuts it."""
+    """Its firmware regulates: a motor whose encoder is dead or reversed goes to full speed, a
+    reversed one also when told zero, unless it stands; only the watchdog cuts it."""
 
     FULL = 20.0
-    RISE = 60.0
-    """rad/s in a second."""
 
-    def __init__(self, *faults: str, **how: Any) -> None:
-        super().__init__(*faults, **how)
-        self.fastest = [0.0] * 4
-        self.full = [0.0] * 4
-        """For how long each was above 6 rad/s, s."""
-        self._told = [0.0] * 4
-        vehicle, advance = self.mcu.vehicle, self.mcu.vehicle.advance
-        act, limit = self.mcu._act, 0.002
+    def __init__(self, *faults: str, lag: float = 0.3) -> None:
+        super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
+        self.full_s = 0.0
+        """For how long a motor was faster than 6 rad/s."""
+        self.mcu.understand = self._regulated
 
-        def obeyed(now_ns: int, line: bytes) -> None:
-            before = self.mcu.valid_lines
-            kept = list(vehicle.set_points)
-            act(now_ns, line)
-            if self.mcu.valid_lines == before:
-                vehicle.set_points[:] = kept
-                return
-            self._told = list(vehicle.set_points)
-            self._cut = False
+    def _regulated(self, line: bytes) -> protocol.Command | None:
+        command = protocol.whole(line)
+        if command is None:
+            return None
+        for motor, told in command.values.items():
+            sign = 0 if self.mcu.stuck == motor else self.mcu.encoder_signs[motor]
+            speed = self.mcu.vehicle.speeds[motor]
+            error = told - sign * speed
+            if sign != 1 and abs(error) > 0.1:
+                command.values[motor] = math.copysign(self.FULL, error)
+        return command
 
-        def moves(dt: float) -> None:
-            watchdog = not any(vehicle.set_points) and self.mcu.watchdog_trips != self._trips
-            self._trips = self.mcu.watchdog_trips
-            if watchdog:
-                self._told, self._cut = [0.0] * 4, True
-            while dt > 0.0:
-                step = min(dt, limit)
-                for wheel in range(4):
-                    self._regulate(wheel, step)
-                advance(step)
-                for wheel, speed in enumerate(vehicle.speeds):
-                    self.fastest[wheel] = max(self.fastest[wheel], abs(speed))
-                    self.full[wheel] += step * (abs(speed) > 6.0)
-                dt -= step
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        got, step_ns = [], 5 * MS
+        while self.now_ns() < until_ns:
+            got += super().listen(min(until_ns, self.now_ns() + step_ns))
+            self.full_s += 0.005 * any(abs(v) > 6.0 for v in self.mcu.vehicle.speeds)
+        return got
 
-        self._trips, self._cut = 0, False
-        self.mcu._act = obeyed  # type: ignore[method-assign]
-        vehicle.advance = moves  # type: ignore[method-assign]
 
-    def _regulate(self, wheel: int, dt: float) -> None:
-        mcu, told = self.mcu, self._told[wheel]
-        sign = 0 if mcu.stuck == wheel else mcu.encoder_signs[wheel]
-        if sign == 1 or self._cut:
-            return
-        speed = mcu.vehicle.speeds[wheel]
-        error = told - sign * speed
-        if abs(error) < 0.05:
-            mcu.vehicle.set_points[wheel] = 0.0 if sign else mcu.vehicle.set_points[wheel]
-            return
-        goal = mcu.vehicle.set_points[wheel] + (self.RISE * dt if error > 0 else -self.RISE * dt)
-        mcu.vehicle.set_points[wheel] = max(-self.FULL, min(self.FULL, goal))
+@pytest.mark.parametrize(
+    ("fault", "most_s"), [("stuck_encoder=b", 0.8), ("reversed_encoder=b", 0.9)]
+)
+def test_firmware_that_regulates_is_not_left_at_full_speed(fault: str, most_s: float) -> None:
+    robot = Regulates(fault)
+    checked = Checked(robot)
+    assert checked.failed == ["motor b (front left)"]
+    assert checked["motor b"].figure.endswith("probed")
+    assert checked["watchdog"].verdict == "PASS"
+    assert robot.full_s < most_s
+    assert not checked.left_turning
+
+
+def zeros_after(sent: Sequence[bytes]) -> int:
+    """How many writes there are after the last that tells a speed."""
+    return next(n for n, line in enumerate(reversed(sent)) if b"3.00" in line)
+
+
+def test_after_a_runaway_zeros_go_out_once_and_then_nothing() -> None:
+    robot = Robot("bias=b:3")
+    Checked(robot)
+    assert zeros_after(robot.sent) == 1
+    assert robot.sent[-1].startswith(b"\r\nap00.00")
+
+
+def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it() -> None:
+    robot = Regulates("reversed_encoder=b", lag=0.05)
+    with robot.bench() as bench:
+        bench.drive((0.0, SPEED, 0.0, 0.0), 0.05)
+    assert 1 <= zeros_after(robot.sent) < FAREWELL
+    assert not any(robot.later())
 
 
 def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
