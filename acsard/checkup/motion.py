@@ -71,12 +71,12 @@ def _mean_without_highest(replies: Sequence[Reply], motor: int) -> float:
     """The mean over time, without the reply that adds most to it: it may be one count, or wrong."""
     ran = []
     for before, after in pairwise(replies):
-        # Not more than a silence tells, not less than nothing: a late host reads several at once.
-        seconds = min(SPEED_S, max(0.001, (after.at_ns - before.at_ns) / NS_PER_S))
+        seconds = min(SPEED_S, (after.at_ns - before.at_ns) / NS_PER_S)
         ran.append((after.motors[motor] * seconds, seconds))
     ran.sort(key=lambda piece: abs(piece[0]))
-    seconds = sum(seconds for _, seconds in ran[:-1])
-    return sum(angle for angle, _ in ran[:-1]) / seconds if seconds else 0.0
+    # Two quick replies after a silence: one count in so little time is no speed.
+    seconds = max(SPEED_S / 2, sum(seconds for _, seconds in ran[:-1]))
+    return sum(angle for angle, _ in ran[:-1]) / seconds
 
 
 def _by_counts(replies: Sequence[Reply], motor: int, per_turn: int) -> float:

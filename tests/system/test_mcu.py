@@ -123,10 +123,11 @@ FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
     "reversed": ("reversed_encoder=b", ["motor b (front left)"], {}),
     "comma": (
         "comma_latched",
-        ["trailing comma", "damaged lines"],
+        ["trailing comma", "watchdog", "damaged lines"],
         {"mcu.trailing_comma": True},
     ),
     "no watchdog": ("no_watchdog", ["watchdog"], {}),
+    "fed watchdog": ("fed_by_anything", ["watchdog"], {}),
     "late watchdog": ("late_watchdog", ["watchdog"], {}),
     "dead encoder": ("stuck_encoder=c", ["motor c (rear left)"], {}),
     "baud": ("other_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),

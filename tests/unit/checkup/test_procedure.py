@@ -104,6 +104,7 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
     ("comma_latched", "trailing comma", "FAIL", "motor d (rear right) still turns after zeros",
      "trailing_comma = true", {"mcu.trailing_comma": True}),
     ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
+    ("fed_by_anything", "watchdog", "FAIL", "half-broken cable", "whole valid line", {}),
     ("late_watchdog", "watchdog", "FAIL", "1.0 s after", "300 ms", {}),
     ("stuck_encoder=b", "motor b", "FAIL", "a dead encoder", "look whether", {}),
     ("other_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
@@ -126,7 +127,7 @@ def test_a_planted_fault_is_found_and_named(
     assert mend in finding.mend
     assert changes.items() <= checked.changes.items()
     # What it is not is said to be right.
-    expected = {"swapped_motors=a:b": 2, "comma_latched": 2}.get(fault, verdict == "FAIL")
+    expected = {"swapped_motors=a:b": 2, "comma_latched": 3}.get(fault, verdict == "FAIL")
     assert len(checked.failed) == expected
     assert not checked.left_turning
 
@@ -201,9 +202,10 @@ def test_a_dead_last_motor_is_no_missing_comma() -> None:
     assert "mcu.trailing_comma" not in checked.changes
 
 
-def test_old_firmware_with_its_comma_configured_fails_by_its_damaged_lines_only() -> None:
+def test_old_firmware_with_its_comma_configured_fails_by_its_broken_lines_only() -> None:
     checked = check("comma_latched", trailing_comma=True)
-    assert checked.failed == ["damaged lines"]
+    assert checked.failed == ["watchdog", "damaged lines"]
+    assert "fed by broken lines" in checked["watchdog"].figure
 
 
 def test_several_faults_at_once_are_all_found() -> None:
