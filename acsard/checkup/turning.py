@@ -12,7 +12,7 @@ from typing import Literal
 from msgspec import structs
 
 from acsard.checkup import motion
-from acsard.checkup.bench import SPEED, ZERO, Bench
+from acsard.checkup.bench import SPEED, STANDING, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, motor_name
 from acsard.checkup.motion import Reply
 from acsard.checkup.outside import Operator
@@ -85,7 +85,7 @@ def run_up(bench: Bench, motors: Motors) -> Motors:
         near = [m for m in moves if abs(abs(means[m]) / SPEED - 1) < 0.4 * TOLERANCE]
         asked = sum(1 for speed in motors if speed)
         steady = steady + 1 if len(near) >= asked else 0
-        if len(chunks) * chunk_s >= DEAD_S and not moves:
+        if len(chunks) * chunk_s >= DEAD_S and max(map(abs, means)) < STANDING:
             break
     return means
 

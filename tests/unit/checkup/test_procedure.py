@@ -65,7 +65,7 @@ def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -
     assert check(*fault, config=config).failed == []
 
 
-@pytest.mark.parametrize("lag", [0.7, 0.8, 0.9, 1.0])
+@pytest.mark.parametrize("lag", [0.8, 1.0])
 @pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
 def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
     checked = check(fault, config=Config(sim=SimConfig(motor_time_constant=lag)))
