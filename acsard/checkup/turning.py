@@ -5,6 +5,7 @@ What it means is `wheels.py`'s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 from typing import Literal
@@ -153,23 +154,35 @@ def probe(bench: Bench, motor: int) -> Motors | None:
         return shown  # no need to drive a reversed one away twice
     if not any(abs(speed) >= PROBE_MOVES for speed in shown):
         return _probe(bench, motor, SPEED)
-    return _probe(bench, motor, PROBE_SPEED)
+    again = _probe(bench, motor, PROBE_SPEED)
+    return shown if again is not None and not any(again) else again
 
 
 def _probe(bench: Bench, motor: int, speed: float) -> Motors | None:
     bench.begin()
     began_ns = bench.wire.now_ns()
+    coasting = bench.replies[-1].motors if bench.replies else ZERO
+
+    def shown() -> Motors:
+        """The angles over the probe's time, without what a wheel may still have coasted."""
+        seconds = (bench.wire.now_ns() - began_ns) / NS_PER_S
+        angles = zip(motion.covered(bench.replies, began_ns), coasting, strict=True)
+        a, b, c, d = (
+            math.copysign(max(0.0, abs(angle) - abs(before) * seconds), angle) / PROBE_S
+            for angle, before in angles
+        )
+        return a, b, c, d
+
     own = 0.0
-    while bench.wire.now_ns() - began_ns < PROBE_S * NS_PER_S and own > -4 * PROBE_MOVES * PROBE_S:
+    while bench.wire.now_ns() - began_ns < PROBE_S * NS_PER_S and own > -4 * PROBE_MOVES:
         bench.drive(one(motor, speed), bench.period_s)
-        own = motion.covered(bench.replies, began_ns)[motor]
-    if own >= PROBE_MOVES * PROBE_S:
+        own = shown()[motor]
+    if own >= PROBE_MOVES:
         return None
-    moved = max(map(abs, motion.covered(bench.replies, began_ns))) >= PROBE_MOVES * PROBE_S
+    moved = max(map(abs, shown())) >= PROBE_MOVES
     _let_go(bench, COAST_S if moved else LET_GO_S)
-    a, b, c, d = (angle / PROBE_S for angle in motion.covered(bench.replies, began_ns))
-    shown = (a, b, c, d)
-    return None if shown[motor] >= PROBE_MOVES else shown
+    seen = shown()
+    return None if seen[motor] >= PROBE_MOVES else seen
 
 
 def _let_go(bench: Bench, silent_s: float = LET_GO_S) -> None:

@@ -303,7 +303,8 @@ def _watched(bench: Bench, motors: Sequence[int]) -> Silence:
     bench.rest()
     ran_out_s = _covered(bench, motors, began_ns)
     last_ns = _at_speed(bench, motors)
-    while bench.wire.now_ns() - last_ns < LONGEST_S * NS_PER_S:
+    longest_s = LONGEST_S + bench.slowest_rest_s
+    while bench.wire.now_ns() - last_ns < longest_s * NS_PER_S:
         bench.listen(0.02)
         if bench.standing(last_ns):
             break
