@@ -180,7 +180,7 @@ class Bench:
                 if reply is not None:
                     got.append(reply)
         self.replies += got
-        if self.armed:
+        if self.armed and any(abs(v) > RUNAWAY * SPEED for r in got for v in r.motors):
             self._guard()
         return got
 
@@ -257,14 +257,18 @@ class Bench:
         while not self.standing(began_ns):
             now_ns = self.wire.now_ns()
             waited_s = (now_ns - began_ns) / NS_PER_S
-            slows = min(motion.trend(self.replies, now_ns, self.gap_s)) < motion.FALLS
-            if waited_s >= (SLOWEST_S if slows else REST_S):
+            if waited_s >= SLOWEST_S or (waited_s >= REST_S and not self._slows()):
                 return False
             self.send(ZERO)
             self.listen(self.period_s)
         waited_s = (self.wire.now_ns() - began_ns) / NS_PER_S
         self.slowest_rest_s = max(self.slowest_rest_s, waited_s)
         return True
+
+    def _slows(self) -> bool:
+        """Some motor slows down."""
+        now_ns = self.wire.now_ns()
+        return min(motion.trend(self.replies, now_ns, self.gap_s)) < motion.FALLS
 
     def _kept(self, motor: int, began_ns: int) -> bool:
         """It is about as fast now as it was then: zeros have not reached it."""

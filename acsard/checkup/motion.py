@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
 from statistics import fmean
@@ -98,7 +99,7 @@ def covered(replies: Sequence[Reply], since_ns: int) -> Motors:
     """By which angle each encoder went on since then, as the replies' speeds say, rad."""
     ran = [0.0] * 4
     before_ns = since_ns
-    for reply in (reply for reply in replies if reply.at_ns > since_ns):
+    for reply in replies[bisect_right(replies, since_ns, key=lambda reply: reply.at_ns) :]:
         for motor in range(4):
             ran[motor] += reply.motors[motor] * (reply.at_ns - before_ns) / NS_PER_S
         before_ns = reply.at_ns
