@@ -62,6 +62,7 @@ ORDER = (
     "checkup.findings",
     "checkup.ends",
     "checkup.outside",
+    "checkup.motion",
     "checkup.bench",
     "checkup.dialect",
     "checkup.wheels",

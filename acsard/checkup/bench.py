@@ -2,21 +2,18 @@
 
 Every step of the check speaks through here. Speeds are the motors', not the wheels': which wheel a
 motor turns is what the check has to find out. A motor that runs away, or an MCU that falls silent
-while one turns, ends the check at once, zeros first.
+while one turns, ends the check at once: zeros, then silence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from statistics import median
 from typing import Literal
 
-from msgspec import Struct
-
-from acsard.checkup import ends
+from acsard.checkup import ends, motion
 from acsard.checkup.findings import WireLostError
+from acsard.checkup.motion import Reply
 from acsard.checkup.outside import Wire
-from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, Reading, seal, unseal
+from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.mcu.frames import Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
 from acsard.mcu.wire import line_bytes, wire_ns
@@ -29,14 +26,17 @@ SPEED = 3.0
 RUNAWAY = 2.0
 """A motor faster than this many times `SPEED` ends the check."""
 
-RUNAWAY_S = 0.1
-"""Speeds are taken over so long: one count of a coarse encoder is no runaway."""
-
 STANDING = 0.1 * SPEED
 """rad/s; slower than this is standing."""
 
 REST_S = 2.0
-"""How long a lifted wheel may take to come to rest."""
+"""How long a lifted wheel may take to come to rest, unless it is seen to slow down."""
+
+SLOWEST_S = 6.0
+"""The longest wait for wheels that slow down: a heavy one, or a hub motor that coasts."""
+
+KEPT = 0.8
+"""A wheel still this share as fast after the wait as at its start has not been stopped."""
 
 SILENCE_S = 0.3
 """How long the MCU may not answer while a motor turns, besides its own pace."""
@@ -53,17 +53,8 @@ FAREWELL = 5
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 
-class Reply(Struct, frozen=True):
-    """A good line of the MCU, complete at `at_ns`."""
-
-    at_ns: int
-    motors: Motors
-    line: bytes
-    reading: Reading | None = None
-
-
 class Bench:
-    """One wire; enter it to begin, leaving sends zeros, whatever happened."""
+    """One wire; enter it to begin, leaving sends zeros and falls silent, whatever happened."""
 
     def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
@@ -87,6 +78,10 @@ class Bench:
         self.sent_lines = 0
         self.longest_pause_s = 0.0
         """Between two lines of ours while driving: too long, and the watchdog strikes."""
+        self.slowest_rest_s = 0.0
+        """The longest that the motors took to come to rest after zeros."""
+        self._fled = False
+        """Zeros do not stop a motor, or make it run: silence, and the MCU's watchdog, may."""
         self._commanded = ZERO
         self._excused_ns = 0
         """Up to then nobody was driving, and the MCU may have been silent."""
@@ -118,10 +113,19 @@ class Bench:
             self.wire.close()
 
     def _farewell(self) -> None:
+        """Zeros, then silence.
+
+        Where zeros make a motor run away (its encoder is reversed, and the firmware regulates it
+        to zero), each further one would feed the watchdog that can cut it.
+        """
+        self.armed = False
         try:
             for _ in range(FAREWELL):
+                if self._fled:
+                    break
                 self.zeros()
-                self.wire.listen(self.wire.now_ns() + int(2 * self.period_s * NS_PER_S))
+                self._listen(2 * self.period_s)
+                self._fled = self._fastest() is not None
         except WireLostError:
             pass  # nothing reaches the motors any more; the MCU's own watchdog has to
 
@@ -176,7 +180,7 @@ class Bench:
                 if reply is not None:
                     got.append(reply)
         self.replies += got
-        if self.armed:
+        if self.armed and any(abs(v) > RUNAWAY * SPEED for r in got for v in r.motors):
             self._guard()
         return got
 
@@ -217,16 +221,6 @@ class Bench:
         self._excused_ns = self.sent_ns = self.wire.now_ns()
         self.longest_pause_s = 0.0
 
-    def until(self, done: Callable[[], bool], seconds: float) -> bool:
-        """Zeros in the form in force until `done`; False when it is not in so many seconds."""
-        end_ns = self.wire.now_ns() + int(seconds * NS_PER_S)
-        while not done():
-            if self.wire.now_ns() >= end_ns:
-                return False
-            self.send(ZERO)
-            self.listen(self.period_s)
-        return True
-
     # standing
 
     def standing(self, since_ns: int) -> bool:
@@ -237,23 +231,50 @@ class Bench:
     def rest(self) -> Literal["rest", "comma"]:
         """Stop, and wait until everything stands.
 
-        "comma" when it takes zeros with the other last comma to stop the last motor; ends the
-        check when nothing does.
+        "comma" when the last motor alone keeps its speed until zeros with the other last comma
+        stop it; ends the check when nothing does.
         """
         began_ns = self.wire.now_ns()
-        if self.until(lambda: self.standing(began_ns), REST_S):
+        if self._settles():
             return "rest"
         turning = self.turning()
+        latched = turning == [3] and self._kept(3, began_ns)
         self.comma = not self.comma
-        began_ns = self.wire.now_ns()
-        if self.until(lambda: self.standing(began_ns), REST_S):
-            if turning == [3]:
-                return "comma"
-            self.comma = not self.comma
+        settled = self._settles()
+        if settled and latched:
+            return "comma"
+        self.comma = not self.comma
+        if settled:
             return "rest"
-        self.comma = not self.comma
-        self.zeros()
-        raise ends.stays_turning(self.mcu, turning, 2 * REST_S)
+        self._let_go()
+        waited_s = (self.wire.now_ns() - began_ns) / NS_PER_S
+        raise ends.stays_turning(self.mcu, turning, round(waited_s, 1))
+
+    def _settles(self) -> bool:
+        """Zeros in the form in force until everything stands; False when it does not, be it that
+        no motor slows down any more."""
+        began_ns = self.wire.now_ns()
+        while not self.standing(began_ns):
+            now_ns = self.wire.now_ns()
+            waited_s = (now_ns - began_ns) / NS_PER_S
+            if waited_s >= SLOWEST_S or (waited_s >= REST_S and not self._slows()):
+                return False
+            self.send(ZERO)
+            self.listen(self.period_s)
+        waited_s = (self.wire.now_ns() - began_ns) / NS_PER_S
+        self.slowest_rest_s = max(self.slowest_rest_s, waited_s)
+        return True
+
+    def _slows(self) -> bool:
+        """Some motor slows down."""
+        now_ns = self.wire.now_ns()
+        return min(motion.trend(self.replies, now_ns, self.gap_s)) < motion.FALLS
+
+    def _kept(self, motor: int, began_ns: int) -> bool:
+        """It is about as fast now as it was then: zeros have not reached it."""
+        span, now_ns = 0.4 * REST_S * NS_PER_S, self.wire.now_ns()
+        first = motion.between(self.replies, began_ns, began_ns + span)[motor]
+        return motion.between(self.replies, now_ns - span, now_ns)[motor] >= KEPT * first
 
     def turning(self) -> list[int]:
         """The motors that turn by the last reply."""
@@ -264,15 +285,24 @@ class Bench:
     # safety
 
     def _guard(self) -> None:
-        recent = [r for r in self.replies[-20:] if r.at_ns > self._last_ns - RUNAWAY_S * NS_PER_S]
-        for motor in range(4):
-            # The median: one damaged line is no runaway.
-            speed = median([reply.motors[motor] for reply in recent] or [0.0])
-            if abs(speed) <= RUNAWAY * SPEED:
-                continue
-            asked = self._commanded[motor]
-            self.zeros()
-            raise ends.runaway(self.mcu, motor, asked, speed, RUNAWAY * SPEED)
+        found = self._fastest()
+        if found is None:
+            return
+        motor, speed = found
+        asked = self._commanded[motor]
+        self._let_go()
+        raise ends.runaway(self.mcu, motor, asked, speed, RUNAWAY * SPEED)
+
+    def _let_go(self) -> None:
+        """Zeros once, and none after them."""
+        self._fled = True
+        self.zeros()
+
+    def _fastest(self) -> tuple[int, float] | None:
+        """A motor that runs away, and its speed."""
+        named = self.identity.get("counts", "")
+        per_turn = int(named) if named.isdigit() else self.mcu.encoder_counts
+        return motion.fastest(self.replies, RUNAWAY * SPEED, per_turn)
 
     @property
     def _last_ns(self) -> int:

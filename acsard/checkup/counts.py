@@ -8,9 +8,9 @@ from itertools import pairwise
 
 from msgspec import Struct
 
-from acsard.checkup.bench import Bench, Reply
+from acsard.checkup.bench import Bench
 from acsard.checkup.findings import Finding
-from acsard.mcu.check import Reading
+from acsard.checkup.motion import Reply, difference
 from acsard.mcu.wire import FIELD
 
 LEAST_ANGLE = 2.0
@@ -41,13 +41,6 @@ def legs(replies: Sequence[Reply]) -> Iterator[Leg]:
                 (after.reading.mcu_ms - before.reading.mcu_ms) % FIELD,
                 after.motors,
             )
-
-
-def difference(before: Reading, after: Reading) -> tuple[int, ...]:
-    """By how much each encoder went on, the short way round."""
-    half = FIELD // 2
-    pairs = zip(before.counts, after.counts, strict=True)
-    return tuple((b - a + half) % FIELD - half for a, b in pairs)
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:

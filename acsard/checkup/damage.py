@@ -46,6 +46,8 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broke
         Broken("a bad digit", line(a, "bp0x.00", c, d)),
         Broken("neither p nor n", line(a, b, "cq" + c[2:], d)),
         Broken("cut short", line(a, b, c, d)[:20] + b"\r\n"),
+        Broken("cut inside the last number", line(a, b, c, d)[:30] + b"\r\n"),
+        Broken("cut inside the last number", line(a, b, c, d)[:27] + b"\r\n"),
         Broken("over-long", line(*(a, b, c, d) * 5), whole=True),
         Broken("garbage before it", b"\xff~" + line(a, b, c, d), whole=True),
     ]
@@ -62,17 +64,19 @@ def finding(bench: Bench, motors: Sequence[int]) -> Finding:
     name = "damaged lines"
     if not motors:
         return Finding(name, "SKIPPED", "", "no motor turns as told, so none can show it")
-    took, whole = [], True
+    took: list[str] = []
+    whole = True
     lines = broken_lines(bench.comma, bench.sealed, motors)
     for broken in lines:
         bench.rest()
         if _moves(bench, broken.line):
-            took.append(broken.what)
+            took += [broken.what] * (broken.what not in took)
             whole = whole and broken.whole
     bench.rest()
     if not took:
-        return Finding(name, "PASS", f"{len(lines)} kinds, none moved")
-    figure = f"{len(took)} of {len(lines)} kinds moved"
+        return Finding(name, "PASS", f"{len(lines)} lines, none moved")
+    kinds = len({broken.what for broken in lines})
+    figure = f"{len(took)} of {kinds} kinds moved"
     text = f"motors turned on lines that are none: {', '.join(took)}"
     if whole:
         mend = "the firmware should take a line whole or not at all"

@@ -11,8 +11,9 @@ from itertools import pairwise
 from statistics import fmean, median
 from typing import get_args
 
-from acsard.checkup.bench import PERIOD_S, ZERO, Bench, Reply
+from acsard.checkup.bench import PERIOD_S, ZERO, Bench
 from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup.motion import Reply
 from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
 from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes

@@ -15,8 +15,9 @@ from acsard.settings import Config
 LIFTED = "lifted"
 
 CONFIRM = (
-    "The wheels will turn one by one, then together, at 3 rad/s at the most. Lift the robot so "
-    "that none touches anything, keep a hand on the power switch, then type "
+    "The wheels will turn one by one, then together. They are told 3 rad/s at the most, but a "
+    "wheel whose encoder is dead or reversed can reach full speed, for a second or so. Lift the "
+    "robot so that none touches anything, keep a hand on the power switch, then type "
     f'"{LIFTED}":'
 )
 
@@ -33,7 +34,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     """Check one microcontroller and `tell` each finding as it is made.
 
     Nothing but zeros goes out before the operator has confirmed that the wheels are lifted.
-    Whatever happens, the last lines are zeros in both forms and the wire is closed.
+    Whatever happens, the last lines are zeros in both forms, then silence: the wire is closed.
     """
     told: list[str] = []
 

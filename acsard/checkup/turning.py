@@ -5,15 +5,21 @@ What it means is `wheels.py`'s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 from typing import Literal
 
-from acsard.checkup.bench import SPEED, ZERO, Bench, Reply
+from msgspec import structs
+
+from acsard.checkup import motion
+from acsard.checkup.bench import SPEED, STANDING, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, motor_name
+from acsard.checkup.motion import Reply
 from acsard.checkup.outside import Operator
-from acsard.checkup.wheels import TOLERANCE, Channel, moving
+from acsard.checkup.wheels import PROBE_MOVES, TOLERANCE, Channel, moving
 from acsard.mcu.frames import Motors
+from acsard.values import NS_PER_S
 
 RAMP_S = 0.2
 HOLD_S = 1.4
@@ -22,10 +28,23 @@ HOLD_S = 1.4
 DEAD_S = 0.6
 """A motor that shows nothing by then is not held longer: its control loop may be winding up."""
 
+LONGEST_HOLD_S = 4.5
+"""A motor that still speeds up after `HOLD_S` is held up to this long."""
+
+PROBE_S = 0.2
+PROBE_SPEED = 0.5 * SPEED
+"""The first a motor is told: so short that one without a working encoder, which the firmware may
+drive up to full speed, does not get far."""
+
+LET_GO_S = 0.7
+"""Silence after a probe that its encoder did not follow: the firmware may regulate zeros into a
+runaway, and its watchdog cuts the motor. Longer than any watchdog that is right."""
+
+COAST_S = 2.5
+"""The same for one that was seen to turn: it must stand before the next zeros are regulated."""
+
 CHUNKS = 8
 """Over so many tenths of a second the speed of an encoder is taken that is not steady before."""
-
-UNSEEN_S = 0.5
 
 STALL_S = 0.15
 """A pause of ours this long makes what was measured worthless: it is measured again."""
@@ -59,7 +78,7 @@ def run_up(bench: Bench, motors: Motors) -> Motors:
     chunk_s = max(0.1, 2.5 * bench.gap_s)
     steady, means = 0, ZERO
     chunks: list[Sequence[Reply]] = []
-    while len(chunks) * chunk_s < HOLD_S and steady < 2:
+    while steady < 2 and (len(chunks) * chunk_s < HOLD_S or _speeds_up(bench, motors, chunks)):
         chunks.append(bench.drive(motors, chunk_s))
         # A coarse encoder needs more of them, a quick one is seen to be steady before.
         means = mean([reply for chunk in chunks[1:][-CHUNKS:] or chunks for reply in chunk])
@@ -67,9 +86,17 @@ def run_up(bench: Bench, motors: Motors) -> Motors:
         near = [m for m in moves if abs(abs(means[m]) / SPEED - 1) < 0.4 * TOLERANCE]
         asked = sum(1 for speed in motors if speed)
         steady = steady + 1 if len(near) >= asked else 0
-        if len(chunks) * chunk_s >= DEAD_S and not moves:
+        if len(chunks) * chunk_s >= DEAD_S and max(map(abs, means)) < STANDING:
             break
     return means
+
+
+def _speeds_up(bench: Bench, motors: Motors, chunks: Sequence[object]) -> bool:
+    """A motor is not at the speed it was told yet, and getting there."""
+    if len(chunks) * max(0.1, 2.5 * bench.gap_s) >= LONGEST_HOLD_S:
+        return False
+    shares = motion.trend(bench.replies, bench.wire.now_ns(), bench.gap_s)
+    return any(share > 1 / motion.FALLS for share, told in zip(shares, motors, strict=True) if told)
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
@@ -83,7 +110,7 @@ def mean(replies: Sequence[Reply]) -> Motors:
 def channels(bench: Bench, operator: Operator) -> Iterator[tuple[Channel, Finding | None]]:
     """Each motor in turn; with the last one, what is to say of the trailing comma."""
     for motor in range(4):
-        operator.say(f"{motor_name(bench.mcu, motor)} turns, forth and back")
+        operator.say(f"{motor_name(bench.mcu, motor)} turns: a moment first, then forth and back")
         channel, stopped = _both_ways(bench, motor)
         comma = None
         if motor == 3:
@@ -97,29 +124,82 @@ def channels(bench: Bench, operator: Operator) -> Iterator[tuple[Channel, Findin
 
 
 def _both_ways(bench: Bench, motor: int) -> tuple[Channel, Literal["rest", "comma"]]:
+    seen = probe(bench, motor)
+    if seen is not None:
+        return Channel(motor, seen, ZERO, probed=True), "rest"
     forth = turn(bench, motor, SPEED)
-    stopped = _rest(bench, motor, forth)
+    if motor not in moving(forth):
+        _let_go(bench)
+        return Channel(motor, forth, ZERO), "rest"
+    stopped = bench.rest()
     back = turn(bench, motor, -SPEED)
-    stopped = "comma" if "comma" in (_rest(bench, motor, back), stopped) else "rest"
+    if motor not in moving(back):
+        _let_go(bench)
+    stopped = "comma" if "comma" in (bench.rest(), stopped) else "rest"
     return Channel(motor, forth, back), stopped
 
 
-def _rest(bench: Bench, motor: int, seen: Motors) -> Literal["rest", "comma"]:
-    """Come to rest; a motor whose encoder shows nothing is given the time for it unseen."""
-    stopped = bench.rest()
-    if motor not in moving(seen):
-        bench.drive(ZERO, UNSEEN_S)
-    return stopped
+def probe(bench: Bench, motor: int) -> Motors | None:
+    """Turn a motor slowly and shortly; None when its own encoder follows, and it turns on.
+
+    Else what the encoders showed of it, in rad/s. A second try is for coarse encoders: they may
+    need more to show anything, and one count back is nothing yet. It stands by then.
+    """
+    began_ns = bench.wire.now_ns()
+    shown = _probe(bench, motor, PROBE_SPEED)
+    if shown is None:
+        return None
+    seen = [r.motors[motor] for r in bench.replies if r.at_ns > began_ns and r.motors[motor]]
+    if len(seen) >= 3 and max(seen) < 0:
+        return shown  # no need to drive a reversed one away twice
+    if not any(abs(speed) >= PROBE_MOVES for speed in shown):
+        return _probe(bench, motor, SPEED)
+    again = _probe(bench, motor, PROBE_SPEED)
+    return shown if again is not None and not any(again) else again
+
+
+def _probe(bench: Bench, motor: int, speed: float) -> Motors | None:
+    bench.begin()
+    began_ns = bench.wire.now_ns()
+    coasting = bench.replies[-1].motors if bench.replies else ZERO
+
+    def shown() -> Motors:
+        """The angles over the probe's time, without what a wheel may still have coasted."""
+        seconds = (bench.wire.now_ns() - began_ns) / NS_PER_S
+        angles = zip(motion.covered(bench.replies, began_ns), coasting, strict=True)
+        a, b, c, d = (
+            math.copysign(max(0.0, abs(angle) - abs(before) * seconds), angle) / PROBE_S
+            for angle, before in angles
+        )
+        return a, b, c, d
+
+    own = 0.0
+    while bench.wire.now_ns() - began_ns < PROBE_S * NS_PER_S and own > -4 * PROBE_MOVES:
+        bench.drive(one(motor, speed), bench.period_s)
+        own = shown()[motor]
+    if own >= PROBE_MOVES:
+        return None
+    moved = max(map(abs, shown())) >= PROBE_MOVES
+    _let_go(bench, COAST_S if moved else LET_GO_S)
+    seen = shown()
+    return None if seen[motor] >= PROBE_MOVES else seen
+
+
+def _let_go(bench: Bench, silent_s: float = LET_GO_S) -> None:
+    """Zeros once, then silence until the watchdog has cut the motors; they stand afterwards."""
+    bench.zeros()
+    bench.listen(silent_s)
+    bench.rest()
 
 
 def _with_other_comma(bench: Bench, dead: Channel) -> tuple[Channel, Finding]:
     """The last motor does nothing: does it with the comma at the line's end turned round?"""
     bench.comma = not bench.comma
-    forth = turn(bench, dead.motor, SPEED)
-    if not moving(forth):
-        bench.rest()
+    shown = probe(bench, dead.motor)
+    forth = ZERO if shown is not None else turn(bench, dead.motor, SPEED)
+    if dead.motor not in moving(forth):
         bench.comma = not bench.comma
-        _rest(bench, dead.motor, forth)
+        _let_go(bench)
         text = "motor d shows nothing either way: it cannot be told"
         return dead, Finding("trailing comma", "SKIPPED", "", text)
     if bench.comma:
@@ -176,9 +256,9 @@ def _seen(bench: Bench, operator: Operator, channel: Channel) -> Channel:
     if which is None:
         return channel
     if which == "none":
-        return Channel(channel.motor, channel.forth, channel.back, 4)
+        return structs.replace(channel, wheel=4)
     way = operator.ask(
         "which way did it turn first: forward (as when the robot drives ahead) or back?",
         ("forward", "back"),
     )
-    return Channel(channel.motor, channel.forth, channel.back, ANSWERS[which], way != "back")
+    return structs.replace(channel, wheel=ANSWERS[which], forward=way != "back")

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from acsard.checkup import counts
-from acsard.checkup.bench import PERIOD_S, REST_S, SPEED, ZERO, Bench, Reply
+from acsard.checkup.bench import PERIOD_S, SLOWEST_S, SPEED, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, StoppedError
+from acsard.checkup.motion import Reply
 from acsard.checkup.turning import mean, run_up
 from acsard.mcu.frames import Motors
 from acsard.mcu.wire import FIELD
@@ -23,6 +24,17 @@ from acsard.values import NS_PER_S
 CONTRACT_S = 0.3
 LEAST_S, MOST_S = 0.1, 0.5
 """What the MCU contract takes."""
+
+NAME = "watchdog"
+
+BROKEN_S = 0.8
+"""So long come broken lines instead of silence, besides the motors' own run-out."""
+
+FED = 0.75
+"""Of the full speed, over all of that time: a watchdog that is right leaves less."""
+
+COARSE_S = 0.05
+"""Where two counts take a motor longer, counts tell less than asking does."""
 
 LONGEST_S = 2.5
 """The longest silence; an MCU that drives on for so long has no watchdog."""
@@ -51,9 +63,8 @@ class Silence(Struct, frozen=True):
 
 def finding(bench: Bench, motors: Sequence[int]) -> Finding:
     """Measure it with these motors, which turn as told; they stand again afterwards."""
-    name = "watchdog"
     if not motors:
-        return Finding(name, "SKIPPED", "", "no motor turns as told, so none can show it")
+        return Finding(NAME, "SKIPPED", "", "no motor turns as told, so none can show it")
     measure = _asked
     if bench.own_clock:
         measure = _watched
@@ -62,29 +73,79 @@ def finding(bench: Bench, motors: Sequence[int]) -> Finding:
     found = measure(bench, motors)
     if found.most == UNKNOWN:
         return Finding(
-            name,
+            NAME,
             "FAIL",
             f"none within {found.least:.1f} s",
             "the motors run on when the host falls silent: a pulled cable or a hung computer "
             "leaves the robot driving",
             "the firmware must stop the motors 300 ms after the last valid line",
         )
+    judged = _judged(found)
+    if judged.verdict != "FAIL" and _fed(bench, motors, found.most):
+        return Finding(
+            NAME,
+            "FAIL",
+            f"{judged.figure}, but fed by broken lines",
+            "it stops the motors when the line is silent, but not when it brings only lines that "
+            "are none: a robot on a half-broken cable drives on",
+            "only a whole valid line may feed the firmware's watchdog",
+        )
+    return judged
+
+
+def _judged(found: Silence) -> Finding:
     middle, half = (found.least + found.most) / 2, (found.most - found.least) / 2
     figure = f"{middle * 1000:.0f} ms"
     if half >= 0.005:
         figure += f" ± {half * 1000:.0f}"
+    mend = f"set the firmware's watchdog to {CONTRACT_S * 1000:.0f} ms"
     if found.least > MOST_S:
-        return Finding(
-            name,
-            "FAIL",
-            figure,
-            f"the robot drives on for {middle:.1f} s after a pulled cable: at 1 m/s as many metres",
-            f"set the firmware's watchdog to {CONTRACT_S * 1000:.0f} ms",
+        text = (
+            f"the robot drives on for {middle:.1f} s after a pulled cable: at 1 m/s as many metres"
         )
+        return Finding(NAME, "FAIL", figure, text, mend)
     if found.most < LEAST_S:
         text = "so short that a host that is late once stops the robot"
-        return Finding(name, "WARN", figure, text, "set the firmware's watchdog to 300 ms")
-    return Finding(name, "PASS", figure, f"contract {CONTRACT_S * 1000:.0f} ms")
+        return Finding(NAME, "WARN", figure, text, mend)
+    if found.most > MOST_S:
+        text = (
+            f"it stops the motors, but whether within {MOST_S * 1000:.0f} ms cannot be told this "
+            "coarsely"
+        )
+        return Finding(NAME, "WARN", figure, text, "look it up in the firmware: 300 ms is right")
+    return Finding(NAME, "PASS", figure, f"contract {CONTRACT_S * 1000:.0f} ms")
+
+
+def _fed(bench: Bench, motors: Sequence[int], stopped_s: float) -> bool:
+    """Whether broken lines instead of silence, which stops them in so long, keep them running."""
+    length_s = max(BROKEN_S, 2 * stopped_s) + bench.slowest_rest_s
+    _at_speed(bench, motors)
+    end_ns = bench.wire.now_ns() + int(length_s * NS_PER_S)
+    number = 0
+    while bench.wire.now_ns() < end_ns:
+        bench.wire.send(_broken(bench, motors, number))
+        bench.listen(bench.period_s)
+        number += 1
+    since_ns = bench.wire.now_ns() - max(0.2, 2.5 * bench.gap_s) * NS_PER_S
+    seen = [reply for reply in bench.replies if reply.at_ns > since_ns]
+    if len(seen) >= 2:  # it speaks all the same
+        shown = mean(seen)
+        turned = max(abs(shown[motor]) for motor in motors) > SPEED / 2
+    else:
+        first, second = _tell(bench, motors)
+        turned = first >= FED or second >= 0.5
+    bench.rest()
+    return turned
+
+
+def _broken(bench: Bench, motors: Sequence[int], number: int) -> bytes:
+    """A command with a fault, another each time; no way to read it tells more than `SPEED`."""
+    good = bench.line(_command(motors))
+    if number % 3 == 0:
+        return good[:20] + b"\r\n"
+    if number % 3 == 1:
+        return good.replace(b"b", b"x", 1)
+    return good.replace(b"p", b"q", 1)
 
 
 def _command(motors: Sequence[int]) -> Motors:
@@ -136,7 +197,7 @@ def _asked(bench: Bench, motors: Sequence[int]) -> Silence:
     """It answers when spoken to: after a silence two quick lines tell what it did meanwhile."""
     stop = _stop(bench, motors)
     least, most = 0.0, UNKNOWN
-    for length_s in (FIRST_S + stop.slow_s, LONGEST_S):
+    for length_s in (FIRST_S + stop.slow_s, max(LONGEST_S, 1.0 + FIRST_S + stop.slow_s)):
         answer = _ask(bench, motors, length_s)
         if not answer.turned:
             most = answer.silent_s
@@ -147,7 +208,8 @@ def _asked(bench: Bench, motors: Sequence[int]) -> Silence:
     if answer.first >= STOPPED:
         # The mean over the silence: how far it ran, less what it runs out after any stop.
         ran_s = answer.first * answer.silent_s - stop.covered_s
-        return Silence(max(0.0, ran_s - QUICK_S), max(0.0, ran_s + QUICK_S))
+        about_s = QUICK_S + 2 * stop.grain_s
+        return Silence(max(0.0, ran_s - about_s), max(0.0, ran_s + about_s))
     for _ in range(8):
         if most - least <= max(FINE_S, 0.1 * most):
             break
@@ -157,7 +219,8 @@ def _asked(bench: Bench, motors: Sequence[int]) -> Silence:
         else:
             most = min(most, answer.silent_s)
     # The reply that tells is of a moment after the silence, as the ordinary stop's is.
-    least, most = least - stop.slow_s + QUICK_S, most - stop.slow_s + 2 * QUICK_S
+    least -= stop.slow_s - QUICK_S + 2 * stop.grain_s
+    most -= stop.slow_s - 2 * QUICK_S - 2 * stop.grain_s
     return Silence(max(0.0, least), max(0.0, most))
 
 
@@ -167,28 +230,51 @@ class Stop(Struct, frozen=True):
 
     slow_s: float
     covered_s: float
+    grain_s: float
+    """How long a motor takes for what its speeds jump by: it cannot be told finer."""
 
 
 def _stop(bench: Bench, motors: Sequence[int]) -> Stop:
+    since_ns = bench.wire.now_ns()
     _at_speed(bench, motors)
+    grain_s = _grain_s(_later_half(bench, since_ns), motors)
     bench.send(ZERO)
     began_ns, slow_ns = bench.sent_ns, 0
-    while not slow_ns and bench.wire.now_ns() - began_ns < REST_S * NS_PER_S:
+    while not slow_ns and bench.wire.now_ns() - began_ns < SLOWEST_S * NS_PER_S:
         for reply in bench.listen(_quick_s(bench)):
             if not slow_ns and _share(reply, motors) < STOPPED:
                 slow_ns = reply.at_ns
         bench.send(ZERO)
     bench.rest()
-    slow_s = (slow_ns - began_ns) / NS_PER_S if slow_ns else REST_S
-    return Stop(slow_s, _covered(bench, motors, began_ns))
+    slow_s = (slow_ns - began_ns) / NS_PER_S if slow_ns else SLOWEST_S
+    return Stop(slow_s, _covered(bench, motors, began_ns), grain_s)
+
+
+def _grain_s(replies: Sequence[Reply], motors: Sequence[int]) -> float:
+    """Whole counts make the speeds of a steady motor jump, by one count in the time of a reply."""
+    if len(replies) < 5:
+        return 0.0
+    between_s = (replies[-1].at_ns - replies[0].at_ns) / NS_PER_S / (len(replies) - 1)
+    jumps = []
+    for motor in motors:
+        speeds = sorted(reply.motors[motor] for reply in replies)
+        jumps.append(speeds[-2] - speeds[1])  # one that is damaged is no jump
+    return max(jumps) * between_s / SPEED
 
 
 def _ask(bench: Bench, motors: Sequence[int], length_s: float) -> Answer:
     last_ns = _at_speed(bench, motors)
     bench.listen(length_s - (bench.wire.now_ns() - last_ns) / NS_PER_S)
+    silent_s = (bench.wire.now_ns() - last_ns) / NS_PER_S
+    first, second = _tell(bench, motors)
+    bench.rest()
+    return Answer(silent_s, first, second)
+
+
+def _tell(bench: Bench, motors: Sequence[int]) -> tuple[float, float]:
+    """What two quick lines tell of a time without any, in shares of the full speed."""
     before = len(bench.replies)
     bench.send(ZERO)
-    silent_s = (bench.sent_ns - last_ns) / NS_PER_S
     bench.listen(_quick_s(bench))
     for _ in range(10):
         bench.send(ZERO)
@@ -196,9 +282,8 @@ def _ask(bench: Bench, motors: Sequence[int], length_s: float) -> Answer:
         if len(bench.replies) >= before + 2:
             break
     shares = [_share(reply, motors) for reply in bench.replies[before : before + 2]]
-    bench.rest()
     first, second = (*shares, 0.0, 0.0)[:2]
-    return Answer(silent_s, first, second)
+    return first, second
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
@@ -218,7 +303,8 @@ def _watched(bench: Bench, motors: Sequence[int]) -> Silence:
     bench.rest()
     ran_out_s = _covered(bench, motors, began_ns)
     last_ns = _at_speed(bench, motors)
-    while bench.wire.now_ns() - last_ns < LONGEST_S * NS_PER_S:
+    longest_s = LONGEST_S + bench.slowest_rest_s
+    while bench.wire.now_ns() - last_ns < longest_s * NS_PER_S:
         bench.listen(0.02)
         if bench.standing(last_ns):
             break
@@ -247,9 +333,11 @@ def _covered(bench: Bench, motors: Sequence[int], since_ns: int) -> float:
 
 
 def _fits(bench: Bench, motors: Sequence[int]) -> bool:
-    """The longest silence's counts do not wrap."""
+    """The longest silence's counts do not wrap, and are fine enough."""
     per_turn = counts.per_turn(bench.replies, motors)
-    return per_turn is not None and per_turn * 2 * SPEED * LONGEST_S / math.tau < FIELD / 2
+    if per_turn is None or 2 * _count_s(bench, motors) > COARSE_S:
+        return False
+    return per_turn * 2 * SPEED * LONGEST_S / math.tau < FIELD / 2
 
 
 def _counted(bench: Bench, motors: Sequence[int]) -> Silence:

@@ -19,6 +19,9 @@ from acsard.values import WHEELS
 MOVES = 0.25 * SPEED
 """rad/s; an encoder that shows this much moves."""
 
+PROBE_MOVES = 0.075
+"""rad/s over a short probe: a heavy wheel has hardly begun to turn by then."""
+
 TOLERANCE = 0.25
 """By which share the encoder's speed may differ from the command."""
 
@@ -35,10 +38,22 @@ class Channel(Struct, frozen=True):
     """Which wheel a person saw turn, in `WHEELS` order; 4 for none, None when nobody looked."""
     forward: bool = True
     """It turned forward first, as seen by a person."""
+    probed: bool = False
+    """Its own encoder did not follow a short probe: it was not turned further, and not back."""
+
+    @property
+    def moved(self) -> list[int]:
+        """The encoders that moved."""
+        if not self.probed:
+            return moving(self.forth) or moving(self.back)
+        least = max(PROBE_MOVES, max(map(abs, self.forth)) / 4)
+        return [motor for motor in range(4) if abs(self.forth[motor]) >= least]
 
     @property
     def kind(self) -> Kind:
         """What the encoders say."""
+        if self.probed:
+            return self._kind_probed()
         forth, back = moving(self.forth), moving(self.back)
         if not forth and not back:
             return "dead"
@@ -53,6 +68,14 @@ class Channel(Struct, frozen=True):
         sizes = (self.forth[self.motor] / SPEED, -self.back[self.motor] / SPEED)
         return "right" if all(abs(s - 1) <= TOLERANCE for s in sizes) else "size"
 
+    def _kind_probed(self) -> Kind:
+        moved = self.moved
+        if len(moved) > 1:
+            return "several"
+        if not moved:
+            return "dead"
+        return "reversed" if moved == [self.motor] else "other"
+
 
 def moving(speeds: Motors) -> list[int]:
     """The encoders that move."""
@@ -64,10 +87,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, kind = channel.motor, channel.kind
     forth, back = channel.forth[motor], channel.back[motor]
     text, mend = _explain(mcu, channel)
-    figure = f"{forth:+.2f} {back:+.2f} rad/s"
+    figure = f"{forth:+.2f} rad/s, probed" if channel.probed else f"{forth:+.2f} {back:+.2f} rad/s"
     if kind in ("other", "several"):
-        moved = moving(channel.forth) or moving(channel.back)
-        figure = ", ".join(f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in moved)
+        shown = [f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in channel.moved]
+        figure = ", ".join(shown)
     verdict: Literal["PASS", "FAIL"] = "PASS" if kind == "right" else "FAIL"
     return Finding(motor_name(mcu, motor), verdict, figure, text, mend)
 
@@ -133,7 +156,7 @@ def _explain_reversed(mcu: McuConfig, channel: Channel) -> tuple[str, str]:
 
 
 def _explain_other(mcu: McuConfig, channel: Channel) -> tuple[str, str]:
-    motor, other = channel.motor, moving(channel.forth)[0]
+    motor, other = channel.motor, channel.moved[0]
     here, there = LETTERS[motor], LETTERS[other]
     text = f"motor {here} moves encoder {there}: two motors or two encoders are swapped"
     if channel.forth[other] < 0:

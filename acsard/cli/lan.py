@@ -64,20 +64,25 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
-        action.add_argument(
-            "--directory", default=DIRECTORY, metavar="DIR", help=f"default {DIRECTORY}"
-        )
-        action.add_argument(
-            "--days", type=_days, default=730, metavar="N", help="validity, default 730 days"
-        )
-        action.add_argument(
-            "--address",
-            action="append",
-            type=_address,
-            default=[],
-            metavar="NAME",
-            help="a name or IP address it is reached by, beside its own name; repeat it",
-        )
+        _add_common(action)
+
+
+def _add_common(action: argparse.ArgumentParser) -> None:
+    """Where the certificates are, how long they hold and for which addresses."""
+    action.add_argument(
+        "--directory", default=DIRECTORY, metavar="DIR", help=f"default {DIRECTORY}"
+    )
+    action.add_argument(
+        "--days", type=_days, default=730, metavar="N", help="validity, default 730 days"
+    )
+    action.add_argument(
+        "--address",
+        action="append",
+        type=_address,
+        default=[],
+        metavar="NAME",
+        help="a name or IP address it is reached by, beside its own name; repeat it",
+    )
 
 
 def main_init(args: argparse.Namespace) -> int:

@@ -35,8 +35,9 @@ Find out on your own robot, wheels lifted, what its microcontroller speaks and w
 what the robot's safety rests on: baud rate, dialect and trailing comma, reply rate and round trip,
 the checked link, each motor and encoder alone, the watchdog, damaged lines. It opens the port
 itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one, then
-together, at 3 rad/s at the most, after you have typed that the wheels are lifted; the last lines
-out are zeros, whatever happens. Exit 0 when nothing fails, 1 when something does.
+together, after you have typed that the wheels are lifted: told 3 rad/s at the most, but a wheel
+whose encoder is dead or reversed can reach full speed. The last lines out are zeros, whatever
+happens, then silence. Exit 0 when nothing fails, 1 when something does.
 """
 
 
@@ -70,8 +71,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     check.add_argument(
         "--write",
         action="store_true",
-        help="also write the lines into the configuration file, comments kept (needs the extra: "
-        "pip install 'acsard[mcu]')",
+        help="also write the lines into the configuration file, and --port, comments kept (needs "
+        "the extra: pip install 'acsard[mcu]')",
     )
     check.set_defaults(main=main)
 
@@ -89,8 +90,8 @@ def main(args: argparse.Namespace) -> int:
     if args.write:
         _writable(args.config)
     port = config.mcu.port
-    person: Person | Nobody = Nobody(args.json) if args.yes else Person()
     _may(args, port)
+    person: Person | Nobody = Nobody(args.json) if args.yes else Person()
     findings: list[Finding] = []
 
     def tell(finding: Finding) -> None:
@@ -101,24 +102,36 @@ def main(args: argparse.Namespace) -> int:
     if not args.json:
         simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""
         print(f"port {port}{simulated}, configuration {where}", flush=True)
-    with ended_by_signals():
-        procedure.run(_wire(config), person, config, tell)
-    changes = advice.changes(findings, configured)
-    failed = any(finding.verdict == "FAIL" for finding in findings)
     trouble: ExitError | None = None
-    if args.write and changes:
+    try:
+        with ended_by_signals():
+            procedure.run(_wire(config), person, config, tell)
+    except ExitError as error:
+        if not args.json:
+            raise
+        trouble = error  # programs get their object all the same
+    changes = advice.changes(findings, configured)
+    if args.write and args.port and _answered(findings) and configured.mcu.port != args.port:
+        changes = {"mcu.port": args.port, **changes}
+    failed = any(finding.verdict == "FAIL" for finding in findings)
+    if args.write and changes and not trouble:
         try:
             change(Path(where), changes)
         except ExitError as error:  # a minute's findings are told first
             trouble = error
     written = bool(args.write and changes and not trouble)
     if args.json:
-        _print_json(port, findings, changes, where if written else None)
+        _print_json(port, findings, changes, where if written else None, trouble)
     else:
         _sum_up(findings, advice.lines(changes), where, written)
     if trouble is not None:
         raise trouble
     return int(Exit.FAILURE if failed else Exit.OK)
+
+
+def _answered(findings: Sequence[Finding]) -> bool:
+    """A board is at the port: its rate was found."""
+    return any(finding.name == "baud rate" and finding.keys for finding in findings)
 
 
 def _wire(config: Config) -> Wire:
@@ -138,6 +151,13 @@ def _wire(config: Config) -> Wire:
 
 def _may(args: argparse.Namespace, port: str) -> None:
     """Raises unless somebody answers for the wheels: a person here, or nothing real can move."""
+    if port == SIMULATOR and args.port != SIMULATOR:
+        raise ExitError(
+            Exit.USAGE,
+            "no port is configured, so there is no board to check (mcu.port is the simulator, "
+            '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
+            "DEVICE`; `--port sim` checks the built-in simulator",
+        )
     if not args.yes:
         if not sys.stdin.isatty():
             raise ExitError(
@@ -262,7 +282,11 @@ def _sum_up(findings: Sequence[Finding], lines: Sequence[str], where: str, writt
 
 
 def _print_json(
-    port: str, findings: Sequence[Finding], changes: dict[str, object], written: str | None
+    port: str,
+    findings: Sequence[Finding],
+    changes: dict[str, object],
+    written: str | None,
+    trouble: ExitError | None,
 ) -> None:
     import msgspec
 
@@ -270,10 +294,11 @@ def _print_json(
 
     found = {
         "port": port,
-        "passed": not any(finding.verdict == "FAIL" for finding in findings),
+        "passed": _answered(findings) and not any(f.verdict == "FAIL" for f in findings),
         "findings": findings,
         "changes": changes,
         "toml": "\n".join(advice.lines(changes)),
         "written": written,
+        "error": str(trouble) if trouble else None,
     }
     print(msgspec.json.encode(found).decode())

@@ -148,6 +148,7 @@ class FakeMcu(Faults):
             return
         command = self.understand(line)
         if command is None:
+            self._fed_ns = now_ns if self.any_feeds else self._fed_ns
             return
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]

@@ -33,6 +33,8 @@ class Faults:
         self.unprompted_ns = 0
         self.watchdog = True
         self.watchdog_ns = WATCHDOG_NS
+        self.any_feeds = False
+        """Lines that are none feed the watchdog too."""
         self.baud_rate = 115200
         self.reply_gap_ns = 0
         self.drivers = [0, 1, 2, 3]
@@ -173,6 +175,10 @@ class Faults:
         """Stops the motors only after so long a silence."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
+    def fed_by_anything(self) -> Fault:
+        """Broken lines, which it does not obey, keep the motors running."""
+        return self._with(any_feeds=True)
+
     def lost_replies(self, every: int = 5) -> Fault:
         """Every so many-th reply is lost on the way."""
         return self._with(lose_reply=every)
@@ -189,7 +195,7 @@ class Faults:
 FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
-    "late_watchdog", "lost_replies", "lost_commands", "bit_errors", "unprompted",
+    "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
 )  # fmt: skip
 """The faults that need no argument, by method name: what `acsard sim --fault` offers."""
 

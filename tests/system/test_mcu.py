@@ -46,7 +46,7 @@ def test_a_port_that_is_not_there_ends_with_66(tmp_path: Path) -> None:
 
 
 def test_without_a_terminal_it_refuses_with_2(tmp_path: Path) -> None:
-    ended = finish(acsard("mcu", "check"), tmp_path)
+    ended = finish(acsard("mcu", "check", "--port", "sim"), tmp_path)
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
 
@@ -123,10 +123,11 @@ FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
     "reversed": ("reversed_encoder=b", ["motor b (front left)"], {}),
     "comma": (
         "comma_latched",
-        ["trailing comma", "damaged lines"],
+        ["trailing comma", "watchdog", "damaged lines"],
         {"mcu.trailing_comma": True},
     ),
     "no watchdog": ("no_watchdog", ["watchdog"], {}),
+    "fed watchdog": ("fed_by_anything", ["watchdog"], {}),
     "late watchdog": ("late_watchdog", ["watchdog"], {}),
     "dead encoder": ("stuck_encoder=c", ["motor c (rear left)"], {}),
     "baud": ("other_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.bench import REST_S, SPEED, ZERO, Bench
+from acsard.checkup.bench import REST_S, SLOWEST_S, SPEED, ZERO, Bench
 from acsard.checkup.findings import StoppedError
-from acsard.settings import McuConfig
+from acsard.settings import Config, McuConfig, SimConfig
+from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Robot
 
 
@@ -73,6 +74,8 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
     assert end.value.finding.name == "stop"
     assert f"{2 * REST_S:g} s" in end.value.finding.figure
     assert "motor a (front right)" in end.value.finding.text
+    assert robot.sent[-1].startswith(b"\r\n")  # once, then silence
+    assert not robot.sent[-2].startswith(b"\r\n")
 
 
 def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
@@ -85,13 +88,19 @@ def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
         bench.open(115200)
         bench.armed = True
         queue = list(lines)
-        robot.listen = lambda until_ns: [(robot.now_ns(), queue.pop(0))]  # type: ignore[method-assign]
+
+        def listen(until_ns: int) -> list[tuple[int, bytes]]:
+            VirtualWire.listen(robot, until_ns)
+            return [(until_ns, queue.pop(0))]
+
+        robot.listen = listen  # type: ignore[method-assign]
         for _ in lines:
             bench.listen(0.02)
 
-    answered(still, still, wild, still)
+    quiet = [still] * 9
+    answered(*quiet, wild, *quiet)
     with pytest.raises(StoppedError):
-        answered(still, still, wild, wild, wild)
+        answered(*quiet, wild, wild, wild)
 
 
 def test_silence_ends_it_only_while_somebody_drives() -> None:
@@ -103,3 +112,25 @@ def test_silence_ends_it_only_while_somebody_drives() -> None:
             bench.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
     assert end.value.finding.name == "link"
     assert robot.later() == [0.0] * 4
+
+
+@pytest.mark.parametrize("sent", [False, True])
+def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=1.5))
+    robot = Robot("plain_only", config=config, trailing_comma=sent)
+    with robot.bench() as bench:
+        bench.drive((0.0, 0.0, 0.0, SPEED), 3.0)
+        assert bench.rest() == "rest"
+        assert bench.comma is sent
+        assert REST_S < bench.slowest_rest_s < SLOWEST_S
+
+
+def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
+    config = Config(sim=SimConfig(motor_time_constant=5.0))
+    robot = Robot("plain_only", config=config)
+    with robot.bench() as bench:
+        bench.drive((0.0, 0.0, 0.0, SPEED), 4.0)
+        began = robot.now_ns()
+        assert bench.rest() == "rest"  # by the second wait
+        assert SLOWEST_S * 1e9 < robot.now_ns() - began < 2 * SLOWEST_S * 1e9
+        assert not bench.comma

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from acsard.checkup import counts
-from acsard.checkup.bench import Reply
 from acsard.checkup.dialect import check, identity
+from acsard.checkup.motion import Reply
 from acsard.checkup.turning import turn
 from acsard.mcu.check import Reading
 from acsard.settings import Config, SimConfig

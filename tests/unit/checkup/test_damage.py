@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from acsard.checkup import damage, dialect
@@ -15,9 +17,12 @@ from tests.unit.checkup.robots import Robot
 @pytest.mark.parametrize("sealed", [False, True])
 def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
     lines = damage.broken_lines(comma, sealed, [0, 1, 2, 3])
-    assert len(lines) == (10 if sealed else 8)
+    assert len(lines) == (12 if sealed else 10)
+    assert all(any(b.line.endswith(end) for b in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
     for broken in lines:
         assert protocol.whole(broken.line) is None, broken.what
+        if "last number" in broken.what:
+            continue  # the host reads replies with other decimals
         with pytest.raises(FrameError):
             Codec(WheelMap()).decode(broken.line.rstrip())
 
@@ -38,6 +43,20 @@ def test_firmware_that_takes_parts_is_told(fault: str, verdict: str) -> None:
         assert damage.finding(bench, [0, 1, 2, 3]).verdict == verdict
         assert bench.turning() == []
     assert robot.later() == [0.0] * 4
+
+
+def test_firmware_that_reads_a_last_number_that_is_cut_is_told() -> None:
+    def scanned(line: bytes) -> protocol.Command | None:
+        """As `sscanf` reads: the last number as far as it goes."""
+        got = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
+        return got and protocol.Command({m: float(got[m + 1]) for m in range(4)})
+
+    robot = Robot()
+    with robot.bench() as bench:
+        robot.mcu.understand = scanned
+        finding = damage.finding(bench, [0, 1, 2, 3])
+    assert finding.verdict == "FAIL"
+    assert finding.text.count("cut inside the last number") == 1
 
 
 def test_motors_that_do_not_turn_as_told_are_left_out() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 
 from acsard.checkup import procedure
+from acsard.checkup.bench import FAREWELL, SPEED
 from acsard.checkup.findings import Finding, WireLostError
 from acsard.mcu.frames import Codec
 from acsard.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.sim import protocol
 from acsard.values import WHEELS
 from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured
 
@@ -55,8 +58,36 @@ def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
         assert int(checked["watchdog"].figure.split()[0]) == pytest.approx(300, abs=60)
 
 
-def test_a_coarse_encoder_is_no_runaway() -> None:
-    assert check(config=Config(sim=SimConfig(encoder_counts=64))).failed == []
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 64])
+@pytest.mark.parametrize("fault", [(), ("no_check",)])
+def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -> None:
+    config = Config(sim=SimConfig(encoder_counts=per_turn))
+    assert check(*fault, config=config).failed == []
+
+
+@pytest.mark.parametrize("lag", [0.8, 1.0])
+@pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
+def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
+    checked = check(fault, config=Config(sim=SimConfig(motor_time_constant=lag)))
+    assert checked.failed == []
+    assert checked["trailing comma"].figure == "not needed"
+    assert "mcu.trailing_comma" not in checked.changes
+
+
+def test_a_heavy_last_wheel_that_does_need_its_comma_is_found() -> None:
+    config = Config(sim=SimConfig(motor_time_constant=0.5))
+    checked = check("comma_latched", config=config)
+    assert checked["trailing comma"].figure == "needed"
+
+
+def test_a_wheel_without_an_encoder_is_not_told_to_turn_back() -> None:
+    robot = Robot("plain_only", "stuck_encoder=b")
+    Checked(robot)
+    assert not any(b"bn" in line for line in robot.sent)
+
+
+def test_the_person_is_told_what_can_happen() -> None:
+    assert "dead or reversed can reach full speed" in procedure.CONFIRM
 
 
 def test_every_step_has_a_finding() -> None:
@@ -73,6 +104,7 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
     ("comma_latched", "trailing comma", "FAIL", "motor d (rear right) still turns after zeros",
      "trailing_comma = true", {"mcu.trailing_comma": True}),
     ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
+    ("fed_by_anything", "watchdog", "FAIL", "half-broken cable", "whole valid line", {}),
     ("late_watchdog", "watchdog", "FAIL", "1.0 s after", "300 ms", {}),
     ("stuck_encoder=b", "motor b", "FAIL", "a dead encoder", "look whether", {}),
     ("other_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
@@ -95,7 +127,7 @@ def test_a_planted_fault_is_found_and_named(
     assert mend in finding.mend
     assert changes.items() <= checked.changes.items()
     # What it is not is said to be right.
-    expected = {"swapped_motors=a:b": 2, "comma_latched": 2}.get(fault, verdict == "FAIL")
+    expected = {"swapped_motors=a:b": 2, "comma_latched": 3}.get(fault, verdict == "FAIL")
     assert len(checked.failed) == expected
     assert not checked.left_turning
 
@@ -170,9 +202,10 @@ def test_a_dead_last_motor_is_no_missing_comma() -> None:
     assert "mcu.trailing_comma" not in checked.changes
 
 
-def test_old_firmware_with_its_comma_configured_fails_by_its_damaged_lines_only() -> None:
+def test_old_firmware_with_its_comma_configured_fails_by_its_broken_lines_only() -> None:
     checked = check("comma_latched", trailing_comma=True)
-    assert checked.failed == ["damaged lines"]
+    assert checked.failed == ["watchdog", "damaged lines"]
+    assert "fed by broken lines" in checked["watchdog"].figure
 
 
 def test_several_faults_at_once_are_all_found() -> None:
@@ -299,12 +332,11 @@ def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
     assert not robot.is_open
 
 
-@pytest.mark.parametrize(("gain", "text"), [(3, "more than 6 rad/s"), (-3, "against the command")])
-def test_a_runaway_stops_it_at_once(gain: int, text: str) -> None:
-    robot = Robot(f"bias=b:{gain}")
+def test_a_runaway_stops_it_at_once() -> None:
+    robot = Robot("bias=b:3")
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
-    assert text in checked["runaway"].text
+    assert "more than 6 rad/s" in checked["runaway"].text
     assert checked["watchdog"].verdict == "SKIPPED"
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
@@ -313,11 +345,79 @@ def test_a_runaway_stops_it_at_once(gain: int, text: str) -> None:
     assert not checked.left_turning
 
 
+class Regulates(Robot):
+    """Its firmware regulates: a motor whose encoder is dead or reversed goes to full speed, a
+    reversed one also when told zero, unless it stands; only the watchdog cuts it."""
+
+    FULL = 20.0
+
+    def __init__(self, *faults: str, lag: float = 0.3) -> None:
+        super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
+        self.full_s = 0.0
+        """For how long a motor was faster than 6 rad/s."""
+        self.mcu.understand = self._regulated
+
+    def _regulated(self, line: bytes) -> protocol.Command | None:
+        command = protocol.whole(line)
+        if command is None:
+            return None
+        for motor, told in command.values.items():
+            sign = 0 if self.mcu.stuck == motor else self.mcu.encoder_signs[motor]
+            speed = self.mcu.vehicle.speeds[motor]
+            error = told - sign * speed
+            if sign != 1 and abs(error) > 0.1:
+                command.values[motor] = math.copysign(self.FULL, error)
+        return command
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        got, step_ns = [], 5 * MS
+        while self.now_ns() < until_ns:
+            got += super().listen(min(until_ns, self.now_ns() + step_ns))
+            self.full_s += 0.005 * any(abs(v) > 6.0 for v in self.mcu.vehicle.speeds)
+        return got
+
+
+@pytest.mark.parametrize(
+    ("fault", "most_s"), [("stuck_encoder=b", 0.8), ("reversed_encoder=b", 0.9)]
+)
+def test_firmware_that_regulates_is_not_left_at_full_speed(fault: str, most_s: float) -> None:
+    robot = Regulates(fault)
+    checked = Checked(robot)
+    assert checked.failed == ["motor b (front left)"]
+    assert checked["motor b"].figure.endswith("probed")
+    assert checked["watchdog"].verdict == "PASS"
+    assert robot.full_s < most_s
+    assert not checked.left_turning
+
+
+def zeros_after(sent: Sequence[bytes]) -> int:
+    """How many writes there are after the last that tells a speed."""
+    return next(n for n, line in enumerate(reversed(sent)) if b"3.00" in line)
+
+
+def test_after_a_runaway_zeros_go_out_once_and_then_nothing() -> None:
+    robot = Robot("bias=b:3")
+    Checked(robot)
+    assert zeros_after(robot.sent) == 1
+    assert robot.sent[-1].startswith(b"\r\nap00.00")
+
+
+def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it() -> None:
+    robot = Regulates("reversed_encoder=b", lag=0.05)
+    with robot.bench() as bench:
+        bench.drive((0.0, SPEED, 0.0, 0.0), 0.05)
+    assert 1 <= zeros_after(robot.sent) < FAREWELL
+    assert not any(robot.later())
+
+
 def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
     class Restarts(Robot):
+        restarts = 0
+
         def send(self, data: bytes) -> None:
             super().send(data)
-            if len(self.sent) == 230:
+            if not self.restarts and self.mcu.vehicle.speeds[1] > 2.0:
+                self.restarts = 1
                 self.mcu.reset(self.now_ns())
 
     checked = Checked(Restarts())

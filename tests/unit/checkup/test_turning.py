@@ -6,6 +6,8 @@ import pytest
 
 from acsard.checkup import turning
 from acsard.checkup.bench import SPEED
+from acsard.checkup.wheels import Channel
+from acsard.settings import Config, SimConfig
 from tests.unit.checkup.robots import Nobody, Robot
 
 
@@ -64,3 +66,38 @@ def test_every_motor_is_announced_before_it_turns() -> None:
         found = list(turning.channels(bench, Listener()))
     assert [text.split()[1] for text in said] == list("abcd")
     assert [comma is not None for _, comma in found] == [False, False, False, True]
+
+
+def test_a_probe_is_short_and_slow_and_no_dead_motor_is_told_more() -> None:
+    robot = Robot("plain_only", "dead_motor=b")
+    with robot.bench() as bench:
+        began, before = robot.now_ns(), len(robot.sent)
+        assert turning.probe(bench, 1) == (0.0, 0.0, 0.0, 0.0)
+        told = [line for line in robot.sent[before:] if b"bp00.00" not in line]
+        assert {line[8:15] for line in told} == {b"bp01.50", b"bp03.00"}
+        assert len(told) <= 2 * (turning.PROBE_S / bench.period_s + 1)
+        assert robot.now_ns() - began < 3e9
+        assert turning.probe(bench, 0) is None
+
+
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 3200])
+@pytest.mark.parametrize("lag", [0.0, 0.3, 1.0])
+def test_a_probe_finds_what_follows_and_what_is_reversed(per_turn: int, lag: float) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
+    for fault, follows in ((), True), (("reversed_encoder=c",), False):
+        robot = Robot("plain_only", *fault, config=config)
+        with robot.bench() as bench:
+            seen = turning.probe(bench, 2)
+            assert (seen is None) is follows
+            if seen is not None:
+                channel = Channel(2, seen, (0.0, 0.0, 0.0, 0.0), probed=True)
+                assert channel.kind == "reversed"
+
+
+def test_a_motor_that_still_speeds_up_is_held_on_but_not_for_ever() -> None:
+    for lag, speed in ((1.0, 2.7), (2.0, 2.0)):
+        robot = Robot("plain_only", config=Config(sim=SimConfig(motor_time_constant=lag)))
+        with robot.bench() as bench:
+            began = robot.now_ns()
+            assert turning.run_up(bench, turning.one(0, SPEED))[0] > speed
+            assert robot.now_ns() - began < 1.2e9 * turning.LONGEST_HOLD_S

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from acsard.checkup import dialect, watchdog
+from acsard.checkup.bench import SPEED
 from acsard.checkup.turning import turn
 from acsard.settings import Config, SimConfig
+from acsard.sim import protocol
 from tests.unit.checkup.robots import Robot
 
 ALL = (0, 1, 2, 3)
@@ -77,3 +79,42 @@ def test_one_too_short_for_any_host_is_a_warning() -> None:
 def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
     with Robot().bench() as bench:
         assert watchdog.finding(bench, []).verdict == "SKIPPED"
+
+
+@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
+@pytest.mark.parametrize("lag", [0.0, 0.6])
+def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], lag: float) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=lag))
+    for robot in (Robot,) if lag else (Robot, ByItsOwnClock):
+        assert measured(robot(*kind, config=config))[0] == "PASS"
+        verdict, figure = measured(robot(*kind, "fed_by_anything", config=config))
+        assert verdict == "FAIL"
+        assert figure.endswith("fed by broken lines")
+
+
+def test_broken_lines_are_never_taken_for_more_than_was_told() -> None:
+    robot = Robot("comma_latched", trailing_comma=True)
+    with robot.bench() as bench:
+        assert watchdog.finding(bench, ALL).figure.endswith("fed by broken lines")
+    told = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
+    assert max(abs(value) for values in told for value in values) == SPEED
+
+
+@pytest.mark.parametrize("fault", [(), ("no_check",)])
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 96])
+@pytest.mark.parametrize("time_s", [0.3, 0.52])
+def test_what_cannot_be_told_finely_is_not_said_to_be_right(
+    fault: tuple[str, ...], per_turn: int, time_s: float
+) -> None:
+    robot = Robot(*fault, config=Config(sim=SimConfig(encoder_counts=per_turn)))
+    robot.mcu.watchdog_ns = int(time_s * 1e9)
+    verdict, figure = measured(robot)
+    middle, _, about = figure.removesuffix(" ms").partition(" ms ± ")
+    assert int(middle) == pytest.approx(1000 * time_s, abs=int(about) + 15)
+    reaches = int(middle) + int(about) > 500
+    if verdict == "PASS":
+        assert time_s == 0.3
+        assert not reaches
+    else:
+        assert reaches
+        assert time_s != 0.3 or verdict == "WARN"

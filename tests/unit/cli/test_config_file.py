@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from tomlkit.exceptions import NonExistentKey
 
 from acsard.cli.config_file import change
 from acsard.config import parse
@@ -53,6 +54,8 @@ def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
         "[mcu.wheels]\n# none\n",
         '[mcu]\nwheels = { front_right = "+a" }\n',
         "mcu.port = 'sim'\nmcu.wheels.rear_left = '+c'\n",
+        "# mine\nmcu.port = 'sim'\nmcu.encoder_counts = 5\n[drive]\nwheel_radius = 0.1\n",
+        "[mcu.wheels]\n# none\n[drive]\nwheel_radius = 0.1\n[mcu]\nport = 'sim'\n",
         "[bus]\nmode = 'peer'\n[mcu]\n\n[drive]\nwheel_radius = 0.1\n",
     ],
 )
@@ -86,6 +89,29 @@ def test_what_would_not_check_is_not_written(
         change(file, keys)
     assert file.read_text() == text
     assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+def test_windows_line_ends_stay(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_bytes(b"# mine\r\n[mcu]\r\nport = 'sim' # here\r\n")
+    change(file, KEYS)
+    data = file.read_bytes()
+    assert data.startswith(b"# mine\r\n[mcu]\r\nport = 'sim' # here\r\n")
+    assert data.count(b"\r\n") == data.count(b"\n") > 8
+    assert b"\r\r" not in data
+
+
+def test_what_the_library_cannot_do_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(text: str) -> None:
+        raise NonExistentKey("mcu")
+
+    monkeypatch.setattr("tomlkit.parse", fails)
+    (tmp_path / "acsard.toml").write_text("# mine\n")
+    with pytest.raises(ExitError, match="left as it was"):
+        change(tmp_path / "acsard.toml", KEYS)
+    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
 def test_a_link_stays_one(tmp_path: Path) -> None:

@@ -12,11 +12,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from acsard.checkup.findings import Finding
 from acsard.cli import mcu
 from acsard.config import parse
 from acsard.runtime.exits import Exit, ExitError
+from acsard.settings import Config
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.virtual_wire import VirtualWire
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
@@ -43,7 +47,7 @@ def test_the_simulator_passes_and_the_lines_are_toml(
 
 
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert called(tmp_path, "--yes", "--json") == 0
+    assert called(tmp_path, "--port", "sim", "--yes", "--json") == 0
     out, err = capsys.readouterr()
     found = json.loads(out)
     assert err == ""
@@ -59,12 +63,12 @@ def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = "# my robot\n[mcu]\nlink_check = 'off' # not yet\n"
-    assert called(tmp_path, "--yes", "--write", text=text) == 0
+    assert called(tmp_path, "--port", "sim", "--yes", "--write", text=text) == 0
     assert "acsard.toml: written" in capsys.readouterr().out
     written = (tmp_path / "acsard.toml").read_text()
     assert written.startswith("# my robot\n")
     assert "# not yet" in written
-    assert called(tmp_path, "--yes", "--write") == 0
+    assert called(tmp_path, "--port", "sim", "--yes", "--write") == 0
     assert "nothing to change" in capsys.readouterr().out
     assert (tmp_path / "acsard.toml").read_text() == written
 
@@ -77,7 +81,7 @@ def test_findings_are_told_also_when_the_file_cannot_be_written(
 
     monkeypatch.setattr("acsard.cli.config_file._replace", full)
     with pytest.raises(ExitError, match="No space left"):
-        called(tmp_path, "--yes", "--json", "--write")
+        called(tmp_path, "--port", "sim", "--yes", "--json", "--write")
     assert json.loads(capsys.readouterr().out)["written"] is None
     assert (tmp_path / "acsard.toml").read_text() == ""
 
@@ -90,7 +94,7 @@ def test_write_without_a_file_is_told_before_anything_moves(
     monkeypatch.setattr("acsard.cli.common.PLACES", (Path("acsard.toml"),))
     parser = argparse.ArgumentParser()
     mcu.add(parser.add_subparsers())
-    args = parser.parse_args(["mcu", "check", "--yes", "--write"])
+    args = parser.parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])
     with pytest.raises(ExitError, match="no configuration file"):
         args.main(args)
 
@@ -100,7 +104,7 @@ def test_write_without_tomlkit_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
     with pytest.raises(ExitError, match=r"pip install 'acsard\[mcu\]'"):
-        called(tmp_path, "--yes", "--write")
+        called(tmp_path, "--port", "sim", "--yes", "--write")
 
 
 def test_without_a_terminal_and_without_yes_it_refuses(
@@ -108,8 +112,45 @@ def test_without_a_terminal_and_without_yes_it_refuses(
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("lifted\n"))
     with pytest.raises(ExitError, match="terminal") as end:
-        called(tmp_path)
+        called(tmp_path, "--port", "sim")
     assert end.value.code == Exit.USAGE
+
+
+@pytest.mark.parametrize("text", ["", "[mcu]\nport = 'sim'\n"])
+@pytest.mark.parametrize("words", [[], ["--yes"], ["--yes", "--wheels-are-lifted", "--json"]])
+def test_the_simulator_is_never_taken_for_a_board(
+    tmp_path: Path, text: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ExitError, match="acsard ports") as end:
+        called(tmp_path, *words, text=text)
+    assert end.value.code == Exit.USAGE
+    assert capsys.readouterr().out == ""
+
+
+def test_the_port_that_was_named_is_written_with_the_rate_it_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def board(config: Config) -> VirtualWire:
+        built = structs.replace(config, mcu=structs.replace(config.mcu, baud_rate=57600))
+        return VirtualWire(FakeMcu(built))
+
+    monkeypatch.setattr(mcu, "_wire", board)
+    words = ("--port", "/dev/acsar_mcu", "--yes", "--wheels-are-lifted", "--write", "--json")
+    assert called(tmp_path, *words, text="# mine\n") == 1
+    assert json.loads(capsys.readouterr().out)["changes"]["mcu.port"] == "/dev/acsar_mcu"
+    written = parse((tmp_path / "acsard.toml").read_bytes()).mcu
+    assert (written.port, written.baud_rate) == ("/dev/acsar_mcu", 57600)
+
+
+def test_a_port_without_an_answer_is_not_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ExitError):
+        called(tmp_path, "--port", str(tmp_path / "none"), "--yes", "--write", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert (found["passed"], found["changes"]) == (False, {})
+    assert "acsard ports" in found["error"]
+    assert (tmp_path / "acsard.toml").read_text() == ""
 
 
 def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:

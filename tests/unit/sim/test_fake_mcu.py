@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from operator import methodcaller
 from typing import Any
@@ -328,6 +328,19 @@ def test_without_watchdog_the_motors_run_on() -> None:
         assert mcu.watchdog_trips == 0
 
 
+def test_a_watchdog_that_anything_feeds_runs_on_with_broken_lines_and_not_in_silence() -> None:
+    for fed in (False, True):
+        mcu = FakeMcu(TRUE)
+        with mcu.fed_by_anything() if fed else nullcontext():
+            mcu.receive(0, LINE)
+            for n in range(1, 10):
+                mcu.receive(n * 100 * MS, LINE[:12] + b"\r\n")
+                mcu.advance(n * 100 * MS + 50 * MS)
+            assert any(mcu.vehicle.set_points) is fed
+            mcu.advance(2000 * MS)
+            assert not any(mcu.vehicle.set_points)
+
+
 def test_the_watchdog_time_is_the_one_of_the_contract() -> None:
     assert WATCHDOG_NS == 300 * MS
 
@@ -392,9 +405,12 @@ NAMED["stuck_encoder"] = methodcaller("stuck_encoder", 1)
 
 
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
-    """Half a second of driving, then silence; answers with times, angles and set points after."""
+    """Half a second of driving, then silence but for one line that is none; answers with times,
+    angles and set points after."""
     found = drive(mcu, start_ns, 40)
     found += drive(mcu, start_ns + 400 * MS, 10, SEALED)
+    found += replies(mcu, start_ns + 650 * MS)
+    mcu.receive(start_ns + 650 * MS, b"ap0\r\n")
     found += replies(mcu, start_ns + 1000 * MS)
     at = [(when - start_ns, data) for when, data in found]
     return at, list(mcu.vehicle.angles), list(mcu.vehicle.set_points)
