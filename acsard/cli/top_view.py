@@ -136,7 +136,7 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 def _no_news(seen: Seen, width: int) -> list[Text]:
     """A bar across the screen: what is below is old."""
-    since = ago(int(seen.age)).replace(".0", "")
+    since = ago(int(min(seen.age, 1e9))).replace(".0", "")
     words = f"NO NEWS FOR {since}: is the daemon running?"
     if seen.undecodable:
         words = f"NOTHING READABLE FOR {since}: is the daemon of another version?"
