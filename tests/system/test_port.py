@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import tty
+from collections.abc import Sequence
 
 from acsard.runtime import clock
 from acsard.runtime.serial_port import STALE_NS, SerialPort
@@ -17,7 +18,7 @@ GO = b"ap05.00,bp05.00,cp05.00,dp05.00\r\n"
 def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() -> None:
     """The step took its time, was stopped before it wrote, and goes on much later."""
 
-    async def offered() -> list[str]:
+    async def offered() -> Sequence[str]:
         async with SerialPort(path, 115200, STOP, lambda: None, lambda event: None) as port:
             answers = [port.offer(STOP, clock.now())]
             await asyncio.sleep(0.01)  # the wire is free again
