@@ -68,6 +68,7 @@ ORDER = (
     "checkup.wheels",
     "checkup.turning",
     "checkup.counts",
+    "checkup.silence",
     "checkup.watchdog",
     "checkup.damage",
     "checkup.procedure",

@@ -1,0 +1,41 @@
+"""However it is measured, the true time of the watchdog lies within what is told."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup import dialect
+from acsard.checkup.silence import UNKNOWN, Silence, measured
+from acsard.checkup.turning import turn
+from tests.unit.checkup.robots import Robot
+
+ALL = (0, 1, 2, 3)
+SLACK_S = 0.02
+"""A reply's own time, which the interval does not hold."""
+
+
+def silence(robot: Robot) -> Silence:
+    with robot.bench() as bench:
+        list(dialect.pace(bench))
+        dialect.check(bench)
+        for motor in ALL:
+            turn(bench, motor, 3.0)
+            bench.rest()
+        found = measured(bench, ALL)
+        assert bench.turning() == []
+    return found
+
+
+@pytest.mark.parametrize("kind", [("plain_only",), (), ("unprompted",)])
+@pytest.mark.parametrize("time_s", [0.2, 0.37])
+def test_the_true_time_lies_between_what_is_told(kind: tuple[str, ...], time_s: float) -> None:
+    robot = Robot(*kind)
+    robot.mcu.watchdog_ns = int(time_s * 1e9)
+    found = silence(robot)
+    assert found.least - SLACK_S <= time_s <= found.most + SLACK_S
+    assert found.most - found.least < 0.2
+
+
+@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "unprompted"])
+def test_motors_that_never_stop_have_no_time(kind: str) -> None:
+    assert silence(Robot(kind, "no_watchdog")).most == UNKNOWN
