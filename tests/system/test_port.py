@@ -26,8 +26,10 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
             before = Instant(now.mono_ns - STALE_NS - 1, now.wall_ns)
             answers.append(port.offer(GO, before))
             answers.append(port.offer(GO, clock.now()))
-            await asyncio.sleep(0.01)
-            answers.append(port.offer(STOP, before))
+            await asyncio.sleep(0.03)
+            later = clock.now()
+            late = Instant(later.mono_ns - STALE_NS - 1, later.wall_ns)
+            answers.append(port.offer(STOP, late))
             return answers
 
     master, slave = os.openpty()
