@@ -126,6 +126,7 @@ ORDER = (
     "cli.service",
     "cli.doctor",
     "cli.config_file",
+    "cli.person",
     "cli.mcu",
     "cli.certificates",
     "cli.lan",

@@ -200,6 +200,14 @@ def _own(state: RobotState) -> dict[str, Summary]:
     }
 
 
+def _nothing_seen(sent: int, state: RobotState) -> ExitError:
+    return ExitError(
+        Exit.FAILURE,
+        f"none of the {sent} commands came out on the wire, so nothing was measured; the daemon "
+        f"says: {state.reason}",
+    )
+
+
 def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
@@ -224,11 +232,7 @@ def _result(
         outside["feedback_to_odometry"] = summary([one.delay_ns for one in fed])
         seen, lines_said, lines_told = len(waits), len(record.said), len(fed)
         if record.sent and not seen:
-            raise ExitError(
-                Exit.FAILURE,
-                f"none of the {len(record.sent)} commands came out on the wire, so nothing was "
-                f"measured; the daemon says: {state.reason}",
-            )
+            raise _nothing_seen(len(record.sent), state)
         lines_waiting = max((one.waiting for one in fed), default=0)
         start_up = round((heard[0][0] - record.began_ns) / 1e6, 1)
     return Result(

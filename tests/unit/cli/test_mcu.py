@@ -16,6 +16,7 @@ from msgspec import structs
 
 from acsard.checkup.findings import Finding
 from acsard.cli import mcu
+from acsard.cli.person import Person
 from acsard.config import parse
 from acsard.runtime.exits import Exit, ExitError
 from acsard.settings import Config
@@ -176,7 +177,7 @@ def test_a_person_is_asked_until_the_answer_is_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))
-    assert mcu.Person().ask("which?", ("fr", "rl")) == "rl"
+    assert Person().ask("which?", ("fr", "rl")) == "rl"
     out, err = capsys.readouterr()
     assert out == ""
     assert "which? [fr/rl]" in err
@@ -186,7 +187,7 @@ def test_a_person_is_asked_until_the_answer_is_one(
 def test_the_end_of_the_input_ends_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     with pytest.raises(KeyboardInterrupt):
-        mcu.Person().ask("lifted?", ("lifted",))
+        Person().ask("lifted?", ("lifted",))
 
 
 @pytest.mark.parametrize(
