@@ -1,6 +1,6 @@
 """The board on the bench: the firmware's machine code in libsimavr, and a host at its port.
 
-Nothing of acsard is imported here. Every wait has a deadline; the process is ended by its own id.
+No parser of acsard's is used here. Every wait has a deadline; the process is ended by its own id.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-T = TypeVar("T")
+from tests.system.harness import until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -82,18 +82,6 @@ def build_runner(where: Path) -> Path:
     binary = where / "runner"
     _run(["gcc", *flags, "-o", binary, source, "-lsimavr", "-lelf", "-lm"], where)
     return binary
-
-
-def until(look: Callable[[], T | None], within: float, what: str) -> T:
-    """The first true value of `look`; fails with `what` was awaited."""
-    deadline = time.monotonic() + within
-    while True:
-        got = look()
-        if got:
-            return got
-        if time.monotonic() > deadline:
-            raise AssertionError(f"not within {within:g} s: {what}")
-        time.sleep(0.002)
 
 
 class Motor(NamedTuple):

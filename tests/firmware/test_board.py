@@ -25,8 +25,8 @@ from tests.firmware.board import (
     read_identity,
     read_reply,
     speeds_line,
-    until,
 )
+from tests.system.harness import until
 
 pytestmark = pytest.mark.firmware
 
