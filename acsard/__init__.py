@@ -12,33 +12,31 @@ step every 10 ms between.
 Inside `Robot.step`, top to bottom: fold the feedback into odometry, choose one command, gate by
 mode, limit, invert the kinematics, report. Nothing else decides anything.
 
-Where to look, in the order the modules may import each other:
+Where to look: one room per concern, in the order they may import each other (P: pure, no clock
+and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-imports` checks it.
 
-    values.py         the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
-    settings.py       the keys of acsard.toml; validation.py, rules.py, config.py: file -> Config,
-                      or why not
-    figures.py        what the daemon measures of itself, in histograms of fixed size
-    mcu/              wire time, pace (when a line may go), round trip, lines, frames (the
-                      protocol), session (is the MCU there?)
-    drive/            kinematics, odometry, sanity (can this feedback be true?), arbiter (who
+    values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
+    config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
+    mcu/           P  the serial line: frames, the check, is the MCU there, when may a line go
+    drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who
                       commands?), limits, modes (the table), lifecycle (what latched it)
-    messages/         schema (the published structs), topics (**the** key table), cdr, encodings,
-                      incoming (sample -> command), report (outputs -> messages), queries
-    ros/              the two ROS trees: names and hashes, tokens, attachments, what stands for
-                      which native key, the configuration as parameters
-    access.py         who may do what: the topic table -> Zenoh's access rules
-    robot.py          the order; guard.py: the last look at every outgoing line
-    sim/              the vehicle, the fake microcontroller, its faults
-    checkup/          what `acsard mcu check` does: one module a question to the board
-    matching.py       which message belongs to which line: what `acsard bench` measures
-    runtime/          clock, ticker, real_time, serial device and port, Zenoh bus (inbox, outlets,
-                      replies), systemd and its journal, logs, control loop, daemon, the bench's rig
-    client.py         drive and follow a robot from Python
-    cli/              one verb per file
+    messages/      P  the published structs, topics (**the** key table), encodings, report
+    ros/           P  the two ROS trees: names and hashes, tokens, attachments, parameters
+    incoming/      P  what comes in over the bus: sample -> command, query -> reply or request
+    robot.py       P  the order; guard.py: the last look at every outgoing line
+    sim/           P  the vehicle, the fake microcontroller, its faults
+    checkup/       P  what `acsard mcu check` does: one module a question to the board
+    host/          S  the machine: clock, timers, threads, scheduling, systemd, journal, logs
+    serial/        S  owns the serial port
+    bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
+    runtime/       S  the control loop and the daemon; figures of itself
+    client.py      S  drive and follow a robot from Python
+    bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
+    cli/           S  one verb per file
 
 Three invariants, each tested:
 
-1. Only runtime/, cli/ and client.py do I/O; only runtime/clock.py reads a clock for the daemon.
+1. Only the rooms marked S do I/O; only host/clock.py reads a clock for the daemon.
 2. No wheel speed grows unless a fresh command, a live link and mode driving agree in the same
    step; otherwise it only falls, and without a link the command is zero at once. The guard checks
    exactly this, with code of its own.

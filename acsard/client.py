@@ -25,13 +25,13 @@ import msgspec
 import zenoh
 import zenoh.ext
 
+from acsard.bus.session import client_session
+from acsard.host import clock
+from acsard.host.exits import Exit, ExitError
+from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.topics import by_key, full_key
-from acsard.runtime import clock
-from acsard.runtime.exits import Exit, ExitError
-from acsard.runtime.threads import in_thread
-from acsard.runtime.zenoh_session import client_session
 from acsard.values import Pose
 
 ENDPOINT = "tcp/127.0.0.1:7448"

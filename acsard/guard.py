@@ -9,7 +9,7 @@ reason goes back into the robot, which latches a fault.
 
 from __future__ import annotations
 
-from acsard.settings import Source
+from acsard.config.settings import Source
 from acsard.values import Outputs
 
 _ZERO = (0, 0, 0, 0)

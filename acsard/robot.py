@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from acsard.config.settings import Config
 from acsard.drive.arbiter import REASONS, Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
@@ -18,7 +19,6 @@ from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
-from acsard.settings import Config
 from acsard.values import (
     NS_PER_S,
     STILL,

@@ -245,6 +245,6 @@ class Snapshot(Struct, frozen=True):
     refused: str
     """The last command that was refused and why, "" when none was."""
     figures: dict[str, Measured] = {}
-    """What the daemon measures of itself, by the names in `figures.py`."""
+    """What the daemon measures of itself, by the names in `runtime/figures.py`."""
     check: str = "plain"
     """Which check the serial lines have, in words."""

@@ -21,8 +21,8 @@ import pytest
 import zenoh
 from ruamel.yaml import YAML
 
+from acsard.config.settings import Config, RosConfig
 from acsard.ros.trees import ros_names
-from acsard.settings import Config, RosConfig
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()

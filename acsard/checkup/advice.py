@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from msgspec import ValidationError
 
 from acsard.checkup.findings import Finding
-from acsard.config import effective, from_builtins
-from acsard.rules import contradictions
-from acsard.settings import Config
-from acsard.validation import write
+from acsard.config.parsing import effective, from_builtins
+from acsard.config.rules import contradictions
+from acsard.config.settings import Config
+from acsard.config.validation import write
 
 Changes = dict[str, object]
 """Dotted key -> value, in the order of the file."""

@@ -13,11 +13,11 @@ from acsard.checkup import ends, motion
 from acsard.checkup.findings import WireLostError
 from acsard.checkup.motion import Reply
 from acsard.checkup.outside import Wire
+from acsard.config.baud import line_bytes, wire_ns
+from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.mcu.frames import Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
-from acsard.mcu.wire import line_bytes, wire_ns
-from acsard.settings import McuConfig, WheelMap
 from acsard.values import NS_PER_S, STILL, WheelSpeeds
 
 SPEED = 3.0

@@ -11,7 +11,7 @@ from msgspec import Struct
 from acsard.checkup.bench import Bench
 from acsard.checkup.findings import Finding
 from acsard.checkup.motion import Reply, difference
-from acsard.mcu.wire import FIELD
+from acsard.config.baud import FIELD
 
 LEAST_ANGLE = 2.0
 """rad; over less the speeds' own rounding spoils the figure."""

@@ -14,10 +14,10 @@ from typing import get_args
 from acsard.checkup.bench import PERIOD_S, ZERO, Bench
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import Reply
+from acsard.config.baud import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.config.settings import Baud
 from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
-from acsard.mcu.wire import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.settings import Baud
 from acsard.values import NS_PER_S
 
 BOOT_S = 3.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from acsard.checkup.findings import LETTERS, Finding, StoppedError, motor_name
-from acsard.settings import McuConfig
+from acsard.config.settings import McuConfig
 
 
 def runaway(mcu: McuConfig, motor: int, asked: float, speed: float, most: float) -> StoppedError:

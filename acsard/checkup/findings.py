@@ -6,7 +6,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.settings import McuConfig
+from acsard.config.settings import McuConfig
 from acsard.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]

@@ -10,9 +10,9 @@ from statistics import fmean
 
 from msgspec import Struct
 
+from acsard.config.baud import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
-from acsard.mcu.wire import FIELD
 from acsard.values import NS_PER_S
 
 SPEED_S = 0.2

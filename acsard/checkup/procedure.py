@@ -10,7 +10,7 @@ from acsard.checkup.findings import Finding, StoppedError, WireLostError
 from acsard.checkup.outside import Operator, Wire
 from acsard.checkup.turning import channels, comma_needed
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
-from acsard.settings import Config
+from acsard.config.settings import Config
 
 LIFTED = "lifted"
 

@@ -16,8 +16,8 @@ from acsard.checkup.bench import PERIOD_S, SLOWEST_S, SPEED, ZERO, Bench
 from acsard.checkup.findings import LETTERS, Finding, StoppedError
 from acsard.checkup.motion import Reply
 from acsard.checkup.turning import mean, run_up
+from acsard.config.baud import FIELD
 from acsard.mcu.frames import Motors
-from acsard.mcu.wire import FIELD
 from acsard.values import NS_PER_S
 
 COARSE_S = 0.05

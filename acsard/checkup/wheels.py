@@ -12,8 +12,8 @@ from msgspec import Struct
 
 from acsard.checkup.bench import SPEED
 from acsard.checkup.findings import LETTERS, Finding, motor_name, wheel_of, words
+from acsard.config.settings import McuConfig
 from acsard.mcu.frames import Motors
-from acsard.settings import McuConfig
 from acsard.values import WHEELS
 
 MOVES = 0.25 * SPEED

@@ -30,7 +30,7 @@ from acsard.cli import (
     top,
     topics,
 )
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
 
 VERBS = (
     run,

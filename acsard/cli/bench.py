@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_config, load
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.cli.bench_table import Result
-    from acsard.matching import Summary
+    from acsard.bench.matching import Summary
+    from acsard.bench.rig import Rig
+    from acsard.bench.table import Result
+    from acsard.config.settings import Config
     from acsard.messages.schema import RobotState
-    from acsard.runtime.bench_rig import Rig
-    from acsard.settings import Config
 
 _DESCRIPTION = """\
 Measure this machine: run a daemon of its own (beside one that already runs) on a
@@ -82,7 +82,7 @@ def main(args: argparse.Namespace) -> int:
 
     import msgspec
 
-    from acsard.cli.bench_table import table
+    from acsard.bench.table import table
 
     port = "" if args.port in (None, "sim") else args.port
     if port:
@@ -123,8 +123,8 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
     """
     from msgspec.structs import replace
 
-    from acsard.runtime.bench_rig import free_endpoint
-    from acsard.settings import (
+    from acsard.bench.rig import free_endpoint
+    from acsard.config.settings import (
         BusConfig,
         CommandsConfig,
         DriveConfig,
@@ -168,7 +168,7 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
 def write(config: Config, where: Path) -> Path:
     """The configuration as a file."""
     from acsard.cli.check import toml
-    from acsard.config import effective
+    from acsard.config.parsing import effective
 
     file = where / "acsard.toml"
     file.write_text("\n".join(toml(effective(config))) + "\n", encoding="utf-8")
@@ -179,8 +179,8 @@ def measure(config: Config, port: str, seconds: float) -> Result:
     """A quarter of the time only followed, then commanded as well."""
     from tempfile import TemporaryDirectory
 
-    from acsard.matching import staircase
-    from acsard.runtime.bench_rig import Rig
+    from acsard.bench.matching import staircase
+    from acsard.bench.rig import Rig
 
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(config, Path(where))
@@ -191,7 +191,7 @@ def measure(config: Config, port: str, seconds: float) -> Result:
 
 
 def _own(state: RobotState) -> dict[str, Summary]:
-    from acsard.matching import Summary
+    from acsard.bench.matching import Summary
 
     spreads = {name: figure.since_start for name, figure in state.figures.items()}
     return {
@@ -211,10 +211,10 @@ def _nothing_seen(sent: int, state: RobotState) -> ExitError:
 def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
-    from acsard.cli.bench_table import Result, this_machine
-    from acsard.matching import lines_of, summary
-    from acsard.runtime.bench_child import resident_mb
-    from acsard.runtime.bench_record import command_waits, feedback_fates
+    from acsard.bench.child import resident_mb
+    from acsard.bench.matching import lines_of, summary
+    from acsard.bench.record import command_waits, feedback_fates
+    from acsard.bench.table import Result, this_machine
 
     state, pid = rig.state(), rig.process.pid
     policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK

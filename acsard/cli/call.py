@@ -27,8 +27,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Call and print."""
     from acsard.client import connect
+    from acsard.host.exits import Exit, ExitError
     from acsard.messages.encodings import encode
-    from acsard.runtime.exits import Exit, ExitError
 
     wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
     if len(args.values) != len(wanted):

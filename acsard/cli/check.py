@@ -25,8 +25,8 @@ def main(args: argparse.Namespace) -> int:
     """Check and print."""
     import msgspec
 
-    from acsard.config import effective
-    from acsard.rules import warnings
+    from acsard.config.parsing import effective
+    from acsard.config.rules import warnings
 
     where, config = load(args.config)
     plain = effective(config)
@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
 
 def toml(table: dict[str, object], path: str = "") -> list[str]:
     """The lines of a TOML document: plain keys first, then tables, then lists of tables."""
-    from acsard.validation import write
+    from acsard.config.validation import write
 
     lines: list[str] = []
     tables: list[str] = []

@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from acsard import config as configuration
-from acsard.config import ConfigError
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import Config
+from acsard.config import parsing as configuration
+from acsard.config.parsing import ConfigError
+from acsard.config.settings import Config
+from acsard.host.exits import Exit, ExitError
 
 PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 

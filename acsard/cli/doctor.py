@@ -19,7 +19,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.cli.common import add_config, address_of, find
-from acsard.settings import Config
+from acsard.config.settings import Config
 from acsard.values import NS_PER_S
 
 Level = Literal["ok", "warning", "failure"]
@@ -76,8 +76,8 @@ def line(finding: Finding, colours: bool) -> str:
 
 def examine(path: str | None) -> Iterator[Finding]:
     """Everything there is to find."""
-    from acsard.config import ConfigError, parse
-    from acsard.rules import warnings
+    from acsard.config.parsing import ConfigError, parse
+    from acsard.config.rules import warnings
 
     where, text = find(path)
     try:
@@ -98,7 +98,7 @@ def examine(path: str | None) -> Iterator[Finding]:
 
 def serial_port(config: Config) -> Iterator[Finding]:
     """Is it there, may we use it, does somebody else?"""
-    from acsard.runtime.host import BOARDS, holders, serial_devices
+    from acsard.host.machine import BOARDS, holders, serial_devices
 
     path = config.mcu.port
     if path == "sim":
@@ -148,7 +148,7 @@ def _group_of(number: int) -> str:
 
 def meddlers() -> Iterator[Finding]:
     """Programs that take serial ports for something else."""
-    from acsard.runtime.host import running
+    from acsard.host.machine import running
 
     if running("brltty"):
         mend = "sudo apt remove brltty, unless you read Braille: it takes CH340 and FTDI ports"
@@ -163,7 +163,7 @@ def clock_and_scheduling() -> Iterator[Finding]:
     import resource
     import time
 
-    from acsard.runtime.clock import now
+    from acsard.host.clock import now
 
     year = time.gmtime(now().wall_ns / NS_PER_S).tm_year
     if year < LEAST_YEAR:
@@ -181,11 +181,11 @@ def clock_and_scheduling() -> Iterator[Finding]:
 
 def certificates(config: Config) -> Iterator[Finding]:
     """Are the files of bus.tls there, private and in date?"""
+    from acsard.bus.certificates import check, ends_ns
+    from acsard.bus.session import CA, CERTIFICATE, KEY
+    from acsard.host.clock import now
+    from acsard.host.exits import ExitError
     from acsard.messages.report import EXPIRY_DAYS
-    from acsard.runtime.certificates import check, ends_ns
-    from acsard.runtime.clock import now
-    from acsard.runtime.exits import ExitError
-    from acsard.runtime.zenoh_session import CA, CERTIFICATE, KEY
 
     if not config.bus.tls:
         return
@@ -220,7 +220,7 @@ def certificates(config: Config) -> Iterator[Finding]:
 def bus(config: Config) -> Iterator[Finding]:
     """Is there a daemon, and what does it say?"""
     from acsard.client import connect
-    from acsard.runtime.exits import ExitError
+    from acsard.host.exits import ExitError
 
     for endpoint in config.bus.connect:
         if endpoint.startswith("tls/"):

@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
     import tty
 
     from acsard.client import connect
-    from acsard.runtime.exits import Exit, ExitError
+    from acsard.host.exits import Exit, ExitError
 
     if not sys.stdin.isatty():
         raise ExitError(Exit.USAGE, "drive reads keys and needs a terminal; use acsard.client")

@@ -13,9 +13,9 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.runtime.exits import Exit, ExitError
-from acsard.runtime.zenoh_session import CA, CERTIFICATE, KEY
-from acsard.validation import write
+from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.config.validation import write
+from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.cli.certificates import Authority
@@ -179,7 +179,7 @@ def _configure(file: Path, directory: Path) -> None:
     """Set the bus's keys in a configuration, its comments kept."""
     import tomlkit
 
-    from acsard.config import ConfigError, parse
+    from acsard.config.parsing import ConfigError, parse
 
     try:
         before = file.read_text(encoding="utf-8") if file.exists() else ""

@@ -18,14 +18,14 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_config, find, load
-from acsard.cli.config_file import change, require_tomlkit
 from acsard.cli.person import Nobody, Person
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
+from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
     from acsard.checkup.findings import Finding
     from acsard.checkup.outside import Wire
-    from acsard.settings import Config
+    from acsard.config.settings import Config
 
 SIMULATOR = "sim"
 
@@ -142,7 +142,7 @@ def _wire(config: Config) -> Wire:
         from acsard.sim.virtual_wire import VirtualWire
 
         return VirtualWire(FakeMcu(config))
-    from acsard.runtime.serial_wire import SerialWire
+    from acsard.serial.wire import SerialWire
 
     return SerialWire(config.mcu.port)
 
@@ -169,7 +169,7 @@ def _may(args: argparse.Namespace, port: str) -> None:
         return
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
         return
-    from acsard.runtime.host import master_of
+    from acsard.host.machine import master_of
 
     master = master_of(port)
     if master is None or master.name != "acsard":

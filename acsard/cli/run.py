@@ -7,7 +7,7 @@ import os
 import sys
 
 from acsard.cli.common import Overrides, add_config, load
-from acsard.settings import Config
+from acsard.config.settings import Config
 
 _BANNER = """\
 acsard {version}, robot {robot}
@@ -56,9 +56,9 @@ def main(args: argparse.Namespace) -> int:
     import asyncio
     import faulthandler
 
-    from acsard.rules import warnings
+    from acsard.config.rules import warnings
+    from acsard.host.logs import Log, Writer
     from acsard.runtime import daemon
-    from acsard.runtime.logs import Log, Writer
     from acsard.values import Event
 
     where, config = load(args.config, overrides(args))

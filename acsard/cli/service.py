@@ -14,7 +14,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
 
 UNIT, STOP = "acsard.service", "acsard-stop"
 DROP_IN = Path("/etc/systemd/system/acsard.service.d/lan.conf")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import get_args
 
 from acsard.cli.common import add_config, load
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import Baud
+from acsard.config.settings import Baud
+from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.faults import ARGUMENTS, FAULTS
 
@@ -88,7 +88,7 @@ def _make_link(link: Path, device: str) -> None:
 def _reset_again(mcu: FakeMcu, period_s: float) -> None:
     import asyncio
 
-    from acsard.runtime import clock
+    from acsard.host import clock
 
     def reset() -> None:
         mcu.reset(clock.now().mono_ns)
@@ -102,9 +102,9 @@ async def _play(config: object, args: argparse.Namespace) -> int:
     import signal
     from contextlib import ExitStack
 
-    from acsard.runtime import clock
-    from acsard.runtime.sim_pty import SimPty
-    from acsard.settings import Config
+    from acsard.config.settings import Config
+    from acsard.host import clock
+    from acsard.serial.sim_pty import SimPty
 
     assert isinstance(config, Config)
     ended = asyncio.Event()

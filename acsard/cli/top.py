@@ -1,6 +1,6 @@
 """`acsard top`: the robot on one screen, live.
 
-What it knows of the robot is in `top_feed`, what the screen looks like in `top_view`.
+What it knows of the robot is in `top.feed`, what the screen looks like in `top.view`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from acsard.cli.top_feed import Feed
+    from acsard.top.feed import Feed
 
 PERIOD_S = 0.25
 
@@ -47,13 +47,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Show until told otherwise."""
     try:
-        from acsard.cli import top_view  # noqa: F401
+        from acsard.top import view  # noqa: F401
     except ImportError:
         raise ExitError(
             Exit.FAILURE, "needs the library rich; run: pip install 'acsard[top]'"
         ) from None
-    from acsard.cli.top_feed import Feed
     from acsard.client import connect
+    from acsard.top.feed import Feed
 
     endpoint, robot_id, tls = robot_address(args)
     dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
@@ -67,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
 def _once(feed: Feed) -> int:
     from rich.console import Console
 
-    from acsard.cli.top_view import screen
+    from acsard.top.view import screen
 
     feed.ask()
     time.sleep(ONCE_S)
@@ -108,7 +108,7 @@ def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
     """Show until a key or ^Z; True for ^Z."""
     from rich.live import Live
 
-    from acsard.cli.top_view import screen
+    from acsard.top.view import screen
 
     with (
         _keys() as pressed,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from acsard.cli.common import add_config, load
 
 if TYPE_CHECKING:
+    from acsard.config.settings import Config
     from acsard.messages.schema import Topics
-    from acsard.settings import Config
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,8 +27,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the table."""
+    from acsard.incoming.queries import topic_table
     from acsard.messages.encodings import encode
-    from acsard.messages.queries import topic_table
 
     _, config = load(args.config)
     table = ros_table(config) if args.ros else topic_table(config.robot.id)

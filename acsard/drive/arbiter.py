@@ -13,7 +13,7 @@ import math
 
 from msgspec import Struct
 
-from acsard.settings import CommandsConfig, Source
+from acsard.config.settings import CommandsConfig, Source
 from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
 
 FORGET_NS = 10 * NS_PER_S

@@ -15,7 +15,7 @@ and, solved for the wheels of a base that does both exactly,
 
 from __future__ import annotations
 
-from acsard.settings import DriveConfig
+from acsard.config.settings import DriveConfig
 from acsard.values import Twist, WheelSpeeds
 
 

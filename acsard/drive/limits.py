@@ -11,8 +11,8 @@ import math
 
 from msgspec import Struct
 
+from acsard.config.settings import LimitsConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.settings import LimitsConfig
 from acsard.values import REST, Twist
 
 

@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import math
 
+from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.settings import OdometryConfig
 from acsard.values import REST, STILL, Pose, PoseCovariance, Sample, WheelSpeeds
 
 MAX_LOST_S = 0.05

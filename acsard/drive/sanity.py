@@ -11,8 +11,8 @@ counts as evidence, and evidence must last.
 
 from __future__ import annotations
 
+from acsard.config.settings import FeedbackConfig
 from acsard.mcu.feedback import Feedback
-from acsard.settings import FeedbackConfig
 from acsard.values import WHEELS, WheelSpeeds
 
 REPEATED = 3

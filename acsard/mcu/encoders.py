@@ -13,9 +13,9 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.config.baud import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
-from acsard.mcu.wire import FIELD
 from acsard.values import NS_PER_S
 
 SLACK_COUNTS = 4

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from acsard.config.baud import wire_ns
+from acsard.config.settings import McuConfig
 from acsard.mcu.check import Reading
 from acsard.mcu.encoders import Agreement, Encoders, Turned
 from acsard.mcu.frames import Codec, Motors
-from acsard.mcu.wire import wire_ns
-from acsard.settings import McuConfig
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
 

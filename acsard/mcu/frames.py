@@ -12,7 +12,7 @@ import math
 import re
 from typing import Literal
 
-from acsard.settings import WheelMap
+from acsard.config.settings import WheelMap
 from acsard.values import STILL, AcsardError, WheelSpeeds
 
 LETTERS = "abcd"

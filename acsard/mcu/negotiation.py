@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Literal
 
+from acsard.config.baud import line_bytes, wire_ns
+from acsard.config.settings import McuConfig
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.mcu.frames import FrameError
-from acsard.mcu.wire import line_bytes, wire_ns
-from acsard.settings import McuConfig
 from acsard.values import NS_PER_S
 
 State = Literal["off", "asking", "plain", "checked"]

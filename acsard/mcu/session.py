@@ -19,12 +19,12 @@ from typing import Literal
 
 from msgspec.structs import replace
 
+from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, Negotiation
-from acsard.settings import FeedbackConfig, McuConfig
 from acsard.values import NS_PER_S, STILL, Event, Instant, Received, WheelSpeeds
 
 Link = Literal["down", "booting", "up", "stale"]

@@ -10,7 +10,8 @@ from collections.abc import Callable, Collection, Iterator
 
 from msgspec.structs import asdict
 
-from acsard.mcu.wire import wire_use
+from acsard.config.baud import wire_use
+from acsard.config.settings import Config
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -35,7 +36,6 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.settings import Config
 from acsard.values import NS_PER_S, Instant, Outputs, Sample, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist

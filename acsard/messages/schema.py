@@ -189,7 +189,7 @@ class RobotState(Message, frozen=True):
     certificate: str = ""
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
-    """How fast it is, by the names in `figures.py`; at most a second old."""
+    """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
 
 
 class KeyValue(Message, frozen=True):

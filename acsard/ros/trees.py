@@ -11,10 +11,10 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.config.settings import Config, RosConfig
 from acsard.messages.topics import Direction
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
-from acsard.settings import Config, RosConfig
 
 Transport = Literal["bridge", "rmw"]
 

@@ -1,1 +1,1 @@
-"""The shells: clock, period, serial port, Zenoh bus, logs, the loop that joins them."""
+"""Shell: the control loop and the daemon around it; `daemon.py` reads top to bottom."""

@@ -6,25 +6,24 @@ Synchronous on purpose: the daemon calls `wake` from one task, the tests call it
 from __future__ import annotations
 
 from collections.abc import Callable
-from collections.abc import Set as AbstractSet
-from typing import Literal, Protocol
 
-from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.config.baud import PLAIN_BYTES, wire_ns
+from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
-from acsard.figures import Figures
 from acsard.guard import Guard
+from acsard.incoming.bus import Bus
+from acsard.incoming.commands import Receiver, voice
+from acsard.incoming.queries import Queries
 from acsard.mcu.pace import Pace
+from acsard.mcu.port import Port
 from acsard.mcu.roundtrip import RoundTrip
-from acsard.mcu.wire import PLAIN_BYTES, wire_ns
 from acsard.messages.encodings import DecodeError
-from acsard.messages.incoming import Arrival, Receiver, voice
-from acsard.messages.queries import Queries, Query, Reply
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
 from acsard.robot import Robot
-from acsard.settings import Config
+from acsard.runtime.figures import Figures
 from acsard.values import (
     NS_PER_S,
     Command,
@@ -32,67 +31,16 @@ from acsard.values import (
     Inputs,
     Instant,
     Outputs,
-    Received,
     Refusal,
     Request,
     Snapshot,
 )
-
-Offered = Literal["sent", "superseded", "down"]
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 """What is published of each feedback line."""
 
 QUERIES_PER_STEP = 8
 """Replies built in one step; a crowd of questions waits its turn instead of costing a period."""
-
-
-class Port(Protocol):
-    """The serial port as the loop sees it."""
-
-    is_open: bool
-    opened: int
-    trouble: str
-    sent_ns: int
-    """When the last line had been handed over, monotonic."""
-
-    def take(self) -> tuple[Received, ...]:
-        """What was received since the last call."""
-
-    def offer(self, line: bytes, now: Instant) -> Offered:
-        """Send the line now or not at all."""
-
-
-class BusInput(Struct, frozen=True):
-    """What came over the bus since the last call."""
-
-    arrivals: tuple[Arrival, ...] = ()
-    queries: tuple[Query, ...] = ()
-    overrun: int = 0
-    """Samples dropped because they came faster than they could be taken."""
-
-
-class Bus(Protocol):
-    """The bus as the loop sees it."""
-
-    @property
-    def wanted(self) -> AbstractSet[str]:
-        """Published keys that somebody listens to."""
-
-    def take(self, queries: int) -> BusInput:
-        """What came in since the last call, at most so many queries."""
-
-    def publish(self, key: str, message: Message) -> None:
-        """Send a message to its listeners."""
-
-    def reply(self, reply: Reply) -> None:
-        """Answer a query; the last reply to its number."""
-
-    def done(self, number: int) -> None:
-        """No more replies to this query."""
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
 
 
 class ControlLoop:

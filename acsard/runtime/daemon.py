@@ -15,23 +15,23 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 
 from acsard import __version__
-from acsard.access import access_control
+from acsard.bus.access import access_control
+from acsard.bus.bus import ZenohBus
+from acsard.bus.certificates import check as check_certificates
+from acsard.bus.certificates import ends_ns as ends_ns_of
+from acsard.bus.session import log_from_environment
+from acsard.config.settings import Config
+from acsard.host import clock, real_time
+from acsard.host.logs import Log
+from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.ros.trees import left_out
-from acsard.runtime import clock, real_time
-from acsard.runtime.certificates import check as check_certificates
-from acsard.runtime.certificates import ends_ns as ends_ns_of
 from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.logs import Log
-from acsard.runtime.serial_port import SerialPort
-from acsard.runtime.sim_pty import SimPty
-from acsard.runtime.systemd import PATIENCE_S, Systemd
 from acsard.runtime.ticker import Alarm, Ticker
 from acsard.runtime.wakeup import Wakeup
-from acsard.runtime.zenoh_bus import ZenohBus
-from acsard.runtime.zenoh_session import log_from_environment
-from acsard.settings import Config
+from acsard.serial.port import SerialPort
+from acsard.serial.sim_pty import SimPty
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S
 

@@ -9,7 +9,7 @@ from typing import Self
 
 from msgspec import Struct
 
-from acsard.runtime.timerfd import TimerFd
+from acsard.host.timerfd import TimerFd
 
 
 class Period(Struct, frozen=True):

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
+from acsard.config.settings import DriveConfig, SimConfig
 from acsard.drive.odometry import arc
-from acsard.settings import DriveConfig, SimConfig
 from acsard.values import Pose
 
 

@@ -12,11 +12,11 @@ from tempfile import TemporaryDirectory
 
 from msgspec.structs import replace
 
+from acsard.bench.matching import staircase
+from acsard.bench.record import Record, command_waits, feedback_fates
+from acsard.bench.rig import ACSARD, Rig, free_endpoint
 from acsard.cli.bench import bench_config, write
-from acsard.matching import staircase
-from acsard.runtime.bench_record import Record, command_waits, feedback_fates
-from acsard.runtime.bench_rig import ACSARD, Rig, free_endpoint
-from acsard.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original's way."""

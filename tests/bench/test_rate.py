@@ -17,7 +17,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.runtime.bench_rig import Rig
+from acsard.bench.rig import Rig
 from tests.bench.rigs import config, rig, schedule
 from tests.bench.unlimited import BAUD_RATE
 

@@ -14,8 +14,8 @@ from statistics import median
 
 import pytest
 
-from acsard.runtime.bench_record import feedback_fates
-from acsard.runtime.bench_rig import ACSARD
+from acsard.bench.record import feedback_fates
+from acsard.bench.rig import ACSARD
 from tests.bench.rigs import (
     DRAINING,
     POLLED,

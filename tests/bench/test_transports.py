@@ -20,19 +20,20 @@ from statistics import median
 
 import pytest
 
-from acsard.access import access_control
+from acsard.bench.child import processor_ns
+from acsard.bench.rig import Rig
+from acsard.bus import outlets
+from acsard.bus.access import access_control
+from acsard.bus.bus import ZenohBus
+from acsard.bus.outlets import direct
+from acsard.bus.session import client_session
+from acsard.config.settings import Config
+from acsard.host import clock
 from acsard.messages import encodings
 from acsard.messages.schema import Message
 from acsard.messages.topics import full_key
 from acsard.ros.trees import left_out
-from acsard.runtime import clock, outlets
-from acsard.runtime.bench_child import processor_ns
-from acsard.runtime.bench_rig import Rig
 from acsard.runtime.daemon import SIMULATOR
-from acsard.runtime.outlets import direct
-from acsard.runtime.zenoh_bus import ZenohBus
-from acsard.runtime.zenoh_session import client_session
-from acsard.settings import Config
 from tests.bench.rigs import config, in_turns, rig, sibling
 from tests.unit.messages.test_cdr import odometry
 

@@ -15,8 +15,8 @@ import asyncio
 from msgspec.structs import replace
 
 from acsard.cli.common import load
+from acsard.host.logs import Log
 from acsard.runtime import daemon
-from acsard.runtime.logs import Log
 
 BAUD_RATE = 4_000_000
 """The fastest a terminal can be set to: 33 bytes in 0.08 ms."""

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import WheelMap
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
-from acsard.settings import WheelMap
 from acsard.values import WheelSpeeds
 from tests.firmware.board import checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acsard.config.settings import CommandsConfig, Config, Source
+from acsard.incoming.queries import Query
 from acsard.mcu.pace import IDLE_WAKES
-from acsard.messages.queries import Query
-from acsard.settings import CommandsConfig, Config, Source
 from acsard.values import Outputs
 from tests.scenarios.world import World
 

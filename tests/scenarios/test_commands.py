@@ -5,12 +5,12 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from acsard.config.settings import CommandsConfig, Config, Source
+from acsard.incoming.commands import Arrival, Via
+from acsard.incoming.queries import Query
 from acsard.messages.encodings import encode
-from acsard.messages.incoming import Arrival, Via
-from acsard.messages.queries import Query
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import Attachment
-from acsard.settings import CommandsConfig, Config, Source
 from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 

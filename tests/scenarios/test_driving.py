@@ -8,8 +8,15 @@ from itertools import pairwise
 import msgspec
 import pytest
 
+from acsard.config.settings import (
+    CommandsConfig,
+    Config,
+    ControlConfig,
+    DriveConfig,
+    McuConfig,
+    WheelMap,
+)
 from acsard.messages.schema import JointState, TFMessage, TwistStamped
-from acsard.settings import CommandsConfig, Config, ControlConfig, DriveConfig, McuConfig, WheelMap
 from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 

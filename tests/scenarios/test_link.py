@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 
 import pytest
 
-from acsard.settings import Config, ControlConfig, McuConfig
+from acsard.config.settings import Config, ControlConfig, McuConfig
 from acsard.sim.fake_mcu import FakeMcu
 from tests.scenarios.world import World
 

@@ -14,11 +14,11 @@ from collections.abc import Iterator
 import pytest
 from msgspec.structs import replace
 
+from acsard.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
 from acsard.mcu.check import unseal
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.messages.schema import DiagnosticArray
-from acsard.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
 from acsard.sim import protocol
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Outputs, Received

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.settings import Config, McuConfig, WheelMap
+from acsard.config.settings import Config, McuConfig, WheelMap
 from acsard.sim.faults import Fault
 from acsard.values import WHEELS
 from tests.scenarios.world import World

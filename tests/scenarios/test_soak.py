@@ -17,7 +17,7 @@ from collections import Counter, deque
 import msgspec
 import pytest
 
-from acsard.settings import CommandsConfig, Config, ControlConfig, Source
+from acsard.config.settings import CommandsConfig, Config, ControlConfig, Source
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Outputs
 from tests.scenarios.world import World

@@ -11,14 +11,16 @@ from collections.abc import Callable
 
 import msgspec
 
+from acsard.config.settings import Config
+from acsard.incoming.bus import BusInput
+from acsard.incoming.commands import Arrival
+from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
+from acsard.mcu.port import Offered
 from acsard.mcu.wire import LineGate
-from acsard.messages.incoming import Arrival
-from acsard.messages.queries import Query, Reply
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.topics import PUBLISHED
-from acsard.runtime.control_loop import BusInput, ControlLoop, Offered
-from acsard.settings import Config
+from acsard.runtime.control_loop import ControlLoop
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
 

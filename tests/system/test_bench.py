@@ -12,8 +12,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.cli.bench import bench_config, measure
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import Config, ControlConfig
+from acsard.config.settings import Config, ControlConfig
+from acsard.host.exits import Exit, ExitError
 from tests.system.harness import (
     ZERO_LINE,
     Daemon,
@@ -102,7 +102,10 @@ def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason()
 
 @pytest.mark.parametrize(
     ("words", "who"),
-    [("acsard run", "the daemon"), ("bench_wire", "the simulated microcontroller's process")],
+    [
+        ("acsard run", "the daemon"),
+        ("acsard.bench.wire", "the simulated microcontroller's process"),
+    ],
 )
 def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str, who: str) -> None:
     with Program(acsard("bench", "--seconds", "30"), tmp_path) as bench:

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from acsard.client import AsyncClient, Client, connect, connect_async
+from acsard.host.exits import ExitError
 from acsard.messages import schema
-from acsard.runtime.exits import ExitError
 from tests.system.harness import (
     ROOT,
     Bus,

@@ -22,11 +22,11 @@ import zenoh.ext
 from msgspec.structs import astuple
 
 from acsard.cli.certificates import Authority
-from acsard.config import parse
+from acsard.config.parsing import parse
+from acsard.config.rules import warnings
+from acsard.config.settings import Config
+from acsard.host.exits import Exit
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
-from acsard.rules import warnings
-from acsard.runtime.exits import Exit
-from acsard.settings import Config
 from tests.system.harness import (
     ROOT,
     ZERO,

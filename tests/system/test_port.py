@@ -7,8 +7,8 @@ import os
 import tty
 from collections.abc import Sequence
 
-from acsard.runtime import clock
-from acsard.runtime.serial_port import STALE_NS, SerialPort
+from acsard.host import clock
+from acsard.serial.port import STALE_NS, SerialPort
 from acsard.values import Instant
 
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"

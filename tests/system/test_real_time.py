@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.runtime.real_time import DOZE
+from acsard.host.real_time import DOZE
 from tests.system.harness import Bus, Daemon
 
 POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import inspect
 from msgspec.structs import FieldInfo, fields
 
-from acsard.settings import Config, Source
+from acsard.config.settings import Config, Source
 
 Bounded = inspect.FloatType | inspect.IntType
 

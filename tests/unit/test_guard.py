@@ -9,13 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import (
+    CommandsConfig,
+    Config,
+    DriveConfig,
+    LimitsConfig,
+    Source,
+    WheelMap,
+)
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
 from acsard.guard import Guard
 from acsard.mcu.check import seal
 from acsard.mcu.frames import Codec
 from acsard.robot import Robot
-from acsard.settings import CommandsConfig, Config, DriveConfig, LimitsConfig, Source, WheelMap
 from acsard.values import (
     REST,
     STILL,

@@ -9,9 +9,7 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
-from acsard.mcu.frames import Codec
-from acsard.robot import Robot
-from acsard.settings import (
+from acsard.config.settings import (
     CommandsConfig,
     Config,
     ControlConfig,
@@ -19,6 +17,8 @@ from acsard.settings import (
     McuConfig,
     Source,
 )
+from acsard.mcu.frames import Codec
+from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,
     REST,

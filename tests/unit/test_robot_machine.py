@@ -22,9 +22,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from acsard.guard import Guard
-from acsard.robot import Robot
-from acsard.settings import (
+from acsard.config.settings import (
     CommandsConfig,
     Config,
     ControlConfig,
@@ -32,6 +30,8 @@ from acsard.settings import (
     McuConfig,
     Source,
 )
+from acsard.guard import Guard
+from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,
     REST,

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from acsard import values
-from acsard.config import ConfigError
+from acsard.config.parsing import ConfigError
 from acsard.mcu.frames import FrameError
 from acsard.messages.encodings import DecodeError
 from acsard.values import WHEELS, AcsardError, WheelSpeeds

@@ -12,7 +12,7 @@ from acsard.checkup import advice, procedure
 from acsard.checkup.bench import Bench
 from acsard.checkup.findings import Finding
 from acsard.cli.sim import fault
-from acsard.settings import Config
+from acsard.config.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.faults import ARGUMENTS
 from acsard.sim.virtual_wire import VirtualWire

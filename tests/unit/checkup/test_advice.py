@@ -6,9 +6,9 @@ import tomllib
 
 from acsard.checkup import advice
 from acsard.checkup.findings import Finding
-from acsard.config import parse
-from acsard.rules import contradictions
-from acsard.settings import Config
+from acsard.config.parsing import parse
+from acsard.config.rules import contradictions
+from acsard.config.settings import Config
 from tests.unit.checkup.robots import configured
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from acsard.checkup.bench import REST_S, SLOWEST_S, SPEED, ZERO, Bench
 from acsard.checkup.findings import StoppedError
-from acsard.settings import Config, McuConfig, SimConfig
+from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Robot
 

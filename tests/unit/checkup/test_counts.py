@@ -10,8 +10,8 @@ from acsard.checkup import counts
 from acsard.checkup.dialect import check, identity
 from acsard.checkup.motion import Reply
 from acsard.checkup.turning import turn
+from acsard.config.settings import Config, SimConfig
 from acsard.mcu.check import Reading
-from acsard.settings import Config, SimConfig
 from tests.unit.checkup.robots import Robot
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from acsard.checkup import dialect
 from acsard.checkup.findings import StoppedError
-from acsard.settings import Config, McuConfig
+from acsard.config.settings import Config, McuConfig
 from tests.unit.checkup.robots import Checked, Robot
 
 

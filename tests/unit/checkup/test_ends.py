@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.checkup import ends
-from acsard.settings import McuConfig
+from acsard.config.settings import McuConfig
 
 MCU = McuConfig()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.checkup.outside import Operator, Wire
-from acsard.settings import Config
+from acsard.config.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Nobody

@@ -12,8 +12,8 @@ import pytest
 from acsard.checkup import procedure
 from acsard.checkup.bench import FAREWELL, SPEED
 from acsard.checkup.findings import Finding, WireLostError
+from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.frames import Codec
-from acsard.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.sim import protocol
 from acsard.values import WHEELS
 from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured

@@ -7,7 +7,7 @@ import pytest
 from acsard.checkup import turning
 from acsard.checkup.bench import SPEED
 from acsard.checkup.wheels import Channel
-from acsard.settings import Config, SimConfig
+from acsard.config.settings import Config, SimConfig
 from tests.unit.checkup.robots import Nobody, Robot
 
 

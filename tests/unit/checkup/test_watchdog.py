@@ -7,7 +7,7 @@ import pytest
 from acsard.checkup import dialect, watchdog
 from acsard.checkup.bench import SPEED
 from acsard.checkup.turning import turn
-from acsard.settings import Config, SimConfig
+from acsard.config.settings import Config, SimConfig
 from acsard.sim import protocol
 from tests.unit.checkup.robots import Robot
 

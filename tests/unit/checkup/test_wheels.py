@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
+from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.frames import Motors
-from acsard.settings import McuConfig, WheelMap
 
 MCU = McuConfig()
 

@@ -9,13 +9,13 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from acsard.bench.matching import Summary, staircase
+from acsard.bench.table import OWN, POINTS, Machine, Result, table, this_machine
 from acsard.cli.bench import bench_config, check_device, duration, write
-from acsard.cli.bench_table import OWN, POINTS, Machine, Result, table, this_machine
-from acsard.config import parse
-from acsard.figures import NAMES
-from acsard.matching import Summary, staircase
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
+from acsard.config.parsing import parse
+from acsard.config.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
+from acsard.host.exits import Exit, ExitError
+from acsard.runtime.figures import NAMES
 
 RESULT = Result(
     machine=Machine("a processor", 4, "6.1", "3.13.0", "0.1.0", realtime_permitted=False),

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.cli.check import main, toml
-from acsard.config import effective, from_builtins, parse
-from acsard.runtime.exits import ExitError
-from acsard.settings import Config, McuConfig
+from acsard.config.parsing import effective, from_builtins, parse
+from acsard.config.settings import Config, McuConfig
+from acsard.host.exits import ExitError
 from tests.unit.keys import KEYS
 
 CONFIGS = [

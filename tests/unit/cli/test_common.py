@@ -9,8 +9,8 @@ import pytest
 
 from acsard.cli import common
 from acsard.cli.common import PLACES, find, load, robot_address
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import Config
+from acsard.config.settings import Config
+from acsard.host.exits import Exit, ExitError
 
 
 class Places:

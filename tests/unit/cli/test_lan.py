@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
-from acsard.config import parse
-from acsard.runtime.exits import Exit
+from acsard.config.parsing import parse
+from acsard.host.exits import Exit
 
 ROLES = ("viewer", "operator", "maintainer")
 

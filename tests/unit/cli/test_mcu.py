@@ -17,9 +17,9 @@ from msgspec import structs
 from acsard.checkup.findings import Finding
 from acsard.cli import mcu
 from acsard.cli.person import Person
-from acsard.config import parse
-from acsard.runtime.exits import Exit, ExitError
-from acsard.settings import Config
+from acsard.config.parsing import parse
+from acsard.config.settings import Config
+from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
 
@@ -80,7 +80,7 @@ def test_findings_are_told_also_when_the_file_cannot_be_written(
     def full(*given: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("acsard.cli.config_file._replace", full)
+    monkeypatch.setattr("acsard.host.files.replace", full)
     with pytest.raises(ExitError, match="No space left"):
         called(tmp_path, "--port", "sim", "--yes", "--json", "--write")
     assert json.loads(capsys.readouterr().out)["written"] is None

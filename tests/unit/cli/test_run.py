@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from acsard.cli import run
-from acsard.config import parse
-from acsard.settings import Config, McuConfig
+from acsard.config.parsing import parse
+from acsard.config.settings import Config, McuConfig
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:

@@ -8,14 +8,14 @@ import sys
 import pytest
 
 from acsard.cli import top
-from acsard.runtime.exits import Exit, ExitError
+from acsard.host.exits import Exit, ExitError
 
 
 def test_without_its_library_it_says_which_extra_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.delitem(sys.modules, "acsard.cli.top_view")
-    monkeypatch.delattr("acsard.cli.top_view")
+    monkeypatch.delitem(sys.modules, "acsard.top.view")
+    monkeypatch.delattr("acsard.top.view")
     monkeypatch.setitem(sys.modules, "rich.console", None)  # as if it were not installed
     with pytest.raises(ExitError, match=r"pip install 'acsard\[top\]'") as told:
         top.main(argparse.Namespace())

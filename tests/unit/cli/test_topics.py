@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from acsard.cli.topics import ros_table
+from acsard.config.settings import Config, RosConfig
 from acsard.messages.topics import PUBLISHED
 from acsard.ros.trees import PARAMETERS, ros_names
-from acsard.settings import Config, RosConfig
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:

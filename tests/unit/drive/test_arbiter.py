@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import CommandsConfig, Source
 from acsard.drive.arbiter import Arbiter, Choice, Freshness
-from acsard.settings import CommandsConfig, Source
 from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
 
 MS = 1_000_000

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import DriveConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.settings import DriveConfig
 from acsard.values import REST, STILL, Twist, WheelSpeeds
 from tests.vectors.drive import CALIBRATED, TWIST_OF_WHEELS, WHEELS_OF_TWIST
 

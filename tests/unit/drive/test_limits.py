@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import DriveConfig, LimitsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
-from acsard.settings import DriveConfig, LimitsConfig
 from acsard.values import REST, Twist
 
 DT = 0.01

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
 from acsard.mcu.feedback import Feedback
-from acsard.settings import DriveConfig, OdometryConfig
 from acsard.values import Instant, Pose, PoseCovariance, Sample, Twist, WheelSpeeds
 from tests.vectors.drive import (
     PATHS,

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import FeedbackConfig
 from acsard.drive.sanity import Sanity
 from acsard.mcu.feedback import Feedback
-from acsard.settings import FeedbackConfig
 from acsard.values import STILL, WHEELS, Instant, WheelSpeeds
 
 DT = 0.01

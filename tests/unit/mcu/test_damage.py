@@ -14,11 +14,11 @@ from collections import Counter
 
 import pytest
 
+from acsard.config.settings import FeedbackConfig, WheelMap
 from acsard.drive.sanity import Sanity
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
-from acsard.settings import FeedbackConfig, WheelMap
 from acsard.values import STILL, Instant, WheelSpeeds
 
 KINDS = ("bit flipped", "byte lost", "byte doubled", "lines merged", "noise")

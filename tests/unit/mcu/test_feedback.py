@@ -6,10 +6,10 @@ import math
 
 import pytest
 
+from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.check import Reading
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec
-from acsard.settings import McuConfig, WheelMap
 from acsard.values import Instant, WheelSpeeds
 
 MS = 1_000_000

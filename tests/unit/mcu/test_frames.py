@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import DriveConfig, Motor, WheelMap
 from acsard.drive.kinematics import Kinematics
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
-from acsard.settings import DriveConfig, Motor, WheelMap
 from acsard.values import Twist, WheelSpeeds
 from tests.vectors.lines import (
     ACCEPTED,

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.settings import McuConfig
 from acsard.mcu.check import Checked, Reading
 from acsard.mcu.frames import FrameError
 from acsard.mcu.negotiation import (
@@ -16,7 +17,6 @@ from acsard.mcu.negotiation import (
     WINDOW,
     Negotiation,
 )
-from acsard.settings import McuConfig
 
 MS = 1_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.config.baud import wire_ns
+from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.check import seal
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import BAD_LINES, GOOD_LINES, LONG_GAP_NS, McuSession
-from acsard.mcu.wire import wire_ns
-from acsard.settings import McuConfig, WheelMap
 from acsard.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
 

@@ -12,6 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.config.settings import (
+    BusConfig,
+    Config,
+    ControlConfig,
+    FootprintConfig,
+    LidarConfig,
+    McuConfig,
+    OdometryConfig,
+    RatesConfig,
+    RobotConfig,
+)
 from acsard.messages.report import Report, from_rpy, from_yaw
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -30,17 +41,6 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.messages.topics import PUBLISHED
-from acsard.settings import (
-    BusConfig,
-    Config,
-    ControlConfig,
-    FootprintConfig,
-    LidarConfig,
-    McuConfig,
-    OdometryConfig,
-    RatesConfig,
-    RobotConfig,
-)
 from acsard.values import Instant, Outputs, Sample, Snapshot
 from tests.unit.messages.examples import OUTPUTS, SAMPLE, SNAPSHOT, START, at, later
 

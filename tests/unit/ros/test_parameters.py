@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from acsard.config import effective
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
 from acsard.messages.cdr import Cdr, CdrError
 from acsard.ros import parameters as rcl
 from acsard.ros.parameters import Parameters
 from acsard.ros.trees import PARAMETER_SERVICES
-from acsard.settings import Config
 
 TABLES: dict[str, object] = {
     "robot": {"id": "acsar"},

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.config.settings import (
+    CommandsConfig,
+    Config,
+    FootprintConfig,
+    LidarConfig,
+    OdometryConfig,
+    RosConfig,
+)
 from acsard.messages.topics import TOPICS
 from acsard.ros.names import TYPE_HASHES
 from acsard.ros.trees import (
@@ -14,14 +22,6 @@ from acsard.ros.trees import (
     left_out,
     node_tokens,
     ros_names,
-)
-from acsard.settings import (
-    CommandsConfig,
-    Config,
-    FootprintConfig,
-    LidarConfig,
-    OdometryConfig,
-    RosConfig,
 )
 
 ZID = "abc"

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.settings import Config, McuConfig, SimConfig
+from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.sim.fake_mcu import MS, RESET_NS, WATCHDOG_NS, FakeMcu
 from acsard.sim.faults import FAULTS
 

@@ -7,8 +7,8 @@ from typing import get_args
 
 import pytest
 
+from acsard.config.settings import Baud, WheelMap
 from acsard.mcu.frames import Codec
-from acsard.settings import Baud, WheelMap
 from acsard.sim.garble import garbled
 
 LINE = Codec(WheelMap()).stop

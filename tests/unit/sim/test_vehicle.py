@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.settings import DriveConfig, SimConfig
+from acsard.config.settings import DriveConfig, SimConfig
 from acsard.sim.vehicle import Vehicle
 
 LAG = 0.1

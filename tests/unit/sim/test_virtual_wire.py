@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.config.settings import Config, WheelMap
 from acsard.mcu.frames import Codec
-from acsard.settings import Config, WheelMap
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
 

@@ -1,0 +1,1 @@
+"""Shell: `acsard bench`: a daemon measured from outside, on one clock."""

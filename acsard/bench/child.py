@@ -1,0 +1,61 @@
+"""The processes of a benchmark: how one is ended, why one ended by itself, what one costs."""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import subprocess
+from pathlib import Path
+
+from acsard.host.exits import Exit, ExitError
+
+END_S = 5.0
+"""An end takes 0.2 s."""
+
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+def end_with_us() -> None:
+    """In the child: a parent that is killed leaves no daemon behind."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def leave(process: subprocess.Popen[bytes]) -> None:
+    """End a child: it is asked first."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def ended(who: str, code: int, said: str = "") -> ExitError:
+    """An end that nobody asked for, in words."""
+    how = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+    return ExitError(Exit.FAILURE, f"{who} {how}" + (f": {said}" if said else ""))
+
+
+def daemon_ended(code: int, log: Path) -> ExitError:
+    """Why the daemon ended by itself: its own reason and code become ours if it gave them."""
+    lines = log.read_text(errors="replace").splitlines()
+    # What it logs is in JSON, why it ended in words.
+    said = [line for line in lines if line.strip() and not line.startswith("{")]
+    if code in Exit.__members__.values() and code and said:
+        return ExitError(Exit(code), said[-1].removeprefix("acsard: "))
+    return ended("the daemon", code, said[-1] if said else "")
+
+
+def processor_ns(pid: int) -> int:
+    """Processor time of all threads of a process so far."""
+    return sum(
+        int(task.joinpath("schedstat").read_text().split()[0])
+        for task in Path(f"/proc/{pid}/task").iterdir()
+    )
+
+
+def resident_mb(pid: int) -> float:
+    """Memory in use."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0]) / 1024

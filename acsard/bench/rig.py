@@ -1,0 +1,280 @@
+"""A daemon under measurement: started as a user starts it, with both its ends in our hands.
+
+    bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  wire.py (simulated MCU)
+
+Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
+taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
+what they mean (`record.py`). Any program that takes `--config` and `--port` and speaks the
+same keys can stand in the daemon's place.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import msgspec
+import zenoh
+
+from acsard.bench.child import END_S, daemon_ended, end_with_us, ended, leave, processor_ns
+from acsard.bench.record import Record, Sample, Seen, Sent
+from acsard.bench.wire import Part
+from acsard.bus.outlets import direct
+from acsard.bus.session import client_session
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.drive.kinematics import Kinematics
+from acsard.host import clock
+from acsard.host.exits import Exit, ExitError
+from acsard.mcu.frames import Codec
+from acsard.messages.encodings import Decoder, encode, encoding_name
+from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
+from acsard.messages.topics import full_key
+from acsard.values import NS_PER_S, Instant, WheelSpeeds
+
+T = TypeVar("T")
+
+ACSARD = (sys.executable, "-m", "acsard", "run")
+
+START_S = 15.0
+"""A start takes 0.3 s, and 2 s more where opening the port resets the board."""
+
+SETTLED = 10
+"""Odometry samples after which the link is up and the start is over."""
+
+LOOK_S = 0.5
+"""Between two looks at whether all processes are there."""
+
+FAR_END = "the simulated microcontroller's process"
+
+SPACING_S = (0.02, 0.06)
+"""Between two commands, evenly spread: they fall anywhere within a period."""
+
+
+def free_endpoint() -> str:
+    """A loopback address nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Rig:
+    """Enter it to have the program up and linked; `end` gives what was recorded."""
+
+    def __init__(
+        self,
+        config: Config,
+        file: Path,
+        *,
+        words: Sequence[str] = ACSARD,
+        port: str = "",
+        unprompted: float = 0.0,
+        wire_baud_rate: int = 0,
+    ) -> None:
+        self._config, self._file, self._words, self._port = config, file, words, port
+        self._part = Part(effective(config), unprompted, wire_baud_rate)
+        self._endpoint = config.bus.listen[0]
+        self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
+        self._kinematics = Kinematics(config.drive)
+        self._stack = ExitStack()
+        self._wire: subprocess.Popen[bytes] | None = None
+        self._session: zenoh.Session | None = None
+        self._arrived: list[tuple[Instant, bytes]] = []
+        self._sent: list[Sent] = []
+        self._began_ns = self._settled_ns = 0
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            where = Path(stack.enter_context(TemporaryDirectory(prefix="acsard-bench-")))
+            self._log = where / "log"
+            port = self._port or self._start_wire(stack, where)
+            self._start_program(stack, port)
+            session = self._session = self._wait(self._connect, f"answer at {self._endpoint}")
+            stack.callback(session.close)
+            key = full_key(self._config.robot.id, "odom")
+            self._kept = session.declare_subscriber(key, direct(self._odometry))
+            self._publisher = session.declare_publisher(
+                full_key(self._config.robot.id, f"cmd/{self._config.commands.sources[0].name}"),
+                encoding=encoding_name("msgpack", "Twist"),
+                express=True,
+            )
+            self._wait(lambda: len(self._arrived) >= SETTLED or None, "odometry on the bus")
+            self._settled_ns = clock.mono_ns()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    # starting
+
+    def _start_wire(self, stack: ExitStack, where: Path) -> str:
+        part = where / "part.json"
+        part.write_bytes(msgspec.json.encode(self._part))
+        wire = self._wire = subprocess.Popen(
+            [sys.executable, "-m", "acsard.bench.wire", str(part)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        stack.callback(leave, wire)
+        assert wire.stdout is not None
+        device = wire.stdout.readline().decode().strip()
+        if not device:
+            raise ended(FAR_END, wire.wait())
+        return device
+
+    def _start_program(self, stack: ExitStack, port: str) -> None:
+        hidden = ("INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG")
+        words = [*self._words, "--config", str(self._file), "--port", port]
+        with self._log.open("wb") as log:
+            self._began_ns = clock.mono_ns()
+            self.process = subprocess.Popen(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                env={key: value for key, value in os.environ.items() if key not in hidden},
+                start_new_session=True,
+                preexec_fn=end_with_us,
+            )
+        stack.callback(leave, self.process)
+
+    def _connect(self) -> zenoh.Session | None:
+        try:
+            return client_session(self._endpoint)
+        except ExitError:
+            return None
+
+    def _wait(self, look: Callable[[], T | None], what: str) -> T:
+        deadline_ns = clock.mono_ns() + int(START_S * NS_PER_S)
+        while True:
+            self._alive()
+            found = look()
+            if found is not None:
+                return found
+            if clock.mono_ns() > deadline_ns:
+                raise ExitError(Exit.FAILURE, f"no {what} within {START_S:g} s{self._why()}")
+            time.sleep(0.01)
+
+    def _why(self) -> str:
+        """What the daemon waits for, if it can be asked."""
+        try:
+            return f": {self.state().reason}"
+        except ExitError:
+            return ""
+
+    def _alive(self) -> None:
+        """Raises the program's own end as ours, and that of the wire."""
+        if self._wire is not None and self._wire.poll() is not None:
+            raise ended(FAR_END, self._wire.returncode)
+        code = self.process.poll()
+        if code is not None:
+            raise daemon_ended(code, self._log)
+
+    # measuring
+
+    def _odometry(self, sample: zenoh.Sample) -> None:
+        self._arrived.append((clock.now(), sample.payload.to_bytes()))
+
+    def follow(self, seconds: float) -> float:
+        """Only listen for so long; the share of a core the program took."""
+        began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
+        end_ns = began_ns + int(seconds * NS_PER_S)
+        while (left_ns := end_ns - clock.mono_ns()) > 0:
+            time.sleep(min(LOOK_S, left_ns / NS_PER_S))
+            self._alive()
+        return self._share(began_ns, used_ns)
+
+    def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
+        """Command at random phases for so long; the share of a core the program took.
+
+        `wheel_speed` gives the speed of all wheels of the n-th command, rad/s.
+        """
+        phases, number = random.Random(seed), 0
+        self._put(0.0)  # neutral first
+        time.sleep(0.2)
+        began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
+        while clock.mono_ns() - began_ns < seconds * NS_PER_S:
+            time.sleep(phases.uniform(*SPACING_S))
+            self._alive()
+            self._sent.append(self._put(wheel_speed(number)))
+            number += 1
+        time.sleep(0.1)  # the last one's line
+        self._put(0.0)
+        return self._share(began_ns, used_ns)
+
+    def _share(self, began_ns: int, used_ns: int) -> float:
+        self._alive()
+        used_ns = processor_ns(self.process.pid) - used_ns
+        return used_ns / (clock.mono_ns() - began_ns)
+
+    def _put(self, wheel_speed: float) -> Sent:
+        speeds = WheelSpeeds(wheel_speed, wheel_speed, wheel_speed, wheel_speed)
+        twist = self._kinematics.twist(speeds)
+        message = Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+        payload, line = encode(message, "msgpack"), self._codec.encode(speeds).rstrip(b",\r\n")
+        at_ns = clock.mono_ns()
+        self._publisher.put(payload)
+        return Sent(at_ns, line)
+
+    def deaf(self) -> None:
+        """Listen to the odometry no longer."""
+        self._kept.undeclare()
+
+    def state(self) -> RobotState:
+        """What the daemon says of itself."""
+        key = full_key(self._config.robot.id, "state")
+        for reply in self._session.get(key, timeout=3.0) if self._session else ():
+            if reply.ok is not None:
+                sample: Any = reply.ok
+                return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
+        raise ExitError(Exit.UNREACHABLE, f"no answer on {key}")
+
+    def leave(self) -> None:
+        """End the program."""
+        leave(self.process)
+
+    def end(self) -> Record:
+        """End the program and tell what was recorded; the rig is used up."""
+        window_ns = (self._settled_ns, clock.mono_ns())
+        time.sleep(0.1)  # what was under way
+        self._alive()
+        self.leave()
+        seen = None if self._wire is None else _told(self._wire)
+        decoder = Decoder(Odometry)
+        samples = []
+        for at, payload in self._arrived:
+            if at.mono_ns < self._settled_ns:
+                continue
+            odometry = decoder.decode(encoding_name("msgpack"), payload)
+            stamp = odometry.header.stamp
+            stamp_ns = stamp.sec * NS_PER_S + stamp.nanosec
+            samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
+        return Record(self._began_ns, window_ns, seen, self._sent, samples)
+
+
+def _told(wire: subprocess.Popen[bytes]) -> Seen:
+    """End the far end; all it saw."""
+    assert wire.stdin is not None
+    assert wire.stdout is not None
+    wire.stdin.close()
+    told = wire.stdout.read()
+    if wire.wait(END_S):
+        raise ended(FAR_END, wire.returncode)
+    return msgspec.msgpack.decode(told, type=Seen)

@@ -1,0 +1,203 @@
+"""Who may do what: the topic table and the ROS names -> Zenoh access rules, default deny.
+
+Zenoh checks them at the daemon's own session, against the neighbour on the link: who is behind a
+router has the router's rights. A rule holds for a key expression that it includes, so what may be
+asked with a wildcard has to be allowed with one. What Zenoh lets pass is checked again in code
+(exact key, kind PUT, listed source).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, TypedDict
+
+from acsard.config.settings import Config
+from acsard.messages.topics import PUBLISHED, TOPICS, full_key
+from acsard.ros.trees import PARAMETERS, Endpoint, endpoints
+from acsard.values import ROOT, Verb
+
+Role = Literal["viewer", "operator", "maintainer"]
+
+SERVICE_ROLES: dict[Verb, Role] = {
+    "stop": "viewer",
+    "clear": "operator",
+    "activate": "operator",
+    "deactivate": "operator",
+    "reset_odometry": "operator",
+    "set_pose": "maintainer",
+}
+"""The least role that may call each service: whoever sees the robot may stop it."""
+
+LOCAL_LINKS = ("tcp",)
+"""Links without a certificate. They do not leave the machine unless `bus.insecure` lets them."""
+
+TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
+"""The liveliness tokens of the ROS trees."""
+
+SPOKEN = (
+    "declare_subscriber",
+    "declare_queryable",
+    "reply",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
+"""The messages a daemon sends by itself: data, answers, and what it has and listens to."""
+
+GRANTS: dict[Role, tuple[str, ...]] = {
+    "viewer": ("speak", "tell", "watch", "ask", "halt"),
+    "operator": ("speak", "tell", "watch", "ask", "halt", "command", "operate"),
+    "maintainer": (
+        "speak",
+        "tell",
+        "watch",
+        "appear",
+        "ask",
+        "halt",
+        "command",
+        "operate",
+        "maintain",
+    ),
+}
+"""The rules each role has. A router is a maintainer, and tells of other robots that are alive."""
+
+LOCAL = (*GRANTS["maintainer"], "look", "overhear", "err", "forge")
+"""Who is at the machine may also look with any wildcard, hear commands, and be wrong: what is put
+on other keys is refused in code, which says why and counts it; but nobody speaks in the robot's
+place."""
+
+
+Flow = Literal["ingress", "egress"]
+
+Permission = Literal["allow", "deny"]
+"""Where both hold, Zenoh denies."""
+
+
+class Rule(TypedDict):
+    """One rule of Zenoh's `access_control`."""
+
+    id: str
+    permission: Permission
+    flows: list[Flow]
+    messages: list[str]
+    key_exprs: list[str]
+
+
+class _Keys:
+    """Every key of one robot, native and ROS, by what is done with it."""
+
+    def __init__(self, config: Config) -> None:
+        robot = config.robot.id
+        self._robot, self._ros = robot, endpoints(config.ros, "*")
+        ros = self._ros
+        self.all = full_key(robot, "**")
+        self.alive = full_key(robot, "alive")
+        self.config = full_key(robot, "config")
+        self.stop = full_key(robot, "stop")
+        self.published = [full_key(robot, topic.key) for topic in PUBLISHED] + _of(ros, "out")
+        latched = [full_key(robot, topic.key) for topic in PUBLISHED if topic.latched]
+        latched += [e.key for e in ros if e.latched]
+        self.kept = [f"{key}/@adv/**" for key in latched]
+        """Where Zenoh's advanced publishers keep samples for those who come late."""
+        self.heard = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "in"]
+        self.heard += _of(ros, "in")
+        """What the daemon subscribes to, whoever sends."""
+        sources = [source.name for source in config.commands.sources]
+        self.commands = [full_key(robot, f"{k}/{s}") for k in ("cmd", "wheel_cmd") for s in sources]
+        self.commands += [
+            e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
+        ]
+        """What listed sources send on."""
+        asked = [t for t in TOPICS if t.direction == "query" and not t.key.startswith("srv/")]
+        self.questions = [full_key(robot, t.pattern) for t in asked if t.key != "config"]
+        self.parameters = [e.key for e in ros if e.native.startswith(PARAMETERS)]
+
+    def of(self, verb: Verb) -> list[str]:
+        """The keys of a service."""
+        native = f"srv/{verb}"
+        return [full_key(self._robot, native)] + [e.key for e in self._ros if e.native == native]
+
+
+def access_control(config: Config) -> dict[str, object]:
+    """The value of Zenoh's `access_control` for the session of this daemon."""
+    rules = _rules(_Keys(config))
+    access = config.access
+    names: dict[Role, tuple[str, ...]] = {
+        "viewer": access.viewers,
+        "operator": access.operators,
+        "maintainer": access.maintainers,
+    }
+    # A certificate counts on a link that was authenticated by it.
+    subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": list(LOCAL_LINKS)}}
+    subjects |= {
+        role: {"link_protocols": ["tls"], "cert_common_names": list(held)}
+        for role, held in names.items()
+        if held
+    }
+    granted: dict[str, tuple[str, ...]] = {"local": LOCAL, **{r: GRANTS[r] for r in GRANTS}}
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule for rule in rules.values() if rule["key_exprs"]],
+        "subjects": [{"id": name, **subject} for name, subject in subjects.items()],
+        "policies": [
+            {
+                "rules": [rule for rule in granted[name] if rules[rule]["key_exprs"]],
+                "subjects": [name],
+            }
+            for name in subjects
+        ],
+    }
+
+
+def _rules(keys: _Keys) -> dict[str, Rule]:
+    def services(role: Role) -> list[str]:
+        return [k for verb, least in SERVICE_ROLES.items() if least == role for k in keys.of(verb)]
+
+    tokens = [keys.alive, *keys.kept, *TOKENS]
+    answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
+    answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
+    watching = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    seen = [f"{ROOT}/**", *keys.published, *tokens]
+    maintained = [*services("maintainer"), keys.config, *keys.parameters, keys.all]
+    rules = (
+        _rule("speak", "egress", SPOKEN, [*answered, *keys.heard, *tokens]),
+        _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
+        _rule("overhear", "egress", ["put"], keys.heard),
+        _rule("watch", "ingress", watching, seen),
+        _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.kept]),
+        _rule(
+            "ask",
+            "ingress",
+            ["query"],
+            [*keys.published, *keys.kept, *keys.questions, *services("viewer")],
+        ),
+        _rule("halt", "ingress", ["put"], [keys.stop]),
+        _rule("command", "ingress", ["put"], keys.commands),
+        _rule("operate", "ingress", ["query"], services("operator")),
+        _rule("maintain", "ingress", ["query"], maintained),
+        _rule("look", "ingress", ["declare_subscriber"], ["**"]),
+        _rule("err", "ingress", ["put", "delete"], ["**"]),
+        _rule("forge", "ingress", ["put", "delete"], [*answered, *tokens], "deny"),
+    )
+    return {rule["id"]: rule for rule in rules}
+
+
+def _rule(
+    name: str,
+    flow: Flow,
+    messages: Sequence[str],
+    keys: Sequence[str],
+    permission: Permission = "allow",
+) -> Rule:
+    return {
+        "id": name,
+        "permission": permission,
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(dict.fromkeys(keys)),
+    }
+
+
+def _of(ros: Sequence[Endpoint], direction: str) -> list[str]:
+    return [e.key for e in ros if e.direction == direction]

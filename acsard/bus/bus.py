@@ -1,0 +1,171 @@
+"""Owns the Zenoh session: declares every key, and hands on what came in and what goes out.
+
+Whatever may block (open, declare, reply, close) runs in a thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from types import TracebackType
+
+import zenoh
+
+from acsard.bus.inbox import Inbox
+from acsard.bus.outlets import Outlets, direct
+from acsard.bus.replies import Replies
+from acsard.bus.session import daemon_session
+from acsard.config.settings import BusConfig, RosConfig
+from acsard.host import clock
+from acsard.host.exits import Exit, ExitError
+from acsard.host.threads import in_thread
+from acsard.incoming.bus import BusInput
+from acsard.incoming.queries import Reply
+from acsard.messages.encodings import encoding_name
+from acsard.messages.schema import Message
+from acsard.messages.topics import PUBLISHED, TOPICS, full_key
+from acsard.ros.tokens import gid
+from acsard.ros.trees import Endpoint, command_keys, endpoints, node_tokens
+
+OPEN_TIMEOUT_S = 10.0
+CLOSE_TIMEOUT_S = 0.3
+
+TWIN_PATIENCE_S = 0.5
+"""How long to listen for another daemon with our id before claiming it."""
+
+
+class ZenohBus:
+    """The robot's keys on the bus, while entered."""
+
+    def __init__(
+        self,
+        bus: BusConfig,
+        ros: RosConfig,
+        silent: frozenset[str],
+        robot_id: str,
+        sources: tuple[str, ...],
+        access: dict[str, object],
+        wake: Callable[[], None],
+    ) -> None:
+        self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
+        self._access, self._silent = access, silent
+        prefix = full_key(robot_id, "")
+        self._replies = Replies(prefix)
+        self._inbox = Inbox(prefix, self._replies, sources, wake)
+        self._outlets = Outlets()
+        self._session: zenoh.Session | None = None
+        self._kept: list[object] = []
+        """Declared entities: Zenoh undeclares what is no longer referred to."""
+
+    # the control loop's view
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Published keys that somebody listens to, in whatever tree."""
+        return self._outlets.wanted
+
+    def take(self, queries: int) -> BusInput:
+        """What came in since the last call, at most so many queries."""
+        return self._inbox.take(queries)
+
+    def publish(self, key: str, message: Message) -> None:
+        """Send a message to its listeners."""
+        self._outlets.publish(key, message)
+
+    def reply(self, reply: Reply) -> None:
+        """Answer a query."""
+        self._replies.send(reply)
+
+    def done(self, number: int) -> None:
+        """No more replies to this query."""
+        self._replies.done(number)
+
+    def alert(self, on: bool) -> None:
+        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
+        self._inbox.alert(on)
+
+    # opening
+
+    async def __aenter__(self) -> ZenohBus:
+        # A client has nothing to do without its router, and waits for it.
+        await in_thread(self._open, OPEN_TIMEOUT_S if self._settings.mode == "peer" else None)
+        self._replies.start()
+        return self
+
+    def _open(self) -> None:
+        settings, limited = self._settings, command_keys(self._ros)
+        session = daemon_session(settings, self._id, self._sources, limited, self._access)
+        self._session = self._replies.session = session
+        self._inbox.own_id = session.new_timestamp().get_id()
+        if settings.connect and self._twin(session):
+            session.close()
+            raise ExitError(
+                Exit.IN_USE,
+                f"another daemon on this bus already is {self._id}; "
+                "give this robot its own robot.id",
+            )
+        self._declare_native(session)
+        zid = str(session.zid())
+        for endpoint in endpoints(self._ros, zid, self._silent):
+            self._declare_ros(session, endpoint)
+        for token in (full_key(self._id, "alive"), *node_tokens(self._ros, zid)):
+            self._kept.append(session.liveliness().declare_token(token))
+
+    def _twin(self, session: zenoh.Session) -> bool:
+        token = full_key(self._id, "alive")
+        others = session.liveliness().declare_subscriber(token, history=True)
+        deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * 1e9)
+        found = None
+        while found is None and clock.now().mono_ns < deadline_ns:
+            time.sleep(0.01)
+            found = others.try_recv()
+        others.undeclare()
+        return found is not None
+
+    def _declare_native(self, session: zenoh.Session) -> None:
+        inbox = self._inbox
+        for topic in TOPICS:
+            key = full_key(self._id, topic.pattern)
+            if topic.direction == "in":
+                self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
+            elif topic.key != "alive":
+                on_query = direct(partial(inbox.on_query, topic.key))
+                self._kept.append(session.declare_queryable(key, on_query))
+        for topic in PUBLISHED:
+            key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
+            self._outlets.declare(session, topic.key, key, "msgpack", encoding, topic.latched)
+
+    def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
+        key = endpoint.key
+        if endpoint.direction == "in":
+            on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
+            self._kept.append(session.declare_subscriber(key, on_sample))
+        elif endpoint.direction == "query":
+            on_query = direct(partial(self._inbox.on_ros_query, endpoint))
+            # rmw_zenoh's clients ask complete queryables only.
+            self._kept.append(session.declare_queryable(key, on_query, complete=True))
+        else:
+            identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
+            encoding = encoding_name("cdr")
+            self._outlets.declare(
+                session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
+            )
+        if endpoint.token:
+            self._kept.append(session.liveliness().declare_token(endpoint.token))
+
+    # the way down
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._replies.stop()
+        session, self._session = self._session, None
+        if session is not None:
+            try:
+                await in_thread(session.close, CLOSE_TIMEOUT_S)
+            except TimeoutError:
+                pass  # a stuck remote; the process ends without its good-bye

@@ -1,0 +1,58 @@
+"""The files of a TLS directory: can they be used, and for how long?
+
+Reading how long takes the library of the extra `lan`.
+"""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+
+from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.host.exits import Exit, ExitError
+from acsard.values import NS_PER_S
+
+
+def check(directory: str) -> None:
+    """Raises `ExitError` with the file and the mend when they cannot be used."""
+    for name in (CA, CERTIFICATE, KEY):
+        file = Path(directory) / name
+        try:
+            file.read_bytes()
+        except PermissionError:
+            raise ExitError(
+                Exit.NO_PERMISSION,
+                f"no permission to read {file}; a service gets its copies by the drop-in "
+                "deploy/systemd/lan.conf",
+            ) from None
+        except OSError as error:
+            raise ExitError(
+                Exit.BAD_CONFIG, f"cannot read {file}: {error.strerror}; `acsard lan init` makes it"
+            ) from None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_verify_locations(f"{directory}/{CA}")
+        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}")
+    except (ssl.SSLError, ValueError) as error:
+        raise ExitError(
+            Exit.BAD_CONFIG,
+            f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
+            "another certificate; `acsard lan init` or `lan add` makes them",
+        ) from None
+
+
+def ends_ns(directory: str) -> int | None:
+    """Wall-clock time at which the certificate in `directory`, or its authority's, ends.
+
+    None when that cannot be read.
+    """
+    try:
+        from cryptography import x509
+    except ImportError:
+        return None
+    try:
+        files = [(Path(directory) / name).read_bytes() for name in (CERTIFICATE, CA)]
+        ends = [x509.load_pem_x509_certificate(data).not_valid_after_utc for data in files]
+    except (OSError, ValueError):
+        return None
+    return int(min(ends).timestamp()) * NS_PER_S

@@ -1,0 +1,200 @@
+"""What came in over the bus and waits for the next step: bounded, filled by Zenoh's threads.
+
+A callback here only copies what it is given and never calls Zenoh back; the control loop takes
+from it when it steps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TypeVar
+
+import zenoh
+
+from acsard.bus.replies import Replies
+from acsard.host import clock
+from acsard.incoming.bus import BusInput
+from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
+from acsard.incoming.queries import Query, Reply
+from acsard.messages.encodings import encoding_name
+from acsard.ros.trees import PARAMETERS, Endpoint
+
+ARRIVALS = 16
+"""Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
+in from one who sends all he may. What comes in on other keys than those of listed sources is held
+together: no flood pushes out a command on another key."""
+
+OTHERS = ""
+"""Where samples on all other keys go."""
+
+STOPS = 16
+"""Stops held, apart from all else: no flood of anything can push one out."""
+
+QUERIES = 64
+"""Queries held, and as many service calls; the next one is turned away with an error."""
+
+ATTACHMENT_BYTES = 64
+"""An rmw_zenoh attachment has 33; a longer one is cut, and refused by its length."""
+
+CDR = encoding_name("cdr")
+
+T = TypeVar("T")
+
+
+class Inbox:
+    """Samples and queries of one robot, until they are taken."""
+
+    def __init__(
+        self, prefix: str, replies: Replies, sources: tuple[str, ...], wake: Callable[[], None]
+    ) -> None:
+        self.own_id: zenoh.TimestampId | None = None
+        """The id this session stamps unstamped samples with: no stamp of theirs."""
+        self._prefix, self._replies = prefix, replies
+        listed = [f"{kind}/{name}" for kind in ("cmd", "wheel_cmd") for name in sources]
+        self._arrivals: dict[str, deque[Arrival]] = {
+            key: deque(maxlen=ARRIVALS) for key in (*listed, OTHERS)
+        }
+        self._stops: deque[Arrival] = deque(maxlen=STOPS)
+        self._services: deque[Query] = deque()
+        self._questions: deque[Query] = deque()
+        self._slow: deque[Query] = deque()
+        """Questions that take as long to answer as all others of a step."""
+        self._overrun = 0
+        self._wake, self._alert, self._stop_told = wake, False, False
+
+    def alert(self, on: bool) -> None:
+        """Wake the loop for the next command, once; or leave it to the next period.
+
+        A stop wakes it all the same, but not every one of a flood of them.
+        """
+        self._alert = on
+        if on:
+            self._stop_told = False
+            if any(self._arrivals.values()):
+                self._rouse()
+
+    def take(self, queries: int) -> BusInput:
+        """What came in since the last call, at most so many queries."""
+        arrivals = [one for held in self._arrivals.values() for one in _drained(held, ARRIVALS)]
+        arrivals.sort(key=lambda one: one.arrived_ns)
+        arrivals = _drained(self._stops, STOPS) + arrivals
+        asked = _drained(self._services, queries) + _drained(self._slow, 1)
+        asked += _drained(self._questions, queries - len(asked))
+        overrun, self._overrun = self._overrun, 0
+        return BusInput(tuple(arrivals), tuple(asked), overrun)
+
+    # Zenoh's threads
+
+    def on_sample(self, sample: zenoh.Sample) -> None:
+        """A sample on a native key."""
+        key = str(sample.key_expr).removeprefix(self._prefix)
+        self._arrived(sample, key, str(sample.encoding), "native")
+
+    def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
+        """A sample on a ROS key, which names its encoding nowhere: it stands for a native one."""
+        key = str(sample.key_expr)
+        native = endpoint.native if key == endpoint.key else key
+        # An rmw key names the type; by a bridge only the length tells a Twist from a TwistStamped.
+        named = endpoint.transport == "rmw"
+        encoding = f"{CDR};{endpoint.type}" if named else CDR
+        self._arrived(sample, native, encoding, endpoint.transport)
+
+    def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
+        arrived = clock.now()
+        put = sample.kind == zenoh.SampleKind.PUT
+        stamp, stamp_ns, sender = sample.timestamp, None, ""
+        if stamp is not None and stamp.get_id() != self.own_id:
+            stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
+        arrival = Arrival(
+            key,
+            put,
+            _bytes(sample.payload, MAX_COMMAND_BYTES),
+            encoding,
+            arrived.mono_ns,
+            stamp_ns,
+            sender,
+            via,
+            _bytes(sample.attachment, ATTACHMENT_BYTES),
+        )
+        if key == "stop" and put:
+            self._stop(arrival)
+            return
+        held = self._arrivals.get(key, self._arrivals[OTHERS])
+        if len(held) == ARRIVALS:
+            self._overrun += 1
+        held.append(arrival)
+        self._rouse()
+
+    def _stop(self, arrival: Arrival) -> None:
+        self._stops.append(arrival)
+        if not self._stop_told:
+            self._stop_told = True
+            self._wake()
+
+    def _rouse(self) -> None:
+        # Once until the loop asks for it again: a flood wakes nobody more often than that.
+        if self._alert:
+            self._alert = False
+            self._wake()
+
+    def on_query(self, topic: str, query: zenoh.Query) -> None:
+        """A query that reached a row of the native table."""
+        asked = str(query.key_expr).removeprefix(self._prefix)
+        if topic.startswith("srv/") and asked != topic:
+            return  # letting go of it ends it
+        self._asked(query, topic, asked, "", "native")
+
+    def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
+        """A call of a ROS service."""
+        if str(query.key_expr) == endpoint.key:
+            native = endpoint.native
+            self._asked(query, native, native, endpoint.key, endpoint.transport)
+
+    def _line_for(self, topic: str) -> deque[Query]:
+        if topic.startswith("srv/"):
+            return self._services
+        return self._slow if topic.startswith(PARAMETERS) else self._questions
+
+    def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
+        arrived_ns = clock.now().mono_ns
+        if topic == "srv/stop":
+            # The stop itself never waits in a line with other questions, nor is it turned away.
+            self._stop(Arrival("stop", True, b"", "", arrived_ns, None, ""))
+        number = self._replies.open(query, key)
+        if number is None:
+            return
+        waiting = self._line_for(topic)
+        if len(waiting) >= QUERIES:
+            if via == "native":  # a ROS client hears no errors
+                busy = b"busy: too many queries at once; ask again"
+                self._replies.send(Reply(number, topic, busy, "text/plain", ok=False))
+            self._replies.done(number)
+            return
+        encoding = query.encoding
+        waiting.append(
+            Query(
+                number,
+                topic,
+                asked,
+                query.parameters.get("fmt", "") or "",
+                _bytes(query.payload, MAX_COMMAND_BYTES),
+                str(encoding) if encoding else "",
+                arrived_ns,
+                via,
+                _bytes(query.attachment, ATTACHMENT_BYTES),
+            )
+        )
+
+
+def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
+    """A copy, cut where it is too long: one byte too many is enough to refuse it by."""
+    return b"" if payload is None else payload.to_bytes()[: most + 1]
+
+
+def _drained(held: deque[T], most: int) -> list[T]:
+    """Take up to `most` out; another thread may be putting in."""
+    taken: list[T] = []
+    while held and len(taken) < most:
+        taken.append(held.popleft())
+    return taken

@@ -1,0 +1,168 @@
+"""Zenoh sessions as acsard opens them: the daemon's, and the tools' clients.
+
+What lives here: the session settings with the reason for each. What must not: keys or messages.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+
+import zenoh
+
+from acsard.config.settings import BusConfig
+from acsard.host.exits import Exit, ExitError
+from acsard.messages.topics import full_key
+
+COMMAND_RATE_HZ = 1000.0
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
+
+MAX_SESSIONS = 256
+"""Clients at once; idle connections of strangers must not keep a person out for long."""
+
+CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
+"""The files of a TLS directory."""
+
+MESSAGE_BYTES = 65536
+"""Largest message taken from a link; commands are held to far less in code."""
+
+
+def daemon_session(
+    bus: BusConfig,
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+) -> zenoh.Session:
+    """The daemon's session: a peer that listens where it is told, finds nobody by itself.
+
+    `limited` are the ROS keys commands come in on, `access` is who may do what. Raises `ExitError`
+    when the address is taken. Blocks, as a client until its router is there; call it in a thread.
+    """
+    settings = _base(bus.mode) | {
+        "listen/endpoints": list(bus.listen) if bus.mode == "peer" else [],
+        "connect/endpoints": list(bus.connect),
+        # Peers behind a router find each other by gossip only; without a router there is nobody.
+        "scouting/gossip/enabled": bool(bus.connect),
+        "timestamping/enabled": True,
+        # A stopped subscriber must not hold a put: by default each waits 1 ms for room.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+        "transport/link/rx/max_message_size": MESSAGE_BYTES,
+        "transport/unicast/accept_timeout": 1000,
+        # With 32, 300 idle connections keep a person out for 2 s; so many cost 3 MB then.
+        "transport/unicast/accept_pending": 512,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
+        "transport/link/tx/lease": 2000,
+        "queries_default_timeout": 3000,
+        "access_control": access,
+        "downsampling": [_command_limits(robot_id, sources, limited)],
+    }
+    if bus.tls:
+        settings |= _tls(bus.tls)
+    if bus.connect:
+        settings |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        where = ", ".join(bus.listen)
+        raise ExitError(
+            Exit.IN_USE,
+            f"cannot listen on {where}: {_first_line(error)}; another daemon or router may have "
+            "it: stop that, or give this one its own bus.listen",
+        ) from error
+
+
+def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
+    """A client of the daemon (or a router) at `endpoint`; raises `ExitError` when nobody answers.
+
+    `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
+
+    A client, because peers behind one hub do not reach each other.
+    """
+    if "/" not in endpoint:
+        raise ExitError(
+            Exit.USAGE, f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"'
+        )
+    settings = _base("client") | {
+        "connect/endpoints": [endpoint],
+        # What accepts and then says nothing is no daemon; a person waits for this.
+        "transport/unicast/open_timeout": 3000,
+        "timestamping/enabled": True,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+    }
+    if tls:
+        settings |= _tls(tls)
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        raise ExitError(
+            Exit.UNREACHABLE,
+            f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
+            f"is this its bus.listen, and has it room (at most {MAX_SESSIONS} connections)?",
+        ) from error
+
+
+def _base(mode: str) -> dict[str, object]:
+    return {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        # Its parts cannot be set alone. Without it a router that comes back waits seconds for us.
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 1.5,
+        },
+    }
+
+
+def _tls(directory: str) -> dict[str, object]:
+    """Both ends show a certificate of the same CA, and a link ends with its certificate."""
+    certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": f"{directory}/{CA}",
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+        }
+    }
+
+
+def _command_limits(
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+) -> dict[str, object]:
+    """A limit per listed source, so that none uses up another's; one more for all unlisted."""
+    names = [*sources, "*"]
+    keys = [full_key(robot_id, f"{kind}/{n}") for kind in ("cmd", "wheel_cmd") for n in names]
+    keys += limited
+    return {
+        "id": "commands",
+        "messages": ["put", "delete"],
+        "flows": ["ingress"],
+        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
+    }
+
+
+def _config(settings: dict[str, object]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _first_line(error: Exception) -> str:
+    """What a Zenoh error says, without the source paths it carries."""
+    text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
+    return text[0][:200].strip() if text else type(error).__name__
+
+
+def log_from_environment() -> None:
+    """Zenoh's own log, only when RUST_LOG asks for it: it goes to standard output."""
+    if "RUST_LOG" in os.environ:
+        zenoh.try_init_log_from_env()

@@ -1,0 +1,81 @@
+"""Changes the text of an `acsard.toml`: comments, order and line ends stay as they are.
+
+Needs the library tomlkit (extras `lan` and `mcu`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from acsard.config.parsing import effective, parse
+from acsard.config.validation import write
+
+
+def edited(text: str, keys: Mapping[str, object]) -> str:
+    """The text with dotted keys set to these values.
+
+    Raises `ConfigError` when either is no configuration, and `ValueError` when the text is written
+    in a way that cannot be changed safely.
+    """
+    from tomlkit.exceptions import TOMLKitError
+
+    wanted = effective(parse(text.encode()))
+    for key, value in keys.items():
+        *path, name = key.split(".")
+        plain = wanted
+        for part in path:
+            plain = plain[part]  # type: ignore[assignment]
+        plain[name] = value
+    try:
+        changed = _changed(text, keys)
+    except TOMLKitError as error:
+        raise ValueError(str(error)) from None
+    if effective(parse(changed.encode())) != wanted:
+        raise ValueError("its tables are written in a way that cannot be changed safely")
+    return changed
+
+
+def _changed(text: str, keys: Mapping[str, object]) -> str:
+    """The text with these keys; all lines end as its lines end."""
+    import tomlkit
+
+    crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
+    text, keys = _dotted(text.replace("\r\n", "\n") if crlf else text, keys)
+    document = tomlkit.parse(text)
+    for key, value in keys.items():
+        *path, name = key.split(".")
+        table = document
+        for part in path:
+            if part not in table:
+                table[part] = tomlkit.table()
+            table = table[part]
+        table[name] = value
+    changed = tomlkit.dumps(document)
+    return changed.replace("\n", "\r\n") if crlf else changed
+
+
+def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
+    """Tables written as top-level dotted keys (`mcu.port = ...`) get new keys in the same form;
+    tomlkit would open a table in the middle of them. The text, and the keys still to be set."""
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    lines, left = text.splitlines(keepends=True), dict(keys)
+    for key, value in keys.items():
+        table = key.partition(".")[0]
+        top = next((n for n, s in enumerate(lines) if s.lstrip().startswith("[")), len(lines))
+        places = [n for n in range(top) if re.match(rf"\s*{table}\s*\.", lines[n])]
+        if not places or _has(document, key):
+            continue
+        lines.insert(places[0], f"{key} = {write(value)}\n")
+        del left[key]
+    return "".join(lines), left
+
+
+def _has(document: object, key: str) -> bool:
+    for part in key.split("."):
+        if not isinstance(document, Mapping) or part not in document:
+            return False
+        document = document[part]
+    return True

@@ -1,0 +1,272 @@
+"""The keys of `acsard.toml`: names, defaults, ranges and units, one frozen struct per table.
+
+What lives here: the shape of the configuration. `acsard.toml` at the root is its commented
+reference and must equal these defaults (a test). What must not: rules between keys (`rules.py`).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from acsard.config.baud import COMFORTABLE_USE, highest_rate, line_bytes
+
+Name = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z0-9_-]{1,32}\Z",
+        extra={"unit": "1 to 32 of A-Z a-z 0-9 _ -", "example": "app"},
+    ),
+]
+Frame = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}\Z",
+        extra={"unit": "a frame or joint name: 1 to 64 of A-Z a-z 0-9 _ /, no leading slash"},
+    ),
+]
+Text = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^\x00]{1,256}\Z",
+        extra={"unit": "a text of 1 to 256 characters"},
+    ),
+]
+CommonName = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^\x00-\x1f/]{1,64}\Z",
+        extra={"unit": "the common name of a certificate", "example": "operator"},
+    ),
+]
+RosNode = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,63}\Z",
+        extra={"unit": "a ROS name: letters, digits and _, not a digit first", "example": "acsard"},
+    ),
+]
+RosNamespace = Annotated[
+    str,
+    Meta(
+        pattern=r"^(|[A-Za-z_][A-Za-z0-9_]{0,63}(/[A-Za-z_][A-Za-z0-9_]{0,63}){0,3})\Z",
+        extra={"unit": "ROS names with / between them, or empty", "example": "robot1"},
+    ),
+]
+Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
+Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
+Angle = Annotated[float, Meta(ge=-6.2832, le=6.2832, extra={"unit": "rad"})]
+Factor = Annotated[float, Meta(ge=0.1, le=10.0)]
+LinearSpeed = Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "m/s"})]
+AngularSpeed = Annotated[float, Meta(ge=0.0, le=50.0, extra={"unit": "rad/s"})]
+LinearRate = Annotated[float, Meta(ge=0.01, le=100.0, extra={"unit": "m/s2"})]
+AngularRate = Annotated[float, Meta(ge=0.01, le=500.0, extra={"unit": "rad/s2"})]
+LinearJerk = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "m/s3 (0 = no limit)"})]
+AngularJerk = Annotated[float, Meta(ge=0.0, le=5000.0, extra={"unit": "rad/s3 (0 = no limit)"})]
+WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
+Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})]
+ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
+PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
+SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
+Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
+Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
+EncoderCounts = Annotated[
+    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = do not ask for them)"})
+]
+Baud = Literal[9600, 19200, 38400, 57600, 115200]
+
+
+class RobotConfig(Struct, frozen=True):
+    id: Name = "acsar"
+
+
+class WheelMap(Struct, frozen=True):
+    front_right: Motor = "+a"
+    front_left: Motor = "+b"
+    rear_left: Motor = "+c"
+    rear_right: Motor = "+d"
+
+
+class McuConfig(Struct, frozen=True):
+    port: Text = "sim"
+    baud_rate: Baud = 115200
+    trailing_comma: bool = False
+    reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
+    link_check: Literal["off", "auto", "require"] = "off"
+    encoder_counts: EncoderCounts = 0
+    wheels: WheelMap = WheelMap()
+
+    @property
+    def wants_samples(self) -> bool:
+        """The MCU is asked for its encoder counts with every line."""
+        return self.link_check != "off" and self.encoder_counts > 0
+
+    @property
+    def line_bytes(self) -> int:
+        """Length of the longest line of either direction that may be on the wire."""
+        return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
+
+
+class ControlConfig(Struct, frozen=True):
+    rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
+    auto_activate: bool = True
+    real_time: bool = True
+
+
+class DriveConfig(Struct, frozen=True):
+    wheel_radius: Length = 0.05
+    wheel_separation: Length = 0.30
+    wheel_separation_multiplier: Factor = 1.0
+    left_wheel_radius_multiplier: Factor = 1.0
+    right_wheel_radius_multiplier: Factor = 1.0
+
+
+class JointsConfig(Struct, frozen=True):
+    front_right: Frame = "front_right_wheel_joint"
+    front_left: Frame = "front_left_wheel_joint"
+    rear_left: Frame = "rear_left_wheel_joint"
+    rear_right: Frame = "rear_right_wheel_joint"
+
+    def as_tuple(self) -> tuple[str, str, str, str]:
+        """The four names in `values.WHEELS` order."""
+        return self.front_right, self.front_left, self.rear_left, self.rear_right
+
+
+class FeedbackConfig(Struct, frozen=True):
+    wheel_speed: WheelSpeed = 80.0
+    wheel_acceleration: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "rad/s2"})] = 1500.0
+    response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
+    fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
+
+
+class LimitsConfig(Struct, frozen=True):
+    linear_speed: LinearSpeed = 1.0
+    angular_speed: AngularSpeed = 4.0
+    linear_acceleration: LinearRate = 1.0
+    angular_acceleration: AngularRate = 4.0
+    linear_deceleration: LinearRate = 1.0
+    angular_deceleration: AngularRate = 4.0
+    linear_stop_deceleration: LinearRate = 3.0
+    angular_stop_deceleration: AngularRate = 12.0
+    linear_jerk: LinearJerk = 0.0
+    angular_jerk: AngularJerk = 0.0
+    wheel_speed: WheelSpeed = 40.0
+
+
+class Source(Struct, frozen=True):
+    name: Name
+    priority: Annotated[int, Meta(ge=0, le=1000, extra={"example": 50})]
+    timeout: Annotated[float, Meta(ge=0.02, le=10.0, extra={"unit": "s"})] = 0.25
+
+
+class CommandsConfig(Struct, frozen=True):
+    neutral_first: bool = True
+    sources: tuple[Source, ...] = (
+        Source("teleop", 100),
+        Source("app", 50),
+        Source("ros2_control", 20),
+        Source("nav", 10),
+    )
+
+
+class OdometryConfig(Struct, frozen=True):
+    odom_frame: Frame = "odom"
+    base_frame: Frame = "base_link"
+    publish_tf: bool = True
+    pose_covariance_diagonal: Diagonal = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e-6)
+    twist_covariance_diagonal: Diagonal = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2)
+    distance_variance_per_metre: ErrorRate = 1e-4
+    yaw_variance_per_metre: ErrorRate = 1e-4
+    yaw_variance_per_radian: ErrorRate = 1e-2
+
+
+class LidarConfig(Struct, frozen=True):
+    publish_tf: bool = True
+    lidar_frame: Frame = "lidar_link"
+    lidar_x_offset: Offset = 0.0
+    lidar_y_offset: Offset = 0.0
+    lidar_z_offset: Offset = 0.0
+    lidar_roll: Angle = 0.0
+    lidar_pitch: Angle = 0.0
+    lidar_yaw: Angle = 0.0
+
+
+class FootprintConfig(Struct, frozen=True):
+    publish_tf: bool = False
+    footprint_frame: Frame = "base_footprint"
+    footprint_z_offset: Offset = 0.0
+
+
+class RatesConfig(Struct, frozen=True):
+    odom: PublishRate = 0.0
+    wheel_states: PublishRate = 0.0
+    cmd_vel_out: PublishRate = 0.0
+    state: SlowRate = 10.0
+    diagnostics: SlowRate = 1.0
+
+
+class BusConfig(Struct, frozen=True):
+    mode: Literal["peer", "client"] = "peer"
+    listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
+    connect: tuple[Text, ...] = ()
+    tls: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
+    ] = ""
+    insecure: bool = False
+
+
+class AccessConfig(Struct, frozen=True):
+    viewers: tuple[CommonName, ...] = ("viewer",)
+    operators: tuple[CommonName, ...] = ("operator",)
+    maintainers: tuple[CommonName, ...] = ("maintainer",)
+
+
+class RosConfig(Struct, frozen=True):
+    bridge: bool = True
+    rmw: bool = True
+    announce: bool = True
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    namespace: RosNamespace = ""
+    node: RosNode = "acsard"
+    cmd_vel_type: Literal["auto", "twist", "twist_stamped"] = "auto"
+
+
+class LogConfig(Struct, frozen=True):
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
+
+
+class SimConfig(Struct, frozen=True):
+    motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
+    encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
+    boot_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s"})] = 0.0
+
+
+class Config(Struct, frozen=True):
+    robot: RobotConfig = RobotConfig()
+    mcu: McuConfig = McuConfig()
+    control: ControlConfig = ControlConfig()
+    drive: DriveConfig = DriveConfig()
+    joints: JointsConfig = JointsConfig()
+    limits: LimitsConfig = LimitsConfig()
+    feedback: FeedbackConfig = FeedbackConfig()
+    commands: CommandsConfig = CommandsConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    lidar: LidarConfig = LidarConfig()
+    footprint: FootprintConfig = FootprintConfig()
+    rates: RatesConfig = RatesConfig()
+    bus: BusConfig = BusConfig()
+    access: AccessConfig = AccessConfig()
+    ros: RosConfig = RosConfig()
+    log: LogConfig = LogConfig()
+    sim: SimConfig = SimConfig()
+
+    @property
+    def rate_hz(self) -> float:
+        """Control periods per second; "auto" is what fits comfortably, at most 100."""
+        if self.control.rate != "auto":
+            return float(self.control.rate)
+        mcu = self.mcu
+        return float(min(100, highest_rate(mcu.baud_rate, mcu.line_bytes, COMFORTABLE_USE)))

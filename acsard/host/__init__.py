@@ -1,0 +1,1 @@
+"""Shell: the machine beneath us: clock, timers, threads, scheduling, systemd, journal, logs."""

@@ -1,0 +1,58 @@
+"""A person's files changed in place, all or nothing."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from acsard.config.editing import edited
+from acsard.config.parsing import ConfigError
+from acsard.host.exits import Exit, ExitError
+
+
+def require_tomlkit() -> None:
+    """Say at once what is missing, before anybody has spent a minute on a check."""
+    try:
+        import tomlkit  # noqa: F401
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE,
+            "--write needs the library tomlkit; run: pip install 'acsard[mcu]', or leave --write "
+            "out and paste the lines",
+        ) from None
+
+
+def change(file: Path, keys: Mapping[str, object]) -> None:
+    """Set dotted keys in an `acsard.toml`; raises `ExitError` and leaves it as it was if it
+    cannot be."""
+    try:
+        file = file.resolve(strict=True)
+        text = file.read_bytes().decode()  # not read_text: it would lose CRLF
+        replace(file, edited(text, keys))
+    except (OSError, ValueError, ConfigError) as error:
+        raise ExitError(
+            Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand"
+        ) from None
+
+
+def replace(file: Path, text: str) -> None:
+    """The file is the old one or the new one, never half of it; who may read it stays."""
+    before = file.stat()
+    handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as new:
+            new.write(text)
+            new.flush()
+            os.fchmod(new.fileno(), stat.S_IMODE(before.st_mode))
+            try:
+                os.fchown(new.fileno(), before.st_uid, before.st_gid)
+            except PermissionError:
+                pass  # another's file in a directory of ours: it becomes ours
+            os.fsync(new.fileno())
+        os.replace(name, file)
+    except BaseException:
+        os.unlink(name)
+        raise

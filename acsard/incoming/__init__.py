@@ -1,0 +1,1 @@
+"""Pure: what comes in over the bus: samples -> commands, queries -> replies or requests."""

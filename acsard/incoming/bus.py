@@ -1,0 +1,44 @@
+"""The bus as the control loop sees it; `bus/bus.py` is the real one."""
+
+from __future__ import annotations
+
+from collections.abc import Set as AbstractSet
+from typing import Protocol
+
+from msgspec import Struct
+
+from acsard.incoming.commands import Arrival
+from acsard.incoming.queries import Query, Reply
+from acsard.messages.schema import Message
+
+
+class BusInput(Struct, frozen=True):
+    """What came over the bus since the last call."""
+
+    arrivals: tuple[Arrival, ...] = ()
+    queries: tuple[Query, ...] = ()
+    overrun: int = 0
+    """Samples dropped because they came faster than they could be taken."""
+
+
+class Bus(Protocol):
+    """The bus as the loop sees it."""
+
+    @property
+    def wanted(self) -> AbstractSet[str]:
+        """Published keys that somebody listens to."""
+
+    def take(self, queries: int) -> BusInput:
+        """What came in since the last call, at most so many queries."""
+
+    def publish(self, key: str, message: Message) -> None:
+        """Send a message to its listeners."""
+
+    def reply(self, reply: Reply) -> None:
+        """Answer a query; the last reply to its number."""
+
+    def done(self, number: int) -> None:
+        """No more replies to this query."""
+
+    def alert(self, on: bool) -> None:
+        """Wake the loop when a command or a stop comes in, or leave it to the next period."""

@@ -1,0 +1,178 @@
+"""A sample from the bus -> a `Command` or a `Request`, or the reason it is refused.
+
+Refused whole, never in part: a command that cannot be decoded, is too big, holds NaN or infinity
+in any field, or came by a wildcard key or a DELETE refreshes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import UNSET, Struct, UnsetType
+
+from acsard.config.settings import JointsConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
+from acsard.ros.attachments import GID_BYTES, unpack
+from acsard.values import REST, Command, Pose, Request, Verb, WheelSpeeds
+from acsard.values import Twist as BodyTwist
+
+MAX_COMMAND_BYTES = 4096
+"""A TwistStamped is under 300 bytes as JSON; more than this is not a command."""
+
+
+Via = Literal["native", "bridge", "rmw"]
+"""The tree a sample or query came by."""
+
+
+class Arrival(Struct, frozen=True):
+    """A sample as the bus shell took it from Zenoh, key below `acsard/<id>/`.
+
+    One that came on a ROS key has the native key it stands for.
+    """
+
+    key: str
+    put: bool
+    payload: bytes
+    encoding: str
+    arrived_ns: int
+    stamp_ns: int | None
+    """Zenoh's own timestamp, when it is the sender's."""
+    sender: str
+    via: Via = "native"
+    attachment: bytes = b""
+
+
+class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
+    """A Twist or a TwistStamped, told apart by the fields it has."""
+
+    linear: Vector3 | UnsetType = UNSET
+    angular: Vector3 | UnsetType = UNSET
+    header: Header | UnsetType = UNSET
+    twist: Twist | UnsetType = UNSET
+
+
+TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
+"""A Twist in CDR, and a TwistStamped at the least: often nothing else tells them apart."""
+
+TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
+STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
+"""What an Encoding may call them."""
+
+_twists = Decoder(_TwistPayload)
+_wheels = Decoder(JointState)
+_poses = Decoder(SetPose)
+
+
+class Receiver:
+    """Decodes what commanders send, by the key it came on."""
+
+    def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
+        self._joints = joints.as_tuple()
+        self._kinematics = kinematics
+
+    def command(self, arrival: Arrival) -> Command:
+        """The command in a sample on `cmd/…` or `wheel_cmd/…`; raises `DecodeError`."""
+        kind, _, source = arrival.key.partition("/")
+        if "*" in arrival.key or "/" in source:
+            raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
+        if not arrival.put:
+            raise DecodeError("not_a_put", "a DELETE is not a command")
+        if len(arrival.payload) > MAX_COMMAND_BYTES:
+            raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+        stamp_ns, sender = _stamp(arrival)
+        if kind == "cmd":
+            twist, header, cancelled = self._twist(arrival)
+        else:
+            twist, header, cancelled = self._wheel_speeds(arrival)
+        if header is not None and header.stamp.to_ns() > 0:
+            # Another clock than the envelope's, which may be a router's for many: its own name.
+            stamp_ns = header.stamp.to_ns()
+            sender = f"{sender}, header on {arrival.via}/{arrival.key}"
+        return Command(
+            source, twist, arrival.arrived_ns, stamp_ns, sender, voice(arrival), cancelled
+        )
+
+    def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
+        got = _twist_payload(arrival)
+        header = None
+        linear, angular = got.linear, got.angular
+        if not isinstance(got.twist, UnsetType):
+            if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
+                raise DecodeError("wrong_shape", "a twist inside and beside `twist`")
+            linear, angular = got.twist.linear, got.twist.angular
+            header = None if isinstance(got.header, UnsetType) else got.header
+        elif not isinstance(got.header, UnsetType):
+            raise DecodeError("wrong_shape", "a header without `twist`: put the twist inside it")
+        if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
+            raise DecodeError("wrong_shape", "needs both `linear` and `angular`")
+        axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        if not all(map(math.isfinite, axes)):
+            raise DecodeError("not_finite", "NaN or infinity in the twist")
+        twist = BodyTwist(linear.x, angular.z)
+        return twist, header, twist == REST and any(axes)
+
+    def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
+        got = _wheels.decode(arrival.encoding, arrival.payload)
+        if sorted(got.name) != sorted(self._joints) or len(got.velocity) != 4:
+            raise DecodeError(
+                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}"
+            )
+        if not all(map(math.isfinite, (*got.velocity, *got.position, *got.effort))):
+            raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
+        speed = dict(zip(got.name, got.velocity, strict=True))
+        twist = self._kinematics.twist(WheelSpeeds(*(speed[joint] for joint in self._joints)))
+        if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
+            raise DecodeError("not_finite", "wheel speeds beyond all numbers")
+        return twist, got.header, twist == REST and any(got.velocity)
+
+    @staticmethod
+    def request(
+        verb: Verb, number: int, encoding: str, payload: bytes, asked_ns: int | None = None
+    ) -> Request:
+        """The request in a service query, to be answered as `number`; raises `DecodeError`."""
+        if verb != "set_pose":
+            return Request(verb, number, asked_ns=asked_ns)
+        if len(payload) > MAX_COMMAND_BYTES:
+            raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
+        got = _poses.decode(encoding, payload)
+        if (
+            not all(map(math.isfinite, (got.x, got.y, got.yaw)))
+            or max(abs(got.x), abs(got.y)) > 1e6
+        ):
+            raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
+        return Request(verb, number, Pose(got.x, got.y, got.yaw), asked_ns)
+
+
+def _stamp(arrival: Arrival) -> tuple[int | None, str]:
+    """When it was sent by whose clock, as far as its envelope says; raises `DecodeError`."""
+    if arrival.via == "rmw":
+        return unpack(arrival.attachment).stamp_ns, voice(arrival)
+    return arrival.stamp_ns, arrival.sender or f"{arrival.via}/{arrival.key}"
+
+
+def voice(arrival: Arrival) -> str:
+    """Who sent it: the rmw publisher, the session that stamped it, or else just the source.
+
+    A bridge says nothing of the ROS node behind it: all those of a source are one.
+    """
+    if arrival.via == "rmw":
+        return arrival.attachment[-GID_BYTES:].hex()
+    return arrival.sender or f"{arrival.via}/{arrival.key.partition('/')[2]}"
+
+
+def _twist_payload(arrival: Arrival) -> _TwistPayload:
+    if detect(arrival.encoding, arrival.payload) != "cdr":
+        return _twists.decode(arrival.encoding, arrival.payload)
+    named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
+    # Without a name by the length; DDS pads to a multiple of four.
+    plain, told = named in TWISTS, named in TWISTS + STAMPED_TWISTS
+    if plain or (not told and size < TWIST_CDR_BYTES + 4):
+        twist = decode_cdr(Twist, arrival.payload)
+        return _TwistPayload(linear=twist.linear, angular=twist.angular)
+    if not told and size < STAMPED_CDR_BYTES:
+        raise DecodeError("wrong_shape", f"{size} bytes of CDR are no Twist and no TwistStamped")
+    stamped = decode_cdr(TwistStamped, arrival.payload)
+    return _TwistPayload(header=stamped.header, twist=stamped.twist)

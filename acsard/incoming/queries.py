@@ -1,0 +1,215 @@
+"""A query -> its reply, or the `Request` it makes of the robot.
+
+Services run only when the query's key is exactly theirs: a get on `<id>/**` must never stop or
+clear anything. Everything else may also be asked by wildcard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import msgspec
+from msgspec import Struct
+
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.incoming.commands import Receiver, Via
+from acsard.messages.cdr import CdrError
+from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
+from acsard.messages.schema import (
+    MESSAGES,
+    HardwareInterface,
+    Info,
+    Interfaces,
+    Message,
+    ServiceReply,
+    TopicInfo,
+    Topics,
+)
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.ros.attachments import Attachment, unpack
+from acsard.ros.parameters import Parameters
+from acsard.ros.trees import PARAMETERS
+from acsard.values import Answer, Outputs, Request, Verb
+
+Current = Callable[[str], Message | None]
+
+
+class Query(Struct, frozen=True):
+    """A query as the bus shell took it from Zenoh, keys below `acsard/<id>/`."""
+
+    number: int
+    topic: str
+    """The row of the topic table it reached."""
+    asked: str
+    """The key expression the client wrote."""
+    fmt: str
+    """The `fmt` parameter, "" when there is none."""
+    payload: bytes
+    encoding: str
+    arrived_ns: int | None = None
+    via: Via = "native"
+    attachment: bytes = b""
+
+
+class Reply(Struct, frozen=True):
+    """What goes back; `ok` False is an error reply."""
+
+    number: int
+    key: str
+    payload: bytes
+    encoding: str
+    ok: bool = True
+    attachment: bytes = b""
+
+
+class Queries:
+    """Answers queries from what it was given at the start and the present values."""
+
+    def __init__(self, config: Config, info: Info) -> None:
+        self._config = config
+        self._fixed: dict[str, object] = {
+            "info": info,
+            "config": effective(config),
+            "topics": topic_table(config.robot.id),
+        }
+        self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
+        self._parameters = Parameters(effective(config))
+        self._waiting: dict[int, tuple[str, Format, Attachment | None]] = {}
+
+    def serve(
+        self, query: Query, current: Current, outputs: Outputs | None
+    ) -> list[Reply] | Request:
+        """The replies to a query, none when it is not for us; a `Request` when it is a service.
+
+        Raises `DecodeError` for a ROS request that cannot be answered: ROS clients hear no errors.
+        """
+        if query.via != "native":
+            return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
+        try:
+            form = _format(query)
+            if query.topic.startswith("srv/"):
+                return self._service(query, form)
+            return [
+                Reply(query.number, key, encode(value, form), encoding_name(form, name))
+                for key, name, value in self._values(query, current, outputs)
+            ]
+        except DecodeError as error:
+            return [self._error(query, str(error))]
+
+    def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
+        """The reply that carries a robot's answer now; None when nobody waits for it."""
+        waiting = self._waiting.pop(answer.id, None)
+        if waiting is None:
+            return None
+        key, form, asked = waiting
+        payload = encode(ServiceReply(answer.success, answer.message), form)
+        encoding = encoding_name(form, "ServiceReply")
+        return Reply(answer.id, key, payload, encoding, attachment=_echo(asked, wall_ns))
+
+    def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
+        """A std_srvs/Trigger, or one of the parameter services."""
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+        if query.topic.startswith("srv/"):
+            verb = cast(Verb, query.topic.removeprefix("srv/"))
+            self._waiting[query.number] = (query.topic, "cdr", asked)
+            return Request(verb, query.number, asked_ns=query.arrived_ns)
+        try:
+            service = query.topic.removeprefix(PARAMETERS)
+            payload = self._parameters.answer(service, query.payload)
+        except CdrError as error:
+            raise DecodeError("malformed", str(error)) from None
+        attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
+        return [Reply(query.number, query.topic, payload, encoding, attachment=attachment)]
+
+    def _service(self, query: Query, form: Format) -> list[Reply] | Request:
+        verb = query.topic.removeprefix("srv/")
+        if query.asked != query.topic or verb not in SERVICES:
+            return []
+        try:
+            request = Receiver.request(
+                cast(Verb, verb),
+                query.number,
+                query.encoding,
+                query.payload,
+                query.arrived_ns,
+            )
+        except DecodeError as error:
+            message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
+            payload, name = encode(message, form), encoding_name(form, "ServiceReply")
+            return [Reply(query.number, query.topic, payload, name)]
+        self._waiting[query.number] = (query.topic, form, None)
+        return request
+
+    def _values(
+        self, query: Query, current: Current, outputs: Outputs | None
+    ) -> list[tuple[str, str, object]]:
+        topic = query.topic
+        if topic == "schema/<Type>":
+            asked = query.asked.removeprefix("schema/")
+            names = list(self._schemas) if "*" in asked else [asked]
+            return [(f"schema/{n}", "", self._schemas[n]) for n in names if n in self._schemas]
+        if topic == "interfaces":
+            return [(topic, "Interfaces", interfaces(self._config, outputs))]
+        if topic in self._fixed:
+            value = self._fixed[topic]
+            return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
+        value = current(topic)
+        return [] if value is None else [(topic, type(value).__name__, value)]
+
+    @staticmethod
+    def _error(query: Query, text: str) -> Reply:
+        return Reply(query.number, query.topic, text.encode(), "text/plain", ok=False)
+
+
+def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
+    """What rmw_zenoh finds the caller of a reply by: the request's sequence and GID."""
+    return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
+
+
+def _format(query: Query) -> Format:
+    """The encoding asked for: `?fmt=`, else a service's own payload's, else JSON for people."""
+    for form in FORMATS:
+        if query.fmt == form:
+            return form
+    if query.fmt:
+        raise DecodeError(
+            "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
+        )
+    if query.topic.startswith("srv/") and query.payload:
+        try:
+            return detect(query.encoding, query.payload)
+        except DecodeError:
+            pass  # a service that takes no payload does not mind one
+    return "json"
+
+
+def schema(cls: type[Message]) -> dict[str, object]:
+    """The JSON Schema of a type."""
+    return msgspec.json.schema(cls)
+
+
+def topic_table(robot_id: str) -> Topics:
+    """The table with this robot's full keys."""
+    return Topics(
+        [TopicInfo(full_key(robot_id, t.key), t.direction, t.type, t.rate, t.note) for t in TOPICS]
+    )
+
+
+def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
+    """Command and state interfaces, named as ros2_control does."""
+    linked = outputs is not None and outputs.linked
+    claimed = outputs is not None and outputs.mode == "driving"
+    joints = config.joints.as_tuple()
+    return Interfaces(
+        [HardwareInterface(f"{j}/velocity", "command", "rad/s", linked, claimed) for j in joints]
+        + [
+            HardwareInterface(f"{j}/{name}", "state", unit, linked, False)
+            for j in joints
+            for name, unit in (("position", "rad"), ("velocity", "rad/s"))
+        ]
+    )
+
+
+assert all(topic.type in MESSAGES for topic in PUBLISHED)

@@ -1,0 +1,1 @@
+"""Shell: owns the serial port; opened raw and locked, never queued on, ended with STOP."""

@@ -1,0 +1,243 @@
+"""Owns the serial port: opens it, reads it, reopens it, never queues, ends with STOP.
+
+pyserial-asyncio reads; lines are written to the descriptor directly, because its transport keeps
+what the kernel does not take and we hold nothing back (invariant 3). Opening is done in a thread
+with a time limit, since drivers may block.
+"""
+
+from __future__ import annotations
+
+import array
+import asyncio
+import errno
+import fcntl
+import itertools
+import os
+import termios
+from collections.abc import Callable
+from types import TracebackType
+
+import serial
+import serial_asyncio
+
+from acsard.host import clock
+from acsard.host.exits import Exit, ExitError
+from acsard.host.threads import in_thread
+from acsard.mcu.port import Offered
+from acsard.mcu.wire import LineGate
+from acsard.serial.device import (
+    close_elsewhere,
+    in_use,
+    no_permission,
+    open_raw,
+    why_closed,
+)
+from acsard.values import Event, Instant, Received
+
+OPEN_TIMEOUT_S = 5.0
+"""A driver that takes longer has hung; the next try gets a new thread."""
+
+BACK_OFF_S = (0.05, 0.1, 0.2)
+"""Waits between attempts to reopen; the last one repeats. udev sets groups late, hence short."""
+
+PERMISSION_PATIENCE_S = 2.0
+"""How long a start waits for udev to grant access before it gives up."""
+
+STALE_NS = 10_000_000
+"""From the start of a step to its line: a period at the usual rate, a hundred times what it takes
+unless the process is stopped in between."""
+
+FAREWELL_S = 0.15
+"""Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
+
+
+class SerialPort:
+    """The port to the MCU. Enter it to open, `keep_open` reopens for ever, leaving sends STOP."""
+
+    def __init__(
+        self,
+        path: str,
+        baud_rate: int,
+        stop: bytes,
+        wake: Callable[[], None],
+        log: Callable[[Event], None],
+    ) -> None:
+        self.is_open = False
+        self.opened = 0
+        self._path, self._baud_rate, self._stop = path, baud_rate, stop
+        self._wake, self._log = wake, log
+        self._received: list[Received] = []
+        self._gate = LineGate(baud_rate)
+        self._transport: serial_asyncio.SerialTransport | None = None
+        self._lost = asyncio.Event()
+        self._fd = -1
+        self._waiting = array.array("i", [0])
+        self.sent_ns = 0
+        """When the last line had been handed to the kernel, monotonic."""
+        self.trouble = ""
+        """Why the port is closed, in words; "" while it is open."""
+
+    # the control loop's view
+
+    def take(self) -> tuple[Received, ...]:
+        """What was received since the last call."""
+        if not self._received:
+            return ()
+        got = tuple(self._received)
+        self._received.clear()
+        return got
+
+    def offer(self, line: bytes, now: Instant) -> Offered:
+        """Send the line now, or say that it did not go; it is never kept."""
+        if not self.is_open:
+            return "down"
+        if not self._gate.may_send(now.mono_ns, self._kernel_bytes()):
+            return "superseded"
+        if line != self._stop and clock.mono_ns() - now.mono_ns > STALE_NS:
+            return "superseded"  # we stood still in the middle of a step: what it says is old
+        instead = self._gate.first and line != self._stop
+        data = self._gate.prefix + (self._stop if instead else line)
+        try:
+            taken = os.write(self._fd, data)
+        except BlockingIOError:
+            taken = 0
+        except OSError as error:
+            self._leave(error)
+            return "down"
+        # From the moment it went, not from the start of the step that made it.
+        self.sent_ns = clock.now().mono_ns
+        self._gate.note_sent(self.sent_ns, len(data), taken)
+        return "sent" if taken == len(data) and not instead else "superseded"
+
+    def _kernel_bytes(self) -> int:
+        """Bytes the driver has not sent yet; 0 where it cannot say (a pty)."""
+        try:
+            fcntl.ioctl(self._fd, termios.TIOCOUTQ, self._waiting)
+        except OSError:
+            return 0
+        return self._waiting[0]
+
+    # opening and reopening
+
+    async def __aenter__(self) -> SerialPort:
+        deadline_ns = clock.now().mono_ns + int(PERMISSION_PATIENCE_S * 1e9)
+        while True:
+            try:
+                await self._open()
+                return self
+            except OSError as error:
+                # serial.SerialException carries the errno but not OSError's subclasses.
+                if error.errno in (errno.EBUSY, errno.EAGAIN):
+                    raise ExitError(Exit.IN_USE, in_use(self._path)) from error
+                if error.errno not in (errno.EACCES, errno.EPERM):
+                    self._complain(error)
+                    return self
+                if clock.now().mono_ns > deadline_ns:
+                    raise ExitError(Exit.NO_PERMISSION, no_permission(self._path)) from error
+                await asyncio.sleep(BACK_OFF_S[-1])
+
+    async def keep_open(self) -> None:
+        """Reopen the port whenever it is lost, for ever."""
+        while True:
+            if self.is_open:
+                await self._lost.wait()
+            for attempt in itertools.count():
+                try:
+                    await self._open()
+                    break
+                except OSError as error:
+                    self._complain(error)
+                    await asyncio.sleep(BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)])
+
+    async def _open(self) -> None:
+        path, baud_rate = self._path, self._baud_rate
+
+        def open_port() -> serial.Serial:
+            return open_raw(path, baud_rate)
+
+        try:
+            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=lambda late: late.close())
+        except TimeoutError:
+            raise OSError(errno.EIO, "the driver did not answer") from None
+        self._lost.clear()
+        self._fd = device.fileno()
+        self._gate = LineGate(baud_rate)
+        self._received.clear()
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await serial_asyncio.connection_for_serial(
+            loop, lambda: _Reader(self), device
+        )
+        self.is_open, self.trouble = True, ""
+        self.opened += 1
+        self._log(Event("port_open", f"{path} at {baud_rate} baud"))
+
+    def _complain(self, error: OSError) -> None:
+        """Say once why the port cannot be opened, not at every attempt."""
+        text = why_closed(self._path, error)
+        if text != self.trouble:
+            self.trouble = text
+            self._log(Event("port_waiting", text, "warning"))
+
+    # the reader's view
+
+    def _data(self, data: bytes) -> None:
+        self._received.append(Received(clock.now(), data))
+        self._wake()
+
+    def _leave(self, error: BaseException | None) -> None:
+        """Give the port up; what the kernel still holds must not go out later."""
+        if not self.is_open:
+            return
+        self.is_open = False
+        transport, self._transport = self._transport, None
+        if transport is not None and transport.serial is not None:
+            if error is not None or self._kernel_bytes():
+                # Only what is stuck: on a pty a flush throws away a STOP that is already through.
+                try:
+                    transport.serial.reset_output_buffer()
+                except (OSError, termios.error):
+                    pass  # the device is gone, and with it what was queued
+            close_elsewhere(transport)
+        if error is not None:
+            self.trouble = f"the serial port {self._path} was lost ({error}); reopening it"
+            self._log(Event("port_lost", self.trouble, "warning"))
+        self._lost.set()
+        self._wake()
+
+    # the way down
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """The last line out is STOP, whatever brought us here; bounded by `FAREWELL_S`."""
+        deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
+        while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
+            if clock.now().mono_ns > deadline_ns:
+                break
+            await asyncio.sleep(0.001)
+        while self.is_open and self._kernel_bytes() and clock.now().mono_ns < deadline_ns:
+            await asyncio.sleep(0.001)
+        self._leave(None)
+
+
+class _Reader(asyncio.Protocol):
+    """Hands bytes and losses from the transport to the port it was made for."""
+
+    def __init__(self, port: SerialPort) -> None:
+        self._port = port
+        self._transport: asyncio.BaseTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        self._port._data(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        # The port may have been reopened since: an old transport's end is not the new one's.
+        if self._port._transport is self._transport:
+            self._port._transport = None
+            self._port._leave(exc or OSError(errno.EIO, "closed"))

@@ -1,0 +1,138 @@
+"""A real serial port as `acsard mcu check` speaks through it: locked, blocking, bounded in time."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import select
+import termios
+import threading
+
+import serial
+
+from acsard.checkup.findings import WireLostError
+from acsard.host import clock
+from acsard.host.exits import Exit, ExitError
+from acsard.serial.device import in_use, no_permission, open_raw
+from acsard.values import NS_PER_S
+
+SEND_S = 0.5
+"""A driver that takes no byte for so long has hung: a line takes 50 ms on the slowest wire."""
+
+DRAIN_S = 0.5
+"""How long the last zeros may take to leave."""
+
+CLOSE_S = 1.0
+"""How long a close is waited for; some drivers drain for 30 s."""
+
+
+class SerialWire:
+    """One device, opened with the first `open`; see `checkup.outside.Wire`."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._device: serial.Serial | None = None
+
+    def open(self, baud_rate: int) -> None:
+        """Open and lock the port, or go on at another rate."""
+        if self._device is None:
+            self._device = self._open(baud_rate)
+            return
+        fd = self._device.fileno()
+        try:
+            attributes = termios.tcgetattr(fd)
+            attributes[4] = attributes[5] = getattr(termios, f"B{baud_rate}")
+            termios.tcsetattr(fd, termios.TCSADRAIN, attributes)
+            termios.tcflush(fd, termios.TCIFLUSH)
+        except (OSError, termios.error) as error:
+            raise WireLostError(f"{self._path}: {error}") from error
+
+    def _open(self, baud_rate: int) -> serial.Serial:
+        path = self._path
+        try:
+            return open_raw(path, baud_rate)
+        except OSError as error:
+            match error.errno:
+                case errno.EBUSY | errno.EAGAIN:
+                    raise ExitError(Exit.IN_USE, in_use(path)) from error
+                case errno.EACCES | errno.EPERM:
+                    raise ExitError(Exit.NO_PERMISSION, no_permission(path)) from error
+                case errno.ENOTTY | errno.EISDIR:
+                    text = f"{path} is not a serial device; `acsard ports` lists those there are"
+                    raise ExitError(Exit.NO_PORT, text) from error
+                case errno.ENOENT | errno.ENODEV | errno.ENXIO:
+                    text = f"{path} is not there; plug it in; `acsard ports` lists what there is"
+                    raise ExitError(Exit.NO_PORT, text) from error
+                case _:
+                    text = f"cannot open {path}: {error}"
+                    raise ExitError(Exit.FAILURE, text) from error
+
+    def close(self) -> None:
+        """Let the last bytes out, unlock and close; nothing can hold it up for long."""
+        device, self._device = self._device, None
+        if device is None:
+            return
+        fd = device.fileno()
+        waiting = bytearray(4)
+        deadline_ns = clock.mono_ns() + int(DRAIN_S * NS_PER_S)
+        try:
+            while clock.mono_ns() < deadline_ns:
+                fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
+                if not any(waiting):
+                    break
+                select.select([], [], [], 0.005)
+            else:
+                device.reset_output_buffer()  # what is stuck must not go out later
+            # A pty outlives us with this flag, and nobody else could open it.
+            fcntl.ioctl(fd, termios.TIOCNXCL)
+        except (OSError, termios.error):
+            pass  # the device is gone
+        closer = threading.Thread(target=device.close, name="close port", daemon=True)
+        closer.start()
+        closer.join(CLOSE_S)
+
+    def now_ns(self) -> int:
+        """The monotonic clock."""
+        return clock.mono_ns()
+
+    def send(self, data: bytes) -> None:
+        """Hand all of it to the driver; raises `WireLostError` when that takes none."""
+        fd = self._fileno()
+        deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
+        while data:
+            try:
+                data = data[os.write(fd, data) :]
+            except BlockingIOError:
+                left_s = (deadline_ns - clock.mono_ns()) / NS_PER_S
+                if left_s <= 0:
+                    raise WireLostError(f"{self._path} takes no more bytes") from None
+                select.select([], [fd], [], left_s)
+            except OSError as error:
+                raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        """What comes until then, each piece with the time it was read."""
+        fd = self._fileno()
+        pieces: list[tuple[int, bytes]] = []
+        while True:
+            left_s = max(0.0, (until_ns - clock.mono_ns()) / NS_PER_S)
+            ready, _, _ = select.select([fd], [], [], left_s)
+            if not ready:
+                return pieces
+            try:
+                data = os.read(fd, 4096)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
+            if not data:
+                raise WireLostError(f"{self._path} was lost: unplugged")
+            pieces.append((clock.mono_ns(), data))
+            if left_s == 0.0:
+                return pieces
+
+    def _fileno(self) -> int:
+        if self._device is None:
+            raise WireLostError(f"{self._path} is closed")
+        return int(self._device.fileno())

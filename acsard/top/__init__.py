@@ -1,0 +1,1 @@
+"""Shell: `acsard top`: what a running robot says, on one screen."""

@@ -1,0 +1,100 @@
+"""Each command finds its line and each sample its line by what it says."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.bench.matching import (
+    PATIENCE_NS,
+    STEPS,
+    Fed,
+    Summary,
+    commands_to_lines,
+    lines_of,
+    lines_to_samples,
+    staircase,
+    summary,
+)
+
+ONE, TWO = b"ap05.00,bp05.00,cp05.00,dp05.00", b"ap05.02,bp05.02,cp05.02,dp05.02"
+
+
+def test_the_speeds_of_one_round_all_differ_and_fit_the_line() -> None:
+    speeds = [staircase(number) for number in range(STEPS)]
+    assert len({f"{speed:05.2f}" for speed in speeds}) == STEPS
+    assert all(0.0 < speed < 20.0 for speed in speeds)
+
+
+def test_neighbouring_speeds_are_close_also_from_one_round_to_the_next() -> None:
+    speeds = [staircase(number) for number in range(2 * STEPS + 1)]
+    assert max(abs(b - a) for a, b in pairwise(speeds)) < 0.03
+
+
+def test_a_line_has_the_time_of_its_first_byte() -> None:
+    assert lines_of([(10, b"\r\nap1"), (20, b"2\r\nbp"), (30, b"\n")]) == [
+        (10, b"ap12"),
+        (20, b"bp"),
+    ]
+
+
+def test_an_end_with_a_comma_is_an_end() -> None:
+    assert lines_of([(1, ONE + b",\r\n")]) == [(1, ONE)]
+
+
+def test_what_has_no_end_yet_is_no_line() -> None:
+    assert lines_of([(1, ONE)]) == []
+
+
+@given(st.lists(st.integers(1, 40), max_size=20))
+def test_lines_are_the_same_however_they_are_cut(cuts: list[int]) -> None:
+    stream, chunks = (ONE + b"\r\n" + TWO + b"\r\n") * 3, []
+    at = 0
+    for number, cut in enumerate([*cuts, len(stream)]):
+        chunks.append((number, stream[at : at + cut]))
+        at += cut
+    assert [line for _, line in lines_of(chunks)] == [ONE, TWO] * 3
+
+
+def test_a_command_is_timed_to_the_first_line_that_says_it() -> None:
+    lines = [(90, ONE), (150, TWO), (160, ONE), (170, ONE)]
+    assert commands_to_lines([(100, ONE)], lines) == [60]
+
+
+def test_a_command_that_never_came_is_left_out() -> None:
+    assert commands_to_lines([(100, ONE)], []) == []
+    assert commands_to_lines([(100, ONE)], [(99, ONE)]) == []
+    assert commands_to_lines([(100, ONE)], [(100 + PATIENCE_NS, ONE)]) == []
+
+
+def test_a_sample_is_timed_from_the_line_it_tells() -> None:
+    said = [(10, 0.25), (20, 0.251), (30, 0.252)]
+    assert lines_to_samples(said, [(15, 0.25), (25, 0.251)]) == [Fed(5, 0), Fed(5, 0)]
+
+
+def test_newer_lines_are_counted_as_waiting() -> None:
+    said = [(10, 0.25), (20, 0.251), (30, 0.252)]
+    assert lines_to_samples(said, [(35, 0.25), (36, 0.252)]) == [Fed(25, 2), Fed(6, 0)]
+
+
+def test_a_sample_that_repeats_a_line_or_tells_none_is_left_out() -> None:
+    said = [(10, 0.25), (20, 0.251)]
+    assert lines_to_samples(said, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [Fed(2, 0)]
+
+
+def test_the_same_speed_a_round_later_is_another_line() -> None:
+    said = [(number * 10, staircase(number) / 20) for number in range(2 * STEPS)]
+    samples = [(at_ns + 3, speed) for at_ns, speed in said]
+    assert lines_to_samples(said, samples) == [Fed(3, 0)] * (2 * STEPS)
+
+
+def test_a_speed_is_recognised_in_spite_of_rounding() -> None:
+    assert lines_to_samples([(0, 0.1 + 0.2)], [(1, 0.3)]) == [Fed(1, 0)]
+
+
+def test_percentiles_are_durations_that_were_measured() -> None:
+    assert summary([n * 1000 for n in range(1, 101)]) == Summary(100, 51.0, 100.0, 100.0)
+    assert summary([7000]) == Summary(1, 7.0, 7.0, 7.0)
+    assert summary([]) is None

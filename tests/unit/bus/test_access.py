@@ -1,0 +1,341 @@
+"""The rules Zenoh is given, read as Zenoh reads them: who may send what on which key."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, cast
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.bus.access import GRANTS, SERVICE_ROLES, Role, access_control
+from acsard.config.settings import (
+    AccessConfig,
+    CommandsConfig,
+    Config,
+    RobotConfig,
+    RosConfig,
+    Source,
+)
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.ros.trees import PARAMETERS, endpoints
+
+ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
+EVERYBODY = ("local", *ROLES)
+ZID = "0123456789abcdef"
+
+
+class Access:
+    """What the rules for a configuration let pass."""
+
+    def __init__(self, **tables: Any) -> None:
+        self.config = Config(**tables)
+        self.value = cast(dict[str, Any], access_control(self.config))
+        self.rules: dict[str, dict[str, Any]] = {rule["id"]: rule for rule in self.value["rules"]}
+        self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
+
+    def rules_of(self, who: str) -> list[dict[str, Any]]:
+        policies = [p for p in self.value["policies"] if who in p["subjects"]]
+        return [self.rules[name] for policy in policies for name in policy["rules"]]
+
+    def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
+        """Some rule allows it and none forbids it; a rule holds for the keys it includes."""
+        asked = zenoh.KeyExpr(key)
+        said = {
+            rule["permission"]
+            for rule in self.rules_of(who)
+            if flow in rule["flows"] and message in rule["messages"]
+            if any(zenoh.KeyExpr(held).includes(asked) for held in rule["key_exprs"])
+        }
+        return said == {"allow"}
+
+    def key(self, below: str) -> str:
+        return full_key(self.config.robot.id, below)
+
+    def who(self, message: str, key: str) -> set[str]:
+        return {who for who in EVERYBODY if self.lets(who, message, key)}
+
+
+DEFAULT = Access()
+FROM: dict[Role, set[str]] = {
+    "viewer": {"viewer", "operator", "maintainer", "local"},
+    "operator": {"operator", "maintainer", "local"},
+    "maintainer": {"maintainer", "local"},
+}
+"""Who has at least this role."""
+
+
+def written(key: str) -> str:
+    """A row of the table with names in the places for names."""
+    return key.replace("<source>", "app").replace("<Type>", "Twist")
+
+
+# the roles
+
+
+def test_each_role_has_all_that_the_one_before_has_and_more() -> None:
+    for less, more in (("viewer", "operator"), ("operator", "maintainer"), ("maintainer", "local")):
+        given_less = {rule["id"] for rule in DEFAULT.rules_of(less)}
+        given_more = {rule["id"] for rule in DEFAULT.rules_of(more)}
+        forbidden = {name for name in given_more if DEFAULT.rules[name]["permission"] == "deny"}
+        assert given_less < given_more - forbidden
+    assert set(GRANTS) == set(ROLES)
+
+
+def test_every_service_has_a_role_and_every_role_has_a_service() -> None:
+    assert set(SERVICE_ROLES) == set(SERVICES)
+    assert set(SERVICE_ROLES.values()) == set(ROLES)
+
+
+def test_what_no_rule_allows_is_denied() -> None:
+    assert DEFAULT.value["enabled"] is True
+    assert DEFAULT.value["default_permission"] == "deny"
+
+
+def test_a_certificate_counts_only_where_it_was_shown_and_plain_tcp_only_without_one() -> None:
+    assert DEFAULT.subjects["local"] == {"id": "local", "link_protocols": ["tcp"]}
+    for role in ROLES:
+        subject = DEFAULT.subjects[role]
+        assert subject["link_protocols"] == ["tls"]
+        assert subject["cert_common_names"] == [role]
+
+
+def test_every_policy_names_rules_and_subjects_that_exist() -> None:
+    for policy in DEFAULT.value["policies"]:
+        assert set(policy["rules"]) <= set(DEFAULT.rules)
+        assert set(policy["subjects"]) <= set(DEFAULT.subjects)
+
+
+# the native keys
+
+
+@pytest.mark.parametrize("topic", PUBLISHED, ids=lambda topic: topic.key)
+def test_everybody_admitted_may_follow_and_ask_for_what_is_published(topic: Any) -> None:
+    key = DEFAULT.key(topic.key)
+    assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
+    assert DEFAULT.who("query", key) == FROM["viewer"]
+    for who in EVERYBODY:
+        assert DEFAULT.lets(who, "put", key, "egress")
+        assert DEFAULT.lets(who, "reply", key, "egress")
+
+
+@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*"])
+def test_everybody_admitted_may_follow_the_robot_by_wildcard(below: str) -> None:
+    assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == FROM["viewer"]
+
+
+LEAST: dict[str, Role] = {
+    "cmd/<source>": "operator",
+    "wheel_cmd/<source>": "operator",
+    "stop": "viewer",
+    "info": "viewer",
+    "topics": "viewer",
+    "interfaces": "viewer",
+    "schema/<Type>": "viewer",
+    "config": "maintainer",
+    "srv/stop": "viewer",
+    "srv/clear": "operator",
+    "srv/activate": "operator",
+    "srv/deactivate": "operator",
+    "srv/reset_odometry": "operator",
+    "srv/set_pose": "maintainer",
+}
+
+
+@pytest.mark.parametrize(
+    "topic", [t for t in TOPICS if t.direction != "out"], ids=lambda topic: topic.key
+)
+def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
+    key = DEFAULT.key(written(topic.key))
+    message = "put" if topic.direction == "in" else "query"
+    assert DEFAULT.who(message, key) == FROM[LEAST[topic.key]]
+    declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
+    for who in EVERYBODY:
+        assert DEFAULT.lets(who, declared, DEFAULT.key(topic.pattern), "egress")
+
+
+def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
+    for key in (DEFAULT.key("alive"), "acsard/*/alive"):
+        assert DEFAULT.who("declare_liveliness_subscriber", key) == FROM["viewer"]
+        assert DEFAULT.who("liveliness_query", key) == FROM["viewer"]
+    for who in EVERYBODY:
+        assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
+
+
+def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:
+    ros = endpoints(RosConfig(), ZID)
+    for key in (DEFAULT.key("tf_static"), *(e.key for e in ros if e.latched)):
+        for message in ("query", "declare_subscriber"):
+            assert DEFAULT.who(message, f"{key}/@adv/**") == FROM["viewer"]
+        for who in EVERYBODY:
+            assert DEFAULT.lets(who, "reply", f"{key}/@adv/**", "egress")
+
+
+# no way round
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_no_role_may_delete_or_answer_in_the_robots_place(role: Role) -> None:
+    messages = {m for r in DEFAULT.rules_of(role) if "ingress" in r["flows"] for m in r["messages"]}
+    assert not messages & {"delete", "reply", "declare_queryable"}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) -> None:
+    below = [
+        "*",
+        "**",
+        "cmd/*",
+        "cmd/**",
+        "wheel_cmd/*",
+        "cmd/a$*",
+        "stop/**",
+        "*/app",
+        "cmd/ghost",
+    ]
+    below += [topic.key for topic in PUBLISHED]
+    for key in (*map(DEFAULT.key, below), "acsard/*/cmd/app", "acsard/**", "**"):
+        assert not DEFAULT.lets(role, "put", key), key
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
+    """A wildcard that meets a service is not let through, so neither is one that includes it."""
+    services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
+    services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction == "query"]
+    for rule in DEFAULT.rules_of(role):
+        if "ingress" in rule["flows"] and "query" in rule["messages"]:
+            for held in map(zenoh.KeyExpr, rule["key_exprs"]):
+                met = [service for service in services if held.intersects(zenoh.KeyExpr(service))]
+                assert met in ([], [str(held)])
+
+
+def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
+    for key in ("acsard/*/config", "acsard/**", "**", "acsard/*", "0/**", "acsard/other/srv/stop"):
+        assert DEFAULT.who("query", key) == set()
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize(
+    "key", ["acsard/other/stop", "acsard/other/cmd/app", "acsard/acsard/stop", "other/cmd_vel", "x"]
+)
+def test_nothing_outside_the_robots_own_keys_is_granted(role: Role, key: str) -> None:
+    for message in ("put", "query", "delete", "reply"):
+        assert not DEFAULT.lets(role, message, key)
+        assert not DEFAULT.lets(role, message, key, "egress")
+
+
+IDS = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
+
+
+@given(IDS, IDS)
+def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> None:
+    access = Access(robot=RobotConfig(id=one), ros=RosConfig(bridge=False, rmw=False))
+    for topic in TOPICS:
+        message = {"out": "query", "in": "put", "query": "query"}[topic.direction]
+        key = full_key(other, written(topic.key))
+        if one != other:
+            assert not any(access.lets(role, message, key) for role in ROLES)
+    assert access.lets("viewer", "put", full_key(one, "stop"))
+
+
+# the configuration decides
+
+
+@given(st.lists(IDS, min_size=1, max_size=5, unique=True))
+def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
+    sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
+    access = Access(commands=CommandsConfig(sources=sources), ros=RosConfig())
+    for kind in ("cmd", "wheel_cmd"):
+        for name in names:
+            assert access.lets("operator", "put", access.key(f"{kind}/{name}"))
+            assert not access.lets("viewer", "put", access.key(f"{kind}/{name}"))
+        for name in {"teleop", "app", "nav", "ros2_control"}.difference(names):
+            assert not access.lets("operator", "put", access.key(f"{kind}/{name}"))
+    for endpoint in endpoints(RosConfig(), ZID):
+        if endpoint.direction == "in":
+            listed = endpoint.native.partition("/")[2] in names
+            assert access.lets("operator", "put", endpoint.key) == listed
+
+
+def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() -> None:
+    access = Access(commands=CommandsConfig(sources=()))
+    assert not access.lets("maintainer", "put", access.key("cmd/app"))
+    assert access.lets("viewer", "put", access.key("stop"))
+    zenoh.Config().insert_json5("access_control", json.dumps(access.value))
+
+
+@pytest.mark.parametrize("namespace", ["", "robot1"])
+@pytest.mark.parametrize("transport", ["bridge", "rmw"])
+def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
+    other = "rmw" if transport == "bridge" else "bridge"
+    ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
+    access = Access(ros=ros)
+    found = endpoints(ros, ZID)
+    assert {endpoint.direction for endpoint in found} == {"in", "out", "query"}
+    for endpoint in found:
+        key, native = endpoint.key, endpoint.native
+        if endpoint.direction == "out":
+            assert access.who("declare_subscriber", key) == FROM["viewer"]
+            assert access.lets("viewer", "put", key, "egress")
+            assert not any(access.lets(role, "put", key) for role in ROLES)
+        elif endpoint.direction == "in":
+            assert access.who("put", key) == FROM["operator"]
+        else:
+            least = "maintainer" if native.startswith(PARAMETERS) else LEAST[native]
+            assert access.who("query", key) == FROM[least]
+            assert access.lets("viewer", "declare_queryable", key, "egress")
+        if endpoint.token:
+            assert access.lets("viewer", "liveliness_token", endpoint.token, "egress")
+
+
+@pytest.mark.parametrize("gone", ["bridge", "rmw"])
+def test_a_ros_tree_that_is_off_leaves_no_keys_behind(gone: str) -> None:
+    access = Access(ros=RosConfig(**{gone: False}))  # type: ignore[arg-type]
+    keys = {e.key for e in endpoints(RosConfig(), ZID) if e.transport == gone}
+    named = {key for rule in access.rules.values() for key in rule["key_exprs"]}
+    assert keys
+    assert not keys & named
+    for key in keys:
+        assert not any(
+            access.lets(role, message, key) for role in ROLES for message in ("put", "query")
+        )
+
+
+def test_the_lists_of_certificates_are_the_subjects() -> None:
+    names = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
+    subjects = Access(access=names).subjects
+    held = {role: subjects[role]["cert_common_names"] for role in ROLES}
+    assert held == {"viewer": ["wall"], "operator": ["anna", "ben"], "maintainer": ["chief"]}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
+    """A subject without names could be anybody."""
+    access = Access(access=AccessConfig(**{f"{role}s": ()}))
+    assert role not in access.subjects
+    assert set(access.subjects) == {*EVERYBODY} - {role}
+    assert not any(role in policy["subjects"] for policy in access.value["policies"])
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {},
+        {"ros": RosConfig(bridge=False, rmw=False)},
+        {"ros": RosConfig(namespace="a/b", domain=232)},
+        {"access": AccessConfig(viewers=(), operators=(), maintainers=())},
+        {"robot": RobotConfig(id="x" * 32)},
+    ],
+    ids=["defaults", "no ROS", "ROS elsewhere", "no certificates", "long id"],
+)
+def test_zenoh_accepts_the_rules(tables: dict[str, Any]) -> None:
+    access = Access(**tables)
+    config = zenoh.Config()
+    config.insert_json5("access_control", json.dumps(access.value))
+    assert json.loads(config.get_json("access_control"))["default_permission"] == "deny"
+    for rule in access.value["rules"]:
+        assert rule["key_exprs"]
+        assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])

@@ -1,0 +1,75 @@
+"""The files of a TLS directory are looked at before a session is opened with them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acsard.bus.certificates import check, ends_ns
+from acsard.cli.certificates import Authority
+from acsard.host.exits import Exit, ExitError
+from acsard.values import NS_PER_S
+
+DAY_NS = 86400 * NS_PER_S
+
+
+def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
+    Authority.make(where, "test", authority_days).issue(where, "robot", ["localhost"], days)
+    return where
+
+
+def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:
+    check(str(made(tmp_path)))
+
+
+def mixed(where: Path) -> None:
+    other = where / "other"
+    other.mkdir()
+    made(other)
+    (where / "key.pem").write_bytes((other / "key.pem").read_bytes())
+
+
+BROKEN: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda where: [path.rename(where / path.stem) for path in where.glob("*.pem")],
+    "no key": lambda where: [path.rename(where / "gone") for path in where.glob("key.pem")],
+    "junk": lambda where: (where / "certificate.pem").write_text("junk"),
+    "junk authority": lambda where: (where / "ca.pem").write_text("junk"),
+    "another's key": mixed,
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
+    BROKEN[how](made(tmp_path))
+    with pytest.raises(ExitError) as caught:
+        check(str(tmp_path))
+    assert caught.value.code is Exit.BAD_CONFIG
+    assert str(tmp_path) in str(caught.value)
+    assert "acsard lan" in str(caught.value)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
+    (made(tmp_path) / "key.pem").chmod(0)
+    with pytest.raises(ExitError) as caught:
+        check(str(tmp_path))
+    assert caught.value.code is Exit.NO_PERMISSION
+
+
+@pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])
+def test_it_ends_when_the_first_of_certificate_and_authority_does(
+    tmp_path: Path, days: int, authority: int
+) -> None:
+    ends = ends_ns(str(made(tmp_path, days, authority)))
+    later = ends_ns(str(made(tmp_path, 1, 1)))
+    assert ends is not None
+    assert later is not None
+    expected = min(days, 5 * authority)  # an authority lasts five times as long as it is asked for
+    assert round((ends - later) / DAY_NS) == expected - 1
+
+
+def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
+    assert ends_ns(str(tmp_path)) is None

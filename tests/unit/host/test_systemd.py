@@ -1,0 +1,315 @@
+"""What the service manager hears, on a real datagram socket: right, seldom, never waited for."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import socket
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.host.systemd import FEEDS_PER_WATCHDOG, Systemd
+from acsard.values import NS_PER_S, Instant, Outputs, Twist, WheelSpeeds
+
+PID = 4711
+
+MS = 1_000_000
+
+HALF = Twist(0.5, 0.0)
+
+
+class Manager:
+    """A service manager's end of the socket."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind("\0" + address[1:] if address.startswith("@") else address)
+        self._socket.setblocking(False)
+
+    def heard(self) -> list[dict[str, str]]:
+        """The datagrams since the last look, each as its assignments."""
+        datagrams: list[dict[str, str]] = []
+        while True:
+            try:
+                text = self._socket.recv(65536).decode()
+            except BlockingIOError:
+                return datagrams
+            datagrams.append(dict(line.split("=", 1) for line in text.split("\n")))
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    manager = Manager(str(tmp_path / "notify"))
+    yield manager
+    manager.close()
+
+
+def systemd(manager: Manager, **more: str) -> Systemd:
+    return Systemd({"NOTIFY_SOCKET": manager.address} | more, PID)
+
+
+def outputs(
+    at_ns: int,
+    *,
+    mode: str = "driving",
+    reason: str = "",
+    source: str = "nav",
+    applied: Twist = HALF,
+    changed: bool = False,
+) -> Outputs:
+    return Outputs(
+        now=Instant(at_ns, at_ns),
+        tick=True,
+        line=None,
+        speeds=WheelSpeeds(0.0, 0.0, 0.0, 0.0),
+        applied=applied,
+        linked=True,
+        samples=(),
+        mode=mode,
+        reason=reason,
+        link="up",
+        source=source,
+        command_ns=None,
+        status_changed=changed,
+    )
+
+
+def statuses(manager: Manager) -> list[str]:
+    return [datagram["STATUS"] for datagram in manager.heard() if "STATUS" in datagram]
+
+
+# who listens
+
+
+def test_without_a_manager_nothing_happens() -> None:
+    nobody = Systemd({}, PID)
+    assert not nobody.present
+    nobody.ready()
+    nobody.step(outputs(NS_PER_S))
+    nobody.stopping()
+    nobody.close()
+
+
+@pytest.mark.parametrize("address", ["/no/such/socket", "relative", "@acsard-nobody-here"])
+def test_an_address_where_nobody_listens_is_no_manager(address: str) -> None:
+    nobody = Systemd({"NOTIFY_SOCKET": address}, PID)
+    assert not nobody.present
+    nobody.ready()
+
+
+def test_an_abstract_address_is_understood() -> None:
+    manager = Manager(f"@acsard-test-{os.getpid()}")
+    try:
+        systemd(manager).ready()
+        assert manager.heard() == [{"READY": "1"}]
+    finally:
+        manager.close()
+
+
+def test_the_socket_is_not_handed_to_children(manager: Manager) -> None:
+    before = sockets()
+    there = systemd(manager)
+    (made,) = sockets() - before
+    assert not os.get_inheritable(made)
+    there.close()
+    assert sockets() == before
+
+
+def sockets() -> set[int]:
+    """The sockets this process has open."""
+    found = set()
+    for fd in map(int, os.listdir("/proc/self/fd")):
+        try:
+            if stat.S_ISSOCK(os.fstat(fd).st_mode):
+                found.add(fd)
+        except OSError:
+            pass  # the one the list was read with
+    return found
+
+
+# the life of a service
+
+
+def test_ready_is_said_in_one_datagram(manager: Manager) -> None:
+    systemd(manager).ready()
+    assert manager.heard() == [{"READY": "1"}]
+
+
+def test_stopping_is_said_with_why(manager: Manager) -> None:
+    systemd(manager).stopping()
+    assert manager.heard() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
+
+
+def test_waiting_asks_for_more_time_than_passes_until_it_is_said_again(manager: Manager) -> None:
+    systemd(manager).waiting("waits for the router")
+    assert manager.heard() == [
+        {"EXTEND_TIMEOUT_USEC": "30000000", "STATUS": "waits for the router"}
+    ]
+
+
+def test_after_close_nothing_is_sent(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    there.close()
+    there.ready()
+    there.step(outputs(NS_PER_S))
+    there.close()
+    assert manager.heard() == []
+    assert not there.present
+
+
+# the watchdog
+
+
+def feeds(manager: Manager, there: Systemd, period_ns: int, steps: int) -> list[int]:
+    """At which of the steps the watchdog was fed."""
+    fed = []
+    for step in range(1, steps + 1):
+        at = NS_PER_S + step * period_ns
+        there.step(outputs(at))
+        if {"WATCHDOG": "1"} in manager.heard():
+            fed.append(at)
+    return fed
+
+
+def test_the_first_step_feeds_the_watchdog(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    assert len(feeds(manager, there, 10 * MS, 1)) == 1
+
+
+@pytest.mark.parametrize("period_ms", [1, 10, 20, 33, 50, 100])
+def test_the_watchdog_is_fed_often_enough_and_not_each_step(
+    manager: Manager, period_ms: int
+) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    fed = feeds(manager, there, period_ms * MS, 2000 // period_ms)
+    gaps = [b - a for a, b in itertools.pairwise(fed)]
+    least = 200 * MS // FEEDS_PER_WATCHDOG
+    assert min(gaps) >= least
+    assert max(gaps) < least + period_ms * MS, "at the first step when it is due"
+    assert max(gaps) <= 100 * MS, "systemd's advice: at half the time"
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {},
+        {"WATCHDOG_USEC": "0"},
+        {"WATCHDOG_USEC": ""},
+        {"WATCHDOG_USEC": "-200000"},
+        {"WATCHDOG_USEC": "soon"},
+        {"WATCHDOG_USEC": "200000", "WATCHDOG_PID": str(PID + 1)},
+    ],
+)
+def test_a_watchdog_that_is_off_broken_or_another_process_s_is_not_fed(
+    manager: Manager, told: dict[str, str]
+) -> None:
+    assert feeds(manager, systemd(manager, **told), 10 * MS, 50) == []
+
+
+def test_a_watchdog_meant_for_us_by_pid_is_fed(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000", WATCHDOG_PID=str(PID))
+    assert feeds(manager, there, 10 * MS, 1)
+
+
+def test_nothing_but_a_step_feeds_it(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    there.ready()
+    there.waiting("for the router")
+    there.stopping()
+    assert not [datagram for datagram in manager.heard() if "WATCHDOG" in datagram]
+
+
+# the status
+
+
+@pytest.mark.parametrize(
+    ("twist", "text"),
+    [
+        (Twist(0.5, 0.0), "driving 0.5 m/s by nav"),
+        (Twist(-0.5, 0.04), "driving -0.5 m/s by nav"),
+        (Twist(0.0, -1.26), "driving 0.0 m/s, -1.3 rad/s by nav"),
+    ],
+)
+def test_driving_is_shown_by_its_speed_and_source(
+    manager: Manager, twist: Twist, text: str
+) -> None:
+    systemd(manager).step(outputs(NS_PER_S, applied=twist))
+    assert statuses(manager) == [text]
+
+
+def test_anything_else_is_shown_by_its_mode_and_reason(manager: Manager) -> None:
+    systemd(manager).step(outputs(NS_PER_S, mode="waiting", reason="/dev/acsar is not there"))
+    assert statuses(manager) == ["waiting: /dev/acsar is not there"]
+
+
+def test_the_same_status_is_sent_once(manager: Manager) -> None:
+    there = systemd(manager)
+    for step in range(1, 1000):
+        there.step(outputs(step * 10 * MS, changed=step % 3 == 0))
+    assert statuses(manager) == ["driving 0.5 m/s by nav"]
+
+
+def test_a_change_of_mode_is_sent_at_once(manager: Manager) -> None:
+    there = systemd(manager)
+    there.step(outputs(NS_PER_S))
+    there.step(outputs(NS_PER_S + 10 * MS, mode="stopped", reason="by teleop", changed=True))
+    assert statuses(manager) == ["driving 0.5 m/s by nav", "stopped: by teleop"]
+
+
+def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> None:
+    there = systemd(manager)
+    for step in range(500):
+        speed = step / 100
+        there.step(outputs(NS_PER_S + step * 10 * MS, applied=Twist(speed, 0.0)))
+    assert len(statuses(manager)) == 5
+
+
+# a manager that does not listen
+
+
+def fill(there: Systemd) -> int:
+    """Say more than fits; how many steps that took."""
+    for step in range(1, 10_000):
+        there.step(outputs(step * 100 * MS))
+    return step
+
+
+def test_a_full_queue_neither_blocks_nor_raises_and_feeding_goes_on_after_it(
+    manager: Manager,
+) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    began = time.monotonic()
+    steps = fill(there)
+    assert time.monotonic() - began < 5.0
+    assert 0 < len(manager.heard()) < steps, "it was full"
+    there.step(outputs(2000 * NS_PER_S))
+    assert {"WATCHDOG": "1"} in manager.heard()
+
+
+def test_a_manager_that_goes_away_neither_blocks_nor_raises(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    manager.close()
+    os.unlink(manager.address)
+    there.ready()
+    there.step(outputs(NS_PER_S))
+    there.stopping()
+    there.close()
+
+
+def test_a_status_that_a_full_queue_refused_is_sent_later(manager: Manager) -> None:
+    there = systemd(manager, WATCHDOG_USEC="200000")
+    fill(there)
+    at = 2000 * NS_PER_S
+    there.step(outputs(at, mode="stopped", reason="by teleop", changed=True))
+    manager.heard()
+    for step in range(1, 30):
+        there.step(outputs(at + step * 100 * MS, mode="stopped", reason="by teleop"))
+    assert statuses(manager) == ["stopped: by teleop"]

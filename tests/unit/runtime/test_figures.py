@@ -1,0 +1,90 @@
+"""What the daemon tells of itself: since the start and over the last minute, in fixed memory."""
+
+from __future__ import annotations
+
+import sys
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.runtime.figures import NAMES, SLOT_NS, SLOTS, Figures
+from acsard.runtime.histogram import Histogram
+from acsard.values import NS_PER_S, Measured, Spread
+
+MINUTE_NS = SLOT_NS * SLOTS
+US = 1000
+
+
+def step_time(figures: Figures, now_ns: int) -> Measured:
+    return figures.measured(now_ns)["step_time"]
+
+
+def test_every_figure_is_there_from_the_start() -> None:
+    assert Figures().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
+
+
+def test_a_measurement_counts_for_both() -> None:
+    figures = Figures()
+    figures.add("step_time", NS_PER_S, 250 * US)
+    one = step_time(figures, NS_PER_S)
+    assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
+
+
+def test_after_a_minute_it_counts_for_the_start_alone() -> None:
+    figures = Figures()
+    figures.add("step_time", 0, 250 * US)
+    assert step_time(figures, MINUTE_NS - 1).last_minute.count == 1
+    one = step_time(figures, MINUTE_NS + NS_PER_S)
+    assert (one.since_start.count, one.last_minute.count) == (1, 0)
+
+
+def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
+    for pause in range(1, 3 * SLOTS):
+        figures = Figures()
+        for slot in range(SLOTS):
+            figures.add("step_time", slot * SLOT_NS, 100 * US)
+        now_ns = (SLOTS - 1 + pause) * SLOT_NS
+        left = max(0, SLOTS - pause)
+        assert step_time(figures, now_ns).last_minute.count == left
+
+
+def test_what_is_told_is_at_most_a_second_old() -> None:
+    figures = Figures()
+    figures.add("step_time", 0, 100 * US)
+    assert step_time(figures, 0).since_start.count == 1
+    figures.add("step_time", 1, 100 * US)
+    assert step_time(figures, NS_PER_S - 1).since_start.count == 1
+    assert step_time(figures, NS_PER_S).since_start.count == 2
+
+
+@given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
+def test_the_minute_is_what_a_histogram_of_its_measurements_says(
+    measurements: list[tuple[int, int]],
+) -> None:
+    figures, now_ns, kept = Figures(), 0, []
+    for wait_ns, duration_ns in measurements:
+        now_ns += wait_ns
+        figures.add("mcu_round_trip", now_ns, duration_ns)
+        kept.append((now_ns, duration_ns))
+    minute = Histogram()
+    for at_ns, duration_ns in kept:
+        if now_ns // SLOT_NS - at_ns // SLOT_NS < SLOTS:
+            minute.add(duration_ns / 1000)
+    assert figures.measured(now_ns)["mcu_round_trip"].last_minute == minute.spread()
+
+
+def test_a_day_takes_no_more_memory_than_a_minute() -> None:
+    def size(figures: Figures) -> int:
+        return sum(
+            sys.getsizeof(histogram._buckets)
+            for figure in figures._figures.values()
+            for histogram in (figure._past, *figure._slots)
+        )
+
+    figures = Figures()
+    for second in range(60):
+        figures.add("period_lateness", second * NS_PER_S, second * US)
+    after_a_minute = size(figures)
+    for second in range(60, 86_400, 7):
+        figures.add("period_lateness", second * NS_PER_S, second * US)
+    assert size(figures) == after_a_minute

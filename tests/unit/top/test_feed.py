@@ -1,0 +1,161 @@
+"""What `acsard top` knows of a robot: the state of this moment at once, and what a silence is."""
+
+from __future__ import annotations
+
+from collections import deque
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.client import Client
+from acsard.host.exits import Exit, ExitError
+from acsard.messages.encodings import DecodeError, encode, encoding_name
+from acsard.messages.schema import Info, RobotState, Time
+from acsard.top import feed as top_feed
+from acsard.top.feed import GAPS, Feed, anew, silence
+from tests.unit.top.test_view import BEFORE, INFO, STATE
+
+KEY = "acsard/acsar/state"
+
+
+class Robot:
+    """A client without a bus: what it would be told, and at what time."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.state: RobotState | DecodeError = STATE
+        self.queue: deque[Any] = deque()
+
+    def key(self, name: str) -> str:
+        return f"acsard/acsar/{name}"
+
+    def get(self, name: str) -> RobotState | Info:
+        if name == "info":
+            return INFO
+        if isinstance(self.state, DecodeError):
+            raise self.state
+        return self.state
+
+    def subscribe(self, name: str) -> Robot:
+        assert name == "state"
+        return self
+
+    def try_recv(self) -> Any:
+        return self.queue.popleft() if self.queue else None
+
+    def tells(self, state: RobotState, key: str = KEY) -> None:
+        payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
+        encoding = encoding_name("msgpack", "RobotState")
+        self.queue.append(SimpleNamespace(key_expr=key, encoding=encoding, payload=payload))
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    robot = Robot()
+    monkeypatch.setattr(top_feed, "time", SimpleNamespace(monotonic=lambda: robot.now))
+    return robot
+
+
+def feed_of(robot: Robot) -> Feed:
+    return Feed(cast(Client, robot), "tcp/127.0.0.1:7448", "acsar")
+
+
+def at(sec: int, lines: int = 1300) -> RobotState:
+    counters = STATE.counters | {"lines": lines}
+    return replace(STATE, stamp=Time(sec), counters=counters)
+
+
+def came_every(robot: Robot, feed: Feed, seconds: float, times: int) -> None:
+    for _ in range(times):
+        robot.now += seconds
+        robot.tells(STATE)
+        feed.poll()
+
+
+def test_the_state_of_this_moment_is_there_without_one_that_comes(robot: Robot) -> None:
+    feed = feed_of(robot)
+    assert feed.seen().state is None
+    feed.ask()
+    assert feed.seen().state == STATE
+
+
+def test_asked_twice_it_has_two_to_take_rates_from(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.state = BEFORE
+    feed.ask()
+    robot.state = STATE
+    feed.ask()
+    assert (feed.seen().before, feed.seen().state) == (BEFORE, STATE)
+
+
+@pytest.mark.parametrize("sec", [999, 1001])
+def test_of_the_answer_and_what_came_meanwhile_the_later_counts(robot: Robot, sec: int) -> None:
+    feed = feed_of(robot)
+    robot.state = at(1000)
+    robot.tells(at(sec, lines=1300 + sec - 1000))
+    feed.ask()
+    feed.poll()
+    told = feed.seen().state
+    assert told is not None
+    assert told.stamp == Time(max(1000, sec))
+
+
+def test_a_put_on_a_wildcard_is_no_state(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.tells(STATE, "acsard/**")
+    feed.poll()
+    assert feed.seen().state is None
+
+
+def test_a_state_of_another_version_is_told_as_that(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.state = DecodeError("bad", "unknown field")
+    with pytest.raises(ExitError, match="another version") as told:
+        feed.ask()
+    assert told.value.code == Exit.FAILURE
+    assert feed.seen().undecodable == 1
+
+
+@pytest.mark.parametrize(("period", "seconds"), [(0.1, 2.0), (0.5, 2.0), (1.0, 3.0), (10.0, 30.0)])
+def test_a_silence_is_three_states_that_did_not_come(
+    robot: Robot, period: float, seconds: float
+) -> None:
+    feed = feed_of(robot)
+    feed.ask()
+    came_every(robot, feed, period, 2)
+    assert feed.seen().silence == pytest.approx(seconds)
+
+
+def test_a_burst_of_changes_makes_no_silence_of_a_slow_state(robot: Robot) -> None:
+    feed = feed_of(robot)
+    came_every(robot, feed, 10.0, 2)
+    came_every(robot, feed, 0.1, GAPS - 1)
+    assert feed.seen().silence == pytest.approx(30.0)
+
+
+def test_until_two_states_came_they_may_be_as_slow_as_any(robot: Robot) -> None:
+    feed = feed_of(robot)
+    assert feed.seen().silence == 2.0  # there is none at all
+    feed.ask()
+    robot.now += 9.0
+    seen = feed.seen()
+    assert seen.age == pytest.approx(9.0)
+    assert seen.age < seen.silence
+
+
+def test_an_outage_is_no_interval_for_long(robot: Robot) -> None:
+    feed = feed_of(robot)
+    came_every(robot, feed, 0.1, 20)
+    came_every(robot, feed, 600.0, 1)
+    assert feed.seen().silence == pytest.approx(30.0)
+    came_every(robot, feed, 0.1, GAPS)
+    assert feed.seen().silence == 2.0
+    assert silence([]) == 30.0
+
+
+def test_counters_that_began_again_are_another_daemon_s() -> None:
+    assert not anew(BEFORE, STATE)
+    assert anew(STATE, BEFORE)
+    assert anew(STATE, replace(STATE, counters={}))

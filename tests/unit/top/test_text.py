@@ -1,0 +1,116 @@
+"""Values as short text: right in value, bounded in length, harmless in a terminal."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
+
+from acsard.top.text import ago, bar, clean, count, duration, ends, rate, rule, signed
+from acsard.top.text import row as labelled
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("commanded by app", "commanded by app"),
+        ("[bold]not markup[/bold] :smile:", "[bold]not markup[/bold] :smile:"),
+        ("\x1b[2Jgone", "�[2Jgone"),
+        ("\x9b2Jgone", "�2Jgone"),
+        ("\x1b]0;title\x07", "�]0;title�"),
+        ("two\nlines\tand\rback", "two lines and back"),
+        ("over\x08\x7f", "over��"),
+        ("right \u202eto left", "right �to left"),
+        ("ze\u200bro wi\u0301dth", "ze�ro wi�dth"),
+        ("Größe 大", "Größe 大"),
+    ],
+)
+def test_text_from_the_bus_keeps_what_is_plain_and_nothing_else(text: str, shown: str) -> None:
+    assert clean(text) == shown
+
+
+@settings(max_examples=30)
+@given(st.text(max_size=300))
+def test_cleaned_text_is_printable_and_bounded(text: str) -> None:
+    assert clean(text).isprintable()
+    assert len(clean(text)) <= 256
+
+
+@pytest.mark.parametrize(
+    ("us", "text"),
+    [
+        (0.0, "<1 µs"), (63.1, "63 µs"), (999.4, "999 µs"), (999.6, "1.0 ms"), (8912.5, "8.9 ms"),
+        (9949.0, "9.9 ms"), (9960.0, "10 ms"), (332_775.0, "333 ms"), (2.5e6, "2.5 s"),
+        (9.9e9, "9900 s"), (1e12, "?"), (-1.0, "?"), (math.nan, "?"), (math.inf, "?"),
+    ],
+)  # fmt: skip
+def test_a_duration_is_told_in_its_own_unit(us: float, text: str) -> None:
+    assert duration(us) == text
+
+
+@given(st.floats())
+def test_a_duration_never_takes_more_than_6_characters(us: float) -> None:
+    assert len(duration(us)) <= 6
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
+     (math.inf, "   +inf"), (math.nan, "   +nan")],
+)  # fmt: skip
+def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
+    assert signed(value, 2, 7) == text
+
+
+@pytest.mark.parametrize(
+    ("number", "text"), [(0, "0"), (1234567, "1,234,567"), (10**30, "1.0e+30"), (-5, "-5")]
+)
+def test_a_count_is_readable_however_large(number: int, text: str) -> None:
+    assert count(number) == text
+    assert len(count(number**1000)) < 15
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "never"), (0.04, "0.0 s"), (12.34, "12.3 s"), (240.0, "4 min"), (7300.0, "2 h"),
+     (9e5, "10 d"), (math.nan, "?"), (-1.0, "?")],
+)  # fmt: skip
+def test_an_age_is_told_in_its_own_unit(seconds: float | None, text: str) -> None:
+    assert ago(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("later", "earlier", "seconds", "text"),
+    [
+        (300, 200, 1.0, "100.0/s"),
+        (20_000, 0, 2.0, "10000/s"),
+        (10, 200, 1.0, "    -/s"),  # started anew
+        (300, 200, 0.0, "    -/s"),  # one state only
+        (300, 200, -5.0, "    -/s"),  # the clock was set
+    ],
+)
+def test_a_rate_that_cannot_be_told_is_not_made_up(
+    later: int, earlier: int, seconds: float, text: str
+) -> None:
+    assert rate(later, earlier, seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "drawn"),
+    [(0.0, ""), (20.0, "██████"), (-20.0, "██████"), (10.0, "███"), (99.0, "██████"),
+     (0.5, "▏"), (math.nan, "")],
+)  # fmt: skip
+def test_a_bar_is_as_long_as_the_value_and_never_longer_than_its_place(
+    value: float, drawn: str
+) -> None:
+    assert bar(value, 20.0, 6) == drawn
+
+
+def test_lines_are_put_together_to_their_width() -> None:
+    line = rule(30, ((0, "pose"), (15, "wheels")))
+    assert line.plain == "pose ───────── wheels ────────"
+    assert cell_len(ends(labelled("a", "b"), labelled("c", "d"), 40).plain) == 40
+    assert ends(labelled("a", "much too long"), labelled("c", "d"), 20).plain.endswith("d")
