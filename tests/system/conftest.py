@@ -1,4 +1,4 @@
-"""The simulator's daemon and a client of it, started once for the tests of a module."""
+"""A bystander, and the simulator's daemon and a client of it, once for the tests of a module."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.bystander import standing_by
 from tests.system.harness import Bus, Daemon, Peer, until
+
+
+@pytest.fixture(scope="session", autouse=True)
+def bystander() -> Iterator[None]:
+    """Measures all the time what the machine costs: `bystander.lost`."""
+    with standing_by():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO,
     Bus,
@@ -22,10 +23,13 @@ from tests.system.harness import (
     resident_kb,
     twist,
     until,
+    waited_for_a_core,
 )
 from tests.system.ros_clients import TWIST, rmw_key
 from tests.system.ros_clients import twist as ros_twist
 from tests.system.strangers import FLOOD, words
+
+TICK_S = 0.01
 
 GO = json.dumps(twist(0.5)).encode()
 JOINTS = [f"{wheel}_wheel_joint" for wheel in ("front_right", "front_left", "rear_left")]
@@ -223,6 +227,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
+        waited = waited_for_a_core(daemon.pid)
         with Program(words(FLOOD, daemon.endpoint, 0.2, 3.0), tmp_path) as flood:
             flood.says("flooding")
             begun = time.monotonic()
@@ -240,6 +245,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
             count = int(flood.says("flooded").split()[1])
             assert flood.ended(5.0) == 0
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
+        waited = waited_for_a_core(daemon.pid) - waited
         until(lambda: bus.state()["linear"] == 0.0, 3.0, "at rest")
     periods = Periods.between(before, after)
     counters = after["counters"]
@@ -250,9 +256,9 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
         f"stop latched after {stopped.at - sent:.4f} s"
     )
     assert count > 10_000
-    assert periods.missed <= 0.03 * periods.elapsed
+    assert periods.missed <= 0.03 * periods.elapsed + waited / TICK_S
     assert grown < 10_000
-    assert stopped.at - sent < 0.2
+    assert stopped.at - sent < 0.2 + lost(sent, stopped.at)
     assert after["mode"] == "stopped"
     assert "Traceback" not in daemon.stderr
 
@@ -361,7 +367,7 @@ def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at
     )  # fmt: skip
     with Bus(flooded.endpoint) as bus, bus.follow("state") as states:
         bus.linked()
-        before = bus.state()
+        before, waited = bus.state(), waited_for_a_core(flooded.pid)
         with Program(program, tmp_path) as flood:
             flood.says("flooding")
             begun = time.monotonic()
@@ -374,7 +380,7 @@ def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at
             assert flood.process.poll() is None, "it was over too early"
             count, called = map(int, flood.says("flooded").split()[1:])
             assert flood.ended(5.0) == 0
-        after = bus.state()
+        after, waited = bus.state(), waited_for_a_core(flooded.pid) - waited
         assert bus.get("srv/clear")["success"]
     periods = Periods.between(before, after)
     refused = after["counters"]["command_malformed"]
@@ -386,7 +392,7 @@ def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at
     assert called == 1000
     assert refused > 100
     assert "64" in after["refused"]
-    assert periods.missed <= 0.03 * periods.elapsed
-    assert stopped.at - sent < 0.2
+    assert periods.missed <= 0.03 * periods.elapsed + waited / TICK_S
+    assert stopped.at - sent < 0.2 + lost(sent, stopped.at)
     assert flooded.process.poll() is None
     assert "Traceback" not in flooded.stderr

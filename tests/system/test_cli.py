@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
+from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -159,10 +160,11 @@ def test_echo_state_says_the_mode_and_why(shared: Daemon, bus: Bus) -> None:
 
 
 def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus) -> None:
+    begun = time.monotonic()
     ended = tool(shared, "echo", "tf_static", "-n", "1")
     assert ended.code == 0
     assert json.loads(ended.out)["transforms"][0]["child_frame_id"] == "lidar_link"
-    assert ended.seconds < 4.0
+    assert ended.seconds < 4.0 + lost(begun)
 
 
 def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: Bus) -> None:
@@ -219,32 +221,37 @@ def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.
     words = acsard("echo", "odom", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
         echo.says("header")
+        sent = time.monotonic()
         echo.signal(number)
         assert echo.ended(2.0) == (0 if number == signal.SIGINT else -signal.SIGTERM)
+        assert time.monotonic() - sent < 2.0 + lost(sent)
     assert echo.stderr == ""
 
 
 def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
+    begun = time.monotonic()
     ended = tool(shared, "hz", "odom", "-n", "2", "--json")
+    late = lost(begun)
     assert ended.code == 0
     lines = [json.loads(line) for line in ended.out.splitlines()]
     print(f"hz odom: {lines[-1]}")
     assert len(lines) == 2
     assert lines[1]["count"] > lines[0]["count"]
-    assert lines[1]["hz"] == pytest.approx(100.0, rel=0.03)
+    # Measured over a second; what comes late at one end may have come at the other.
+    assert lines[1]["hz"] == pytest.approx(100.0, abs=3.0 + 100.0 * late)
 
 
 @pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
 def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
     tmp_path: Path, words: list[str]
 ) -> None:
-    endpoint = free_endpoint()
+    endpoint, begun = free_endpoint(), time.monotonic()
     ended = finish(acsard(*words, "--connect", endpoint), tmp_path)
     assert (ended.code, ended.out) == (69, "")
     (told,) = ended.err.splitlines()
     assert endpoint in told
     assert "acsard run" in told
-    assert ended.seconds < 4.0
+    assert ended.seconds < 4.0 + lost(begun)
 
 
 def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -> None:
@@ -310,9 +317,11 @@ def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Pat
             bus.linked()
             assert bus.get("info")["simulated"] is False
             with connect(daemon.endpoint) as robot:
+                begun = time.monotonic()
                 robot.drive(0.5, seconds=0.6)
                 until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
-                assert robot.pose().x == pytest.approx(0.3, abs=0.05)
+                # What comes late is driven on for: 0.5 m/s.
+                assert robot.pose().x == pytest.approx(0.3, abs=0.05 + 0.5 * lost(begun))
         sim.signal(signal.SIGTERM)
         assert sim.ended(2.0) == 0
     assert "valid lines" in sim.stderr
@@ -421,7 +430,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
         took = time.monotonic() - released
         print(f"key let go -> at rest: {took:.2f} s")
         # 0.6 s of hold, 0.5 s of ramp, and some of the way.
-        assert 0.6 < took < 1.5 + 0.3
+        assert 0.6 < took < 1.5 + 0.3 + lost(released, released + took)
         assert program.process.poll() is None
 
 
@@ -435,7 +444,7 @@ def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
         took = time.monotonic() - pressed
         print(f"space -> at rest: {took:.2f} s")
         # The ramp alone is 0.5 s, and the source is gone 0.25 s after its last zero.
-        assert took < 0.5 + 0.25 + 0.4
+        assert took < 0.5 + 0.25 + 0.4 + lost(pressed, pressed + took)
 
 
 ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}

@@ -15,6 +15,7 @@ import pytest
 from acsard.client import AsyncClient, Client, connect, connect_async
 from acsard.host.exits import ExitError
 from acsard.messages import schema
+from tests.system.bystander import lost
 from tests.system.harness import (
     ROOT,
     Bus,
@@ -33,10 +34,11 @@ DEFAULT = "tcp/127.0.0.1:7448"
 
 
 class Outcome(NamedTuple):
-    """How an example ended, and the robot's state at rest afterwards."""
+    """How an example ended, the robot's state at rest afterwards, and what the machine took, s."""
 
     ended: Finished
     state: Any
+    late: float
 
 
 def code_blocks() -> list[str]:
@@ -98,7 +100,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
             print(
                 f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
             )
-            outcomes[name] = Outcome(ended, state)
+            outcomes[name] = Outcome(ended, state, lost(program.started))
     return outcomes
 
 
@@ -109,31 +111,32 @@ def test_the_readme_has_the_three_examples() -> None:
 def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
     examples: dict[str, Outcome],
 ) -> None:
-    ended, state = examples["five lines"]
+    ended, state, late = examples["five lines"]
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith("Pose(x=")
-    assert state["x"] == pytest.approx(1.0, rel=0.03)
+    # What comes late is driven on for: 0.5 m/s.
+    assert state["x"] == pytest.approx(1.0, abs=0.03 + 0.5 * late)
     assert state["y"] == pytest.approx(0.0, abs=0.01)
 
 
 def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
     examples: dict[str, Outcome],
 ) -> None:
-    ended, state = examples["async"]
+    ended, state, late = examples["async"]
     assert (ended.code, ended.err) == (0, "")
     assert len(ended.out.splitlines()) > 100
-    assert state["yaw"] == pytest.approx(0.4, rel=0.05)
-    assert state["x"] == pytest.approx(0.97, rel=0.05)
+    assert state["yaw"] == pytest.approx(0.4, abs=0.02 + 0.2 * late)
+    assert state["x"] == pytest.approx(0.97, abs=0.05 + 0.5 * late)
 
 
 def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_prints_the_odometry(
     examples: dict[str, Outcome],
 ) -> None:
-    ended, state = examples["plain zenoh"]
+    ended, state, late = examples["plain zenoh"]
     assert (ended.code, ended.err) == (0, "")
     assert '"child_frame_id":"base_link"' in ended.out
     # Its own sleeps add up to some more than 2 s.
-    assert state["x"] == pytest.approx(1.03, rel=0.05)
+    assert state["x"] == pytest.approx(1.03, abs=0.05 + 0.5 * late)
 
 
 # the client
@@ -185,17 +188,17 @@ def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(
         messages = robot.messages("tf_static", timeout=0.5)
         message = next(messages)
         assert message.transforms[0].child_frame_id == "lidar_link"
-        assert time.monotonic() - start < 0.5
+        assert time.monotonic() - start < 0.5 + lost(start)
         # At most one more, if the one of every 5 s falls into that time.
         assert len(list(messages)) <= 1
-        assert time.monotonic() - start < 2.0
+        assert time.monotonic() - start < 2.0 + lost(start)
 
 
 def test_messages_of_silence_ends_after_its_timeout(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot:
         start = time.monotonic()
         assert list(robot.samples("cmd/nobody", timeout=0.3)) == []
-        assert 0.25 < time.monotonic() - start < 1.5
+        assert 0.25 < time.monotonic() - start < 1.5 + lost(start)
 
 
 def test_connecting_to_nobody_is_an_exit_error_with_69_and_the_mend() -> None:
@@ -241,7 +244,9 @@ def test_a_source_that_is_not_listed_is_told_so_in_state(shared: Daemon, fresh: 
 
 def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
+        begun = time.monotonic()
         robot.drive(0.3, 0.1, seconds=0.2)
+        missed = lost(begun) / 0.05  # it sends at 20 Hz
         commands.find(lambda value: value["twist"]["linear"]["x"] == 0.3, 2.0, "the command")
         speeds = until(
             lambda: _ended([seen.value["twist"]["linear"]["x"] for seen in commands.seen]),
@@ -249,7 +254,7 @@ def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh
             "the last zero",
         )
         assert speeds[0] == 0.0
-        assert 3 <= speeds.count(0.3) <= 6
+        assert 3 - missed <= speeds.count(0.3) <= 6
         assert commands.seen[0].encoding == "application/msgpack;acsard.TwistStamped.v1"
         assert all(seen.value["header"]["stamp"]["sec"] > 0 for seen in commands.seen)
 
@@ -307,10 +312,12 @@ def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: B
                 break
         return seen
 
+    begun = time.monotonic()
     seen = run_async(shared, work)
-    assert len(seen) > 60
+    late = lost(begun)
+    assert len(seen) > 60 - 100 * late
     assert max(odom.twist.twist.linear.x for odom in seen) > 0.4
-    assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03)
+    assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
 
 
 def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh: Bus) -> None:
@@ -335,7 +342,7 @@ def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh:
             lambda value: value["twist"]["linear"]["x"] == 0.0, 2.0, "a zero", after=cancelled
         )
     print(f"cancel -> zero on the bus: {zero.at - cancelled:.4f} s")
-    assert zero.at - cancelled < 0.2
+    assert zero.at - cancelled < 0.2 + lost(cancelled, zero.at)
     assert not [
         seen
         for seen in commands.seen

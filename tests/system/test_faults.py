@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     PLAIN,
     ZERO,
@@ -100,7 +101,7 @@ def gaps(lines: list[Heard]) -> list[float]:
 
 
 class Ramp(NamedTuple):
-    """How long after the last accepted command a ramp began, s."""
+    """How long after the last accepted command a ramp began, s, less what the machine took."""
 
     step: float
     """The first slower step, by the daemon's own stamps."""
@@ -145,7 +146,10 @@ def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
             slower = next(step for step in full if speed(step) < 0.0999)
             until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "zero on the wire")
             line = next(h for h in peer.since(steady) if not h.line.startswith(text(0.1)))
-            found.append(Ramp(stamp(slower) - accepted, line.at + wall - accepted))
+            since, step = accepted - wall, stamp(slower) - wall
+            found.append(
+                Ramp(step - since - lost(since, step), line.at - since - lost(since, line.at))
+            )
     took, lines = [ramp.step for ramp in found], [ramp.line for ramp in found]
     promised = TIMEOUT_S + TICK_S
     late = [one - promised for one in took if one > promised]
@@ -234,7 +238,7 @@ def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command
             ramp = [wheels(heard.line)[0] for heard in later]
             assert bus.state()["source"] == successor
     print(f"{successor} takes over {slower.at - sent:.3f} s after the last command")
-    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S
+    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
     assert ramp == sorted(ramp, reverse=True)
     assert ramp[-1] == 2.0, "it never fell below what the successor asks for"
 
@@ -272,7 +276,8 @@ def taken(name: str) -> Iterator[None]:
 
 
 def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], list[float]]:
-    """Seconds until an unplug is seen in state, and from replug to the first zero line."""
+    """Seconds until an unplug is seen in state, and from replug to the first zero line, each less
+    what the machine took."""
     noticed, zeros = [], []
     with (
         Daemon(tmp_path, peer.path) as daemon,
@@ -296,8 +301,8 @@ def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], lis
                 # The first loss may start a thread that stays.
                 before = kinds_of(daemon.pid)
                 continue
-            noticed.append(down.at - pulled)
-            zeros.append(first.at - plugged)
+            noticed.append(down.at - pulled - lost(pulled, down.at))
+            zeros.append(first.at - plugged - lost(plugged, first.at))
         until(
             lambda: kinds_of(daemon.pid) <= before,
             3.0,
@@ -349,7 +354,7 @@ def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_li
             begun, known = time.monotonic(), len(peer.lines)
             until(lambda: time.monotonic() > begun + 1.0, 5.0, "a second")
             heard = time.monotonic()
-        until(lambda: len(peer.lines) > known, 5.0, "it reads again")
+        until(lambda: peer.lines[-1].at > heard + 0.005, 5.0, "it has read what waited")
         found = [one.line for one in peer.lines[known:] if one.at < heard + 0.005]
         drive = [line for line in found if line != ZERO_LINE]
         first_zero = found.index(ZERO_LINE)
@@ -360,7 +365,7 @@ def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_li
         assert set(found[first_zero:]) == {ZERO_LINE}
         assert len(drive) <= 10 + 2
         # 10 Hz of zeros.
-        assert len(found) - first_zero <= 10 + 2
+        assert len(found) - first_zero <= 10 * (heard - begun) + 2
 
 
 def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> None:
@@ -400,8 +405,8 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             f"link {after['link']}"
         )
         assert after["link"] == "up"
-        assert periods.superseded >= 35
-        assert periods.accounted == pytest.approx(periods.elapsed, abs=2)
+        assert periods.superseded + periods.missed >= 35
+        assert periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.
         assert len(waited) <= 6
         # Long unheard, the MCU has stopped: we start over from zero.
@@ -437,6 +442,8 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
             driver.ended(5.0)
             sent = last_put(driver)
             peer.awaits(ZERO_TEXT, after=sent)
+        puts = [float(line.split()[1]) for line in driver.out[:-1]]
+        silent = max(b - a for a, b in itertools.pairwise([begun, *puts, ended]) if begun < b)
         lines = peer.since(begun, ended)
         slower = next(h for h in peer.since(sent) if not h.line.startswith(text(0.3)))
     stamps = [seconds(step.value["header"]["stamp"]) for step in steps.seen]
@@ -451,12 +458,14 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
         f"{max(between) * 1e3:.1f} ms apart, {close} closer than a line's time; ramp "
         f"{slower.at - sent:.3f} s after the last command"
     )
-    assert periods.accounted == pytest.approx(periods.elapsed, abs=2)
+    assert periods.are_all_accounted_for()
     # Counted, not timed: the kernel's thread that carries bytes through a pty starves as well,
     # and then hands over several lines at once.
     assert len(lines) <= 100 * (ended - begun) + 5
-    assert {h.line for h in lines} <= {text(0.3) + b"bp06.00,cp06.00,dp06.00"}
-    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S
+    # The commander starves, too.
+    if silent < TIMEOUT_S - TICK_S:
+        assert {h.line for h in lines} <= {text(0.3) + b"bp06.00,cp06.00,dp06.00"}
+    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
 
 
 def test_starved_of_both_cores_every_missed_period_is_counted_and_none_made_up_in_a_burst(
@@ -485,10 +494,13 @@ def no_burst(lines: list[Heard]) -> float:
     """The smallest gap; fails when lines came faster than their periods.
 
     Counted over a tenth of a second: the kernel's thread that carries bytes through a pty may be
-    late itself and hand over two or three lines at once.
+    late itself and hand over two or three lines at once, or as many as the machine made it wait.
     """
     for first in lines:
-        assert sum(first.at <= heard.at < first.at + 0.1 for heard in lines) <= 10 + 4
+        most = 10 + 4
+        if (count := sum(first.at <= heard.at < first.at + 0.1 for heard in lines)) > most:
+            most += round(lost(first.at - 0.1, first.at + 0.1) / TICK_S)
+        assert count <= most
     return min(gaps(lines))
 
 

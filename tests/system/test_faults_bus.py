@@ -24,6 +24,7 @@ import pytest
 import zenoh
 
 from acsard.client import Client, connect
+from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -37,6 +38,7 @@ from tests.system.harness import (
     resident_kb,
     seconds,
     until,
+    waited_for_a_core,
     wheels,
 )
 from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, words
@@ -59,7 +61,11 @@ PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
 
 
 def gaps(lines: list[Heard]) -> list[float]:
-    return [after.at - before.at for before, after in itertools.pairwise(lines)]
+    """How far the lines are apart, less what the machine took where that is much."""
+    return [
+        b.at - a.at - (lost(a.at, b.at) if b.at - a.at > 2 * TICK_S else 0.0)
+        for a, b in itertools.pairwise(lines)
+    ]
 
 
 def port_of(endpoint: str) -> int:
@@ -266,7 +272,10 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
             until(lambda: proxy.held < 2000, 20.0, "all is through")
             proxy.turn("fast")
             lines = appeared(peer.since(begun + TIMEOUT_S))
-            ages = [age for heard in lines if (age := numbered.age(heard)) is not None]
+            known = [(h, age) for h in lines if (age := numbered.age(h)) is not None]
+            ages = [age for _, age in known]
+            bound = TIMEOUT_S + TICK_S + SLACK_S
+            stale = [(h, age) for h, age in known if age > bound]
             found.append(
                 Hole(
                     way,
@@ -274,7 +283,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
                     held,
                     bus.count("command_stale") - refused,
                     len(ages),
-                    sum(age > TIMEOUT_S + TICK_S + SLACK_S for age in ages),
+                    sum(age > bound + lost(h.at - age, h.at) for h, age in stale),
                     max(ages),
                     again.at - healed,
                 )
@@ -334,8 +343,9 @@ BASE = 0.25
 
 
 class Flooded(NamedTuple):
-    """How old what a flood's steps obeyed was, s. The first two hold also the way to the daemon,
-    on which a flooder's own threads and Zenoh's wait for a core."""
+    """How old what a flood's steps obeyed was, s, less what the machine took where that is over
+    20 ms. The first two hold also the way to the daemon, on which a flooder's own threads and
+    Zenoh's wait for a core."""
 
     age: list[float]
     """Since the command was written, be there a newer one or not."""
@@ -374,6 +384,7 @@ def flooded(where: Path, length: float) -> Flooded:
     ):
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
+        waited = waited_for_a_core(daemon.pid)
         with Program(words(CODED_FLOOD, daemon.endpoint, BASE, SLOPE, length), where) as flood:
             begun = float(flood.says("flooding").split()[1])
             asked = []
@@ -383,6 +394,7 @@ def flooded(where: Path, length: float) -> Flooded:
             sent = json.loads(flood.says("sent").removeprefix("sent"))
             assert flood.ended(5.0) == 0
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
+        waited = waited_for_a_core(daemon.pid) - waited
         start = begun + time.time() - time.monotonic()
         steps = [
             (seconds(step.value["header"]["stamp"]) - start, step.value["twist"]["linear"]["x"])
@@ -392,6 +404,10 @@ def flooded(where: Path, length: float) -> Flooded:
     written, put = [one[0] for one in sent], [one[1] for one in sent]
     stood = 0.0
     found = Flooded([], [], [], [])
+
+    def by_itself(age: float, at: float) -> float:
+        return age - lost(begun + at - age, begun + at) if age > 0.02 else age
+
     for at, speed in steps:
         if speed < BASE:
             stood = at
@@ -399,12 +415,13 @@ def flooded(where: Path, length: float) -> Flooded:
             code = (speed - BASE) / SLOPE
             # By 0.1 ms: a code holds 0.02 ms, commands are 0.5 ms apart.
             newer = bisect.bisect(written, code + 0.0001)
-            found.age.append(at - code)
-            found.overtaken.append(at - put[newer] if newer < len(put) else 0.0)
+            found.age.append(by_itself(at - code, at))
+            late = at - put[newer] if newer < len(put) else 0.0
+            found.overtaken.append(by_itself(late, at))
     # Before its first one counts, the last command is the zero it opened with.
     flooding = [state for state in asked if seconds(state["stamp"]) > start + 0.1]
     found.arrived.extend(
-        source["age"]
+        by_itself(source["age"], seconds(state["stamp"]) - start)
         for state in flooding
         for source in state["sources"]
         if source["name"] == "app" and state["mode"] == "driving"
@@ -420,7 +437,8 @@ def flooded(where: Path, length: float) -> Flooded:
         f"{len(found.held_up)} times; {found}"
     )
     assert count > 10_000 * length
-    assert periods.missed <= 0.03 * periods.elapsed + 1
+    assert periods.missed <= 0.03 * periods.elapsed + 1 + waited / TICK_S
+    assert len(found.age) > 50 * length - waited / TICK_S
     assert grown < 10_000
     assert after["mode"] != "fault", after["reason"]
     return found
@@ -428,7 +446,6 @@ def flooded(where: Path, length: float) -> Flooded:
 
 def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
     found = flooded(tmp_path, 1.0)
-    assert len(found.age) > 50
     assert len(found.arrived) > 20
     assert statistics.median(found.age) <= 0.02
     assert max(found.overtaken) <= 0.02 + SLACK_S
@@ -555,7 +572,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
                     "acsard/acsar/odom", zenoh.handlers.FifoChannel(100)
                 )
                 until(samples.try_recv, 10.0, "odometry behind the new router")
-                found.append(time.monotonic() - back)
+                found.append(time.monotonic() - back - lost(back))
         lines = peer.since(steady)
         worst = max(gaps(lines))
         assert {heard.line[:7] for heard in lines} == {b"ap04.00"}, "it drove on all the time"
@@ -564,7 +581,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
         f"{statistics.median(found):.2f} max {max(found):.2f} s; longest gap between lines of the "
         f"local drive {worst * 1e3:.1f} ms"
     )
-    assert worst <= 0.06
+    assert worst <= 0.06  # less what the machine took
     return found
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO_LINE,
     Bus,
@@ -52,7 +53,7 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
     ramp = [wheels(heard.line)[0] for heard in ramp_after(peer, sent)]
     print(f"{number.name} at 0.5 m/s: exit {code} after {seconds:.3f} s, ramp of {len(ramp)} lines")
     assert code == 0
-    assert seconds < 1.0
+    assert seconds < 1.0 + lost(sent, sent + seconds)
     assert last == ZERO_LINE, "STOP is the last line"
     assert ramp == sorted(ramp, reverse=True), "a monotone fall"
     # 0.5 m/s at 3 m/s2 is 17 periods: a ramp, not a cut.
@@ -68,7 +69,7 @@ def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, pee
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(5.0) == 0
         print(f"SIGTERM at rest: {time.monotonic() - sent:.3f} s")
-        assert time.monotonic() - sent < 1.0
+        assert time.monotonic() - sent < 1.0 + lost(sent)
     assert peer.last_line() == ZERO_LINE
     assert peer.session.stream.endswith(ZERO_LINE)
 
@@ -87,7 +88,7 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
     ramp = ramp_after(peer, sent)
     print(f"SIGTERM at 2 m/s with a slow ramp: {seconds:.3f} s")
     assert code == 0
-    assert 0.55 < seconds < 1.0
+    assert 0.55 < seconds < 1.0 + lost(sent, sent + seconds)
     assert last == ZERO_LINE, "STOP is the last line"
     assert wheels(ramp[-2].line)[0] > 20.0, "it was still fast when its time was up"
 
@@ -115,9 +116,11 @@ def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signa
     print(f"second signal {hurried - sent:.3f} s after the first -> exit {ended - hurried:.3f} s")
     assert code == 0
     assert last == ZERO_LINE, "STOP is the last line"
-    assert wheels(ramp[-2].line)[0] > 28.0, "the ramp alone would be below that after 0.6 s"
-    assert ramp[-1].at - hurried < 0.3
-    assert ended - sent < 1.0
+    machine_s = lost(sent, ended)
+    # 20 rad/s2: the ramp alone would be below that after its 0.6 s.
+    assert wheels(ramp[-2].line)[0] > 28.0 - 20.0 * machine_s
+    assert ramp[-1].at - hurried < 0.3 + machine_s
+    assert ended - sent < 1.0 + machine_s
 
 
 def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
@@ -129,7 +132,7 @@ def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
         sent = time.monotonic()
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(5.0) == 0
-        assert time.monotonic() - sent < 1.0
+        assert time.monotonic() - sent < 1.0 + lost(sent)
     assert peer.last_line() == ZERO_LINE
 
 
@@ -154,7 +157,7 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
     print(f"SIGTERM with a stopped subscriber: {seconds:.3f} s")
     assert code == 0
     assert peer.last_line() == ZERO_LINE
-    assert seconds < 1.0
+    assert seconds < 1.0 + lost(sent, sent + seconds)
 
 
 def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path) -> None:

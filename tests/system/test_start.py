@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     START_S,
     ZERO_LINE,
@@ -39,7 +40,7 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
             first = float(watcher.says("first").split()[1])
     seconds = first - daemon.started
     print(f"acsard run -> first odometry in another process: {seconds:.3f} s")
-    assert seconds < 3.0
+    assert seconds < 3.0 + lost(daemon.started, first)
 
 
 def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Path) -> None:
@@ -54,12 +55,15 @@ def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Pa
 def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
+        begun = time.monotonic()
         driven = finish(words(DRIVE, daemon.endpoint, 0.5, 2.0), tmp_path)
+        late = lost(begun)
         assert driven.code == 0, driven
         until(lambda: bus.get("odom")["twist"]["twist"]["linear"]["x"] == 0.0, 3.0, "standstill")
         position = bus.get("odom")["pose"]["pose"]["position"]
     print(f"0.5 m/s for 2 s: {position['x']:.4f} m ({driven.out.strip()} s)")
-    assert position["x"] == pytest.approx(1.0, rel=0.02)
+    # What comes late is driven on for: 0.5 m/s.
+    assert position["x"] == pytest.approx(1.0, abs=0.02 + 0.5 * late)
     assert position["y"] == pytest.approx(0.0, abs=0.01)
 
 
@@ -78,7 +82,8 @@ def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appea
             appeared = peer.session.plugged
             until(lambda: peer.lines, 5.0, "a line")
             print(f"port appears -> first bytes: {peer.session.raw[0].at - appeared:.3f} s")
-            assert peer.session.raw[0].at - appeared < 0.5 + 0.5
+            first = peer.session.raw[0].at
+            assert first - appeared < 0.5 + 0.5 + lost(appeared, first)
             assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
             states.find(lambda state: state["link"] == "up", 5.0, "link up")
         assert len(daemon.events("port_waiting")) == 1  # once, not at every attempt
@@ -94,7 +99,7 @@ def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
             sent = time.monotonic()
             daemon.signal(signal.SIGTERM)
             assert daemon.ended(2.0) == 0
-            assert time.monotonic() - sent < 1.0
+            assert time.monotonic() - sent < 1.0 + lost(sent)
 
 
 def test_state_answers_as_soon_as_the_daemon_says_it_is_up(tmp_path: Path) -> None:
@@ -193,10 +198,11 @@ def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, pee
     device = os.path.realpath(peer.path)
     os.chmod(device, 0o000)  # not even the owner, who is root here only without root's rights
     run = acsard("run", "--port", device, "--listen", free_endpoint())
+    begun = time.monotonic()
     ended = finish([*drop, *run], tmp_path)
     print(f"no permission: exit {ended.code} after {ended.seconds:.2f} s")
     assert ended.code == 77
-    assert 2.0 < ended.seconds < 8.0  # udev is given 2 s to set the group
+    assert 2.0 < ended.seconds < 8.0 + lost(begun)  # udev is given 2 s to set the group
     assert device in ended.err
     assert "usermod -aG dialout" in ended.err
     assert "Traceback" not in ended.err
@@ -243,6 +249,7 @@ MISTAKES = {
 def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path, verb: str) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(PLANTED)
+    begun = time.monotonic()
     ended = finish(acsard(verb, "--config", str(path)), tmp_path)
     print(f"{verb} with a bad configuration: {ended.seconds:.2f} s")
     assert ended.code == 78
@@ -252,7 +259,7 @@ def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path,
     for key, told in MISTAKES.items():
         assert [line for line in lines if key in line and told in line], (key, ended.err)
     assert summary.startswith("acsard: 5 problems")
-    assert ended.seconds < 2.0
+    assert ended.seconds < 2.0 + lost(begun)
 
 
 def test_a_configuration_that_is_not_there_ends_with_78(tmp_path: Path) -> None:

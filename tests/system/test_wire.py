@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     PLAIN,
     ZERO,
@@ -57,8 +58,7 @@ def test_half_a_metre_per_second_straight_is_10_rad_per_s_on_every_wheel(
 ) -> None:
     with running(tmp_path, peer) as bus, bus.commanding(0.5):
         steady = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
-        until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
-        assert {heard.line for heard in peer.await_lines(30)} == {steady}
+        until(lambda: {h.line for h in peer.lines[-30:]} == {steady}, 5.0, f"30 times {steady!r}")
 
 
 def test_a_pure_left_turn_is_forward_on_a_and_d_and_backward_on_b_and_c(
@@ -227,7 +227,7 @@ def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_
         until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
         silent, stale, _ = _fall_silent(peer, states)
         print(f"peer falls silent -> stale in state: {stale.at - silent:.3f} s")
-        assert stale.at - silent < 0.1 + 0.5
+        assert stale.at - silent < 0.1 + 0.5 + lost(silent, stale.at)
         assert "silent" in stale.value["reason"]
         pose = bus.state()["x"]
         zeros = peer.await_lines(2)
@@ -249,7 +249,8 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             zeros = peer.await_lines(14)
             # 10 Hz while nothing comes back, whatever the commander wants.
             assert {heard.line for heard in zeros} == {ZERO_LINE}
-            assert 0.08 < (zeros[-1].at - zeros[0].at) / 13 < 0.2
+            took = zeros[-1].at - zeros[0].at
+            assert 0.08 < took / 13 < 0.2 + lost(zeros[0].at, zeros[-1].at) / 13
             peer.reply = PLAIN
             back = states.find(lambda state: state["link"] == "up", 5.0, "up", after=stale.at).at
             waiting = states.find(

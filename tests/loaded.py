@@ -1,0 +1,130 @@
+"""`python -m tests.loaded`: the test command where it is hardest, several times, with its times.
+
+Beside it run four loops that take all they get, at the same priority. The tests run as nohup and a
+script's `&` start a program: no terminal, nothing on standard input, SIGINT and SIGHUP ignored,
+LC_ALL=C; and by a plain user, nobody when root starts this (who must be able to run this Python).
+It ends with 0 when no run failed. `python -m tests.loaded -n 1 -- tests/system` is one run of a
+part; what stands behind `--` goes to pytest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+
+NOBODY = 65534
+
+LOOP = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    pass"
+"""Ends by itself when this program does."""
+
+
+class Run(NamedTuple):
+    """What became of one run of the test command."""
+
+    seconds: float
+    code: int | None
+    """None when its time was up."""
+    said: str
+
+    @property
+    def failed(self) -> list[str]:
+        return re.findall(r"^(?:FAILED|ERROR) .*$", self.said, re.M)
+
+
+@contextmanager
+def loops(count: int) -> Iterator[None]:
+    """So many busy loops beside what is done in here."""
+    with ExitStack() as stack:
+        for _ in range(count):
+            words = [sys.executable, "-c", LOOP, str(os.getpid())]
+            loop = stack.enter_context(subprocess.Popen(words, stdin=subprocess.DEVNULL))
+            stack.callback(loop.kill)
+        yield
+
+
+def plain_user() -> dict[str, object]:
+    """How Popen starts a process of a user without rights."""
+    if os.geteuid() != 0:
+        return {}
+    return {"user": NOBODY, "group": NOBODY, "extra_groups": []}
+
+
+def unattended() -> None:
+    """As nohup and `&` leave a program; called in the child."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def environment(home: Path) -> dict[str, str]:
+    """A plain user's, who can write to a home only."""
+    kept = {key: os.environ[key] for key in ("PATH", "VIRTUAL_ENV") if key in os.environ}
+    return kept | {
+        "HOME": str(home),
+        "TMPDIR": str(home),
+        "LC_ALL": "C",
+        "HYPOTHESIS_STORAGE_DIRECTORY": str(home / "hypothesis"),
+        "PYTHONPYCACHEPREFIX": str(home / "compiled"),
+    }
+
+
+def run(home: Path, words: list[str], within: float) -> Run:
+    """The test command once; ended with all it has started when its time is up."""
+    command = [sys.executable, "-m", "pytest", "-q", "-o", f"cache_dir={home}/cache", *words]
+    log, begun = home / "log", time.monotonic()
+    with (
+        log.open("wb") as out,
+        subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, cwd=ROOT,
+            env=environment(home), start_new_session=True, preexec_fn=unattended,
+            **plain_user(),  # type: ignore[call-overload]
+        ) as tests,
+    ):  # fmt: skip
+        try:
+            code = tests.wait(within)
+        except subprocess.TimeoutExpired:
+            code = None
+            os.killpg(tests.pid, signal.SIGKILL)
+    return Run(time.monotonic() - begun, code, log.read_text(errors="replace"))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.loaded", description=__doc__)
+    parser.add_argument("-n", "--runs", type=int, default=5)
+    parser.add_argument("--loops", type=int, default=4)
+    parser.add_argument("--within", type=float, default=900.0, help="seconds for one run")
+    parser.add_argument("words", nargs="*", help="for pytest, behind --")
+    asked = parser.parse_args()
+    done = []
+    for number in range(1, asked.runs + 1):
+        with tempfile.TemporaryDirectory(prefix="loaded-") as path, loops(asked.loops):
+            home = Path(path)
+            if plain_user():
+                os.chown(home, NOBODY, NOBODY)
+            one = run(home, asked.words, asked.within)
+        done.append(one)
+        *_, last = one.said.strip().splitlines() or ["said nothing"]
+        ended = "out of time" if one.code is None else f"exit {one.code}"
+        print(f"run {number}: {one.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
+        for line in one.failed:
+            print(f"    {line}", flush=True)
+        if one.code:
+            Path(f"loaded-{number}.log").write_text(one.said)
+    good = sum(one.code == 0 for one in done)
+    print(f"{good} of {len(done)} runs without a failure, beside {asked.loops} busy loops")
+    return 0 if good == len(done) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

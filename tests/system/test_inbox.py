@@ -1,0 +1,27 @@
+"""What the bus takes in, with real Zenoh sessions and without a daemon."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import zenoh
+
+from acsard.bus.inbox import Inbox
+from acsard.bus.replies import OPEN_QUERIES, Replies
+from tests.system.harness import Bus, client_config, free_endpoint
+
+
+def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answered() -> None:
+    prefix, endpoint = "acsard/acsar/", free_endpoint()
+    # Never started, so no query is ever answered, as behind clients that read no reply.
+    inbox = Inbox(prefix, Replies(prefix), (), lambda: None)
+    with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
+        topics = ("info", "srv/stop")
+        held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
+        asked = [bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(OPEN_QUERIES + 1)]
+        # One more is let go, at once, and so is the stop itself; but it counts.
+        assert list(bus.session.get(f"{prefix}info", timeout=60.0)) == []
+        assert inbox.take(0).arrivals == ()
+        assert list(bus.session.get(f"{prefix}srv/stop", timeout=60.0)) == []
+        assert [one.key for one in inbox.take(0).arrivals] == ["stop"]
+        del held, asked
