@@ -75,6 +75,7 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
     assert world.state.x == pytest.approx(x, abs=0.2)
 
 
+@pytest.mark.slow
 def test_minutes_of_driving_about_raise_no_false_alarm(world: World) -> None:
     for i in range(30):
         world.hold((-1) ** i * 0.9, (i % 7 - 3) * 1.2, seconds=0.5 + i % 5 * 0.8, hz=10.0)

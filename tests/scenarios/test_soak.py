@@ -1,6 +1,7 @@
 """What must not move does not, ten thousand times over, and for a day with a fault every minute.
 
-Each test prints its figure; the short versions run by default, the long ones with
+Each test prints its figure; the short versions run by default, those in `.ci/run` that are marked
+slow, the long ones with
 
     pytest -m soak -s tests/scenarios/test_soak.py
 """
@@ -24,6 +25,11 @@ from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 DAY_NS = 86_400 * NS_PER_S
+
+
+def slow(count: int) -> object:
+    """A run too slow for every day."""
+    return pytest.param(count, marks=pytest.mark.slow)
 
 
 def long(count: int, seconds: int) -> object:
@@ -99,7 +105,7 @@ def silence(world: World, dice: random.Random, timeout: float) -> float:
     return took
 
 
-@pytest.mark.parametrize("count", [200, long(10_000, 1200)])
+@pytest.mark.parametrize("count", [50, slow(200), long(10_000, 1200)])
 def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int) -> None:
     dice, kept, latest = random.Random(1), 0, 0.0
     for trial in range(count):
@@ -171,7 +177,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     return world
 
 
-@pytest.mark.parametrize("count", [48, long(1_000, 1800)])
+@pytest.mark.parametrize("count", [16, slow(48), long(1_000, 1800)])
 def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
     world = quiet_bus(World())
@@ -249,7 +255,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     return stale, backward, accepted
 
 
-@pytest.mark.parametrize("count", [10, long(200, 1800)])
+@pytest.mark.parametrize("count", [4, slow(10), long(200, 1800)])
 def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
     dice, stale, backward, accepted = random.Random(3), 0, 0, 0
     for trial in range(count):
@@ -350,7 +356,7 @@ def empty(world: World) -> int:
     return sys.getallocatedblocks()
 
 
-@pytest.mark.parametrize("minutes", [5, long(24 * 60, 3600)])
+@pytest.mark.parametrize("minutes", [slow(5), long(24 * 60, 3600)])
 def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memory(
     minutes: int,
 ) -> None:

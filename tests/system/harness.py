@@ -111,6 +111,7 @@ class Program:
         self.out: list[str] = []
         self.err: list[str] = []
         self._readers: list[threading.Thread] = []
+        self._end_by = signal.SIGTERM
 
     def __enter__(self: P) -> P:
         self.started = time.monotonic()
@@ -125,7 +126,7 @@ class Program:
     def __exit__(self, *error: object) -> None:
         process = self.process
         if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
+            process.send_signal(self._end_by)
             try:
                 process.wait(END_S)
             except subprocess.TimeoutExpired:
@@ -252,6 +253,8 @@ class Daemon(Program):
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
         super().__init__(run, where, **how)
+        # The way down takes 0.3 s; the tests that are about it send the signal themselves.
+        self._end_by = signal.SIGKILL
 
     def __enter__(self) -> Daemon:
         super().__enter__()
@@ -596,6 +599,13 @@ class Following:
                     raise AssertionError(f"not within {within:g} s: {what}; last: {last}")
 
 
+def broken(states: Following, since: float, to: float = float("inf")) -> bool:
+    """Whether the link was lost in that time, though nobody broke it: the machine kept the
+    microcontroller or the kernel's thread that carries its lines waiting. The robot rightly stands
+    then, and what it did tells nothing."""
+    return any(since <= seen.at <= to and seen.value["link"] != "up" for seen in states.seen)
+
+
 class Answered(NamedTuple):
     """One reply to a query."""
 
@@ -667,6 +677,18 @@ class Bus:
         with self.follow("state") as states:
             states.find(lambda state: state["link"] == "up", within, "link up")
 
+    def comes_to(self, *modes: str) -> Any:
+        """The state in one of these modes: at once, or when a link that a busy machine kept
+        waiting for a tenth of a second is back."""
+
+        def look() -> Any:
+            state = self.state()
+            return state if state["mode"] in modes or state["link"] == "up" else None
+
+        state = until(look, 5.0, "link up")
+        assert state["mode"] in modes, state
+        return state
+
     def at_rest(self, within: float = 5.0) -> Any:
         """The state when the robot is ready, obeys nobody and its wheels stand."""
 
@@ -737,8 +759,10 @@ class Periods(NamedTuple):
 
     def are_all_accounted_for(self) -> bool:
         """A state falls anywhere within a period, at either end, or into one that is yet to begin:
-        what is due by its stamp is counted then."""
-        return abs(self.accounted - self.elapsed) <= 2 + self.latest
+        what is due by its stamp is counted then. What a command's own line supersedes is counted
+        beyond the periods."""
+        over = self.accounted - self.elapsed
+        return -2 - self.latest <= over <= 2 + self.latest + self.superseded
 
 
 def waited_for_a_core(pid: int) -> float:

@@ -141,13 +141,12 @@ def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said
     )
     lines = bus.count("lines_sent")
     until(lambda: bus.count("lines_sent") >= lines + 5, 3.0, "five more lines")
-    after = bus.state()
+    after = bus.comes_to("ready", "driving")
     assert said in after["refused"], after["refused"]
     assert len(after["refused"]) <= 300
     assert after["counters"]["commands"] == before["counters"]["commands"], "it refreshed something"
     for key in ("x", "y", "yaw", "linear", "angular", "wheels"):
         assert after[key] == before[key], key
-    assert after["mode"] in ("ready", "driving")
     reasons = {k for k in after["counters"] if k.startswith("command_")}
     changed = {k for k in reasons if after["counters"][k] != before["counters"].get(k, 0)}
     assert changed == {f"command_{reason}"}
@@ -207,8 +206,7 @@ def test_a_message_over_the_link_s_size_harms_only_who_sent_it(bus: Bus, shared:
         sender.session.put("acsard/acsar/cmd/app", GO + b" " * 1_000_000)
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") > lines + 50, 5.0, "it goes on")
-    state = bus.state()
-    assert (state["linear"], state["mode"]) == (0.0, "ready")
+    assert bus.comes_to("ready")["linear"] == 0.0
     with Bus(shared.endpoint) as another:
         another.linked()
 
@@ -218,7 +216,7 @@ def test_nothing_of_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
     assert "Traceback" not in shared.stderr
     assert "Error" not in shared.stderr
     assert "panicked" not in shared.stderr
-    assert bus.state()["mode"] == "ready"
+    bus.comes_to("ready")
 
 
 def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once(
@@ -228,14 +226,14 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
         waited = waited_for_a_core(daemon.pid)
-        with Program(words(FLOOD, daemon.endpoint, 0.2, 3.0), tmp_path) as flood:
+        with Program(words(FLOOD, daemon.endpoint, 0.2, 2.0), tmp_path) as flood:
             flood.says("flooding")
             begun = time.monotonic()
             driving = states.find(
                 lambda state: state["linear"] == pytest.approx(0.2, abs=0.01), 3.0, "0.2 m/s"
             )
             # Most of the flood first, then the stop in the middle of it.
-            states.find(lambda _: True, 3.0, "2.5 s of flood", after=begun + 2.5)
+            states.find(lambda _: True, 3.0, "1.5 s of flood", after=begun + 1.5)
             sent = time.monotonic()
             bus.session.put("acsard/acsar/stop", b"")
             stopped = states.find(
@@ -250,7 +248,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
     periods = Periods.between(before, after)
     counters = after["counters"]
     print(
-        f"flood of {count} puts in 3 s: {periods.missed} of {periods.elapsed:.0f} periods missed, "
+        f"flood of {count} puts in 2 s: {periods.missed} of {periods.elapsed:.0f} periods missed, "
         f"{counters['commands']} commands taken, overrun {counters.get('bus_overrun', 0)}, "
         f"memory +{grown} kB, driving after {driving.at - begun:.3f} s, "
         f"stop latched after {stopped.at - sent:.4f} s"

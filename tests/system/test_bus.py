@@ -196,12 +196,11 @@ def test_a_get_by_wildcard_never_runs_a_service(bus: Bus, pattern: str, latched:
         assert bus.get("srv/set_pose", {"x": 3.0, "y": 2.0, "yaw": 1.0})["success"]
         if latched:
             bus.get("srv/stop")
-        before = bus.state()
+        before = bus.comes_to("stopped" if latched else "ready")
         start = time.monotonic()
         answers = bus.ask(pattern, {"x": 7.0, "y": 7.0, "yaw": 0.0})
         took = time.monotonic() - start - lost(start)
-        after = bus.state()
-    assert before["mode"] == ("stopped" if latched else "ready")
+        after = bus.comes_to(before["mode"])
     assert (after["mode"], after["reason"]) == (before["mode"], before["reason"])
     # Neither reset nor set; encoders may still tick over by a fraction of a millimetre.
     assert (after["x"], after["y"], after["yaw"]) == pytest.approx((3.0, 2.0, 1.0), abs=0.01)
@@ -227,7 +226,7 @@ def test_stop_and_clear_by_their_exact_keys(bus: Bus) -> None:
         refused = bus.get("srv/activate")
         assert (refused["success"], "clear" in refused["message"]) == (False, True)
         assert bus.get("srv/clear")["success"]
-        assert bus.state()["mode"] == "ready"
+        bus.comes_to("ready")
         nothing = bus.get("srv/clear")
         assert (nothing["success"], "nothing to clear" in nothing["message"]) == (False, True)
 
@@ -238,8 +237,8 @@ def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
         assert bus.state()["mode"] == "inactive"
         assert "srv/activate" in bus.state()["reason"]
         assert bus.get("srv/activate")["success"]
-        # Never "waiting", which says that there is no link: it is up.
-        assert bus.state()["mode"] == "ready"
+        # Never "waiting", which says that there is no link, while it is up.
+        bus.comes_to("ready")
 
 
 def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> None:

@@ -34,6 +34,7 @@ from tests.system.harness import (
     Periods,
     Program,
     alive_at,
+    broken,
     environment,
     free_endpoint,
     seconds,
@@ -213,7 +214,32 @@ def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
         yield daemon
 
 
-@pytest.mark.parametrize("successor", ["second", "third"])
+def taken_over(
+    peer: FarPeer, daemon: Daemon, bus: Bus, successor: str
+) -> tuple[float, list[Heard]] | None:
+    """When a commander that was killed sent its last, and the lines up to the speed of the next;
+    nothing when the machine broke the link meanwhile."""
+    with bus.follow("state") as states, commander(daemon, 0.3, "first") as first:
+        steady = peer.awaits(text(0.3), after=time.monotonic()).at
+        with commander(daemon, 0.1, successor) as other:
+            until(lambda: len(other.out) > 5, 5.0, "the other one commands")
+            waits = {one["name"]: one["waits_for"] for one in bus.state()["sources"]}
+            driven = peer.lines[-1].line.startswith(text(0.3))
+            first.signal(signal.SIGKILL)
+            first.ended(5.0)
+            sent = last_put(first)
+            reached = peer.awaits(text(0.1), after=sent)
+            source = bus.state()["source"]
+        until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "at rest")
+        if broken(states, steady):
+            return None
+    assert "first" in waits[successor]
+    assert driven
+    assert source == successor
+    return sent, peer.since(sent, reached.at)
+
+
+@pytest.mark.parametrize("successor", ["second", pytest.param("third", marks=pytest.mark.slow)])
 def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command(
     tmp_path: Path, successor: str
 ) -> None:
@@ -221,22 +247,11 @@ def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command
         FarPeer(tmp_path) as peer,
         three_sources(tmp_path, peer) as daemon,
         Bus(daemon.endpoint) as bus,
-        commander(daemon, 0.3, "first") as first,
     ):
-        peer.awaits(text(0.3))
-        with commander(daemon, 0.1, successor) as other:
-            until(lambda: len(other.out) > 5, 5.0, "the other one commands")
-            waits = {one["name"]: one["waits_for"] for one in bus.state()["sources"]}
-            assert "first" in waits[successor]
-            assert peer.lines[-1].line.startswith(text(0.3))
-            first.signal(signal.SIGKILL)
-            first.ended(5.0)
-            sent = last_put(first)
-            reached = peer.awaits(text(0.1), after=sent)
-            later = peer.since(sent, reached.at)
-            slower = next(h for h in later if not h.line.startswith(text(0.3)))
-            ramp = [wheels(heard.line)[0] for heard in later]
-            assert bus.state()["source"] == successor
+        took = until(lambda: taken_over(peer, daemon, bus, successor), 30.0, "with the link up")
+    sent, later = took
+    slower = next(h for h in later if not h.line.startswith(text(0.3)))
+    ramp = [wheels(heard.line)[0] for heard in later]
     print(f"{successor} takes over {slower.at - sent:.3f} s after the last command")
     assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
     assert ramp == sorted(ramp, reverse=True)
@@ -388,7 +403,9 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             taken, begun = sum(noise), time.monotonic()
             before = bus.state()
             driver.wish = twist(0.2)
+            spoke, silent = begun, 0.0
             while (now := time.monotonic()) < begun + 0.5:
+                spoke, silent = now, max(silent, now - spoke)
                 # Its own 100 Hz; unheard, it stops as the contract says.
                 peer.say(PLAIN((10.0 if now < begun + 0.3 else 0.0,) * 4))
                 time.sleep(TICK_S)
@@ -404,7 +421,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             f"{len(waited)} lines of ours in the first 5 ms, {periods.superseded} superseded, "
             f"link {after['link']}"
         )
-        assert after["link"] == "up"
+        assert after["link"] == "up" or silent > 0.05
         assert periods.superseded + periods.missed >= 35
         assert periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.
@@ -462,8 +479,8 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
     # Counted, not timed: the kernel's thread that carries bytes through a pty starves as well,
     # and then hands over several lines at once.
     assert len(lines) <= 100 * (ended - begun) + 5
-    # The commander starves, too.
-    if silent < TIMEOUT_S - TICK_S:
+    # The commander starves, too, and so does the link.
+    if silent < TIMEOUT_S - TICK_S and not broken(states, begun, ended):
         assert {h.line for h in lines} <= {text(0.3) + b"bp06.00,cp06.00,dp06.00"}
     assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
 

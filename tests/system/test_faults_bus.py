@@ -33,6 +33,7 @@ from tests.system.harness import (
     Periods,
     Program,
     Tables,
+    broken,
     client_config,
     free_endpoint,
     resident_kb,
@@ -438,7 +439,10 @@ def flooded(where: Path, length: float) -> Flooded:
     )
     assert count > 10_000 * length
     assert periods.missed <= 0.03 * periods.elapsed + 1 + waited / TICK_S
-    assert len(found.age) > 50 * length - waited / TICK_S
+    during = sum(0.0 <= at < length for at, _ in steps)
+    assert during > 90 * length - waited / TICK_S
+    # While the machine keeps the link from being up the robot stands.
+    assert len(found.age) > (10 if stale else 50)
     assert grown < 10_000
     assert after["mode"] != "fault", after["reason"]
     return found
@@ -533,6 +537,7 @@ def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[
     return without, stopped
 
 
+@pytest.mark.slow
 def test_four_stopped_subscribers_hold_up_no_line(tmp_path: Path) -> None:
     without, stopped = hoarded(tmp_path, 1, 0.4)
     assert max(stopped) <= max(without) + 0.005 + SLACK_S
@@ -561,6 +566,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
         stack.enter_context(Program(words(COMMANDER, daemon.endpoint, "app", 0.2, 1), where))
         with Bus(routed) as remote, remote.follow("odom") as odom:
             odom.find(lambda _: True, 5.0, "odometry behind the router")
+        states = stack.enter_context(stack.enter_context(Bus(daemon.endpoint)).follow("state"))
         steady = peer.awaits(b"ap04.00").at
         for _ in range(cycles):
             router.signal(signal.SIGKILL)
@@ -575,7 +581,8 @@ def rerouted(where: Path, cycles: int) -> list[float]:
                 found.append(time.monotonic() - back - lost(back))
         lines = peer.since(steady)
         worst = max(gaps(lines))
-        assert {heard.line[:7] for heard in lines} == {b"ap04.00"}, "it drove on all the time"
+        told = {heard.line[:7] for heard in lines}
+        assert told == {b"ap04.00"} or broken(states, steady), "it drove on all the time"
     print(
         f"router killed {cycles} times: back -> odometry behind it median "
         f"{statistics.median(found):.2f} max {max(found):.2f} s; longest gap between lines of the "

@@ -36,7 +36,7 @@ def test_a_port_that_the_daemon_holds_ends_with_75_and_how_to_stop_it(
     assert ended.code == 75
     assert f"process {shared.pid}" in ended.err
     assert "systemctl stop acsard" in ended.err
-    assert bus.state()["link"] == "up"
+    bus.comes_to("ready")
 
 
 def test_a_port_that_is_not_there_ends_with_66(tmp_path: Path) -> None:

@@ -160,17 +160,18 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
     assert seconds < 1.0 + lost(sent, sent + seconds)
 
 
-def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rounds", [1, pytest.param(8, marks=pytest.mark.slow)])
+def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path, rounds: int) -> None:
     # At once, so that each is interrupted anywhere: a thread left behind at the interpreter's end
     # made one in ten of them abort on a busy machine.
-    for number in (signal.SIGTERM, signal.SIGINT) * 2:
+    for _ in range(rounds):
         with ExitStack() as stack:
             daemons = [
                 stack.enter_context(Daemon(tmp_path, name=f"d{n}", ready=False)) for n in range(8)
             ]
-            for daemon in daemons:
+            for n, daemon in enumerate(daemons):
                 daemon.says("bus ")
-                daemon.signal(number)
+                daemon.signal((signal.SIGTERM, signal.SIGINT)[n % 2])
             codes = [daemon.ended(5.0) for daemon in daemons]
             told = next((d.stderr for d, code in zip(daemons, codes, strict=True) if code), "")
             assert codes == [0] * 8, told

@@ -52,6 +52,7 @@ def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Pa
             daemon.says(hint)
 
 
+@pytest.mark.slow
 def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
@@ -89,11 +90,12 @@ def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appea
         assert len(daemon.events("port_waiting")) == 1  # once, not at every attempt
 
 
+@pytest.mark.parametrize("often", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
-    tmp_path: Path,
+    tmp_path: Path, often: int
 ) -> None:
     # In the first milliseconds the signal meets an attempt to open the port, later a pause.
-    for pause in (0.0, 0.0, 0.0, 0.0, 0.001, 0.003, 0.3):
+    for pause in (0.0, 0.001, 0.3) * often:
         with Daemon(tmp_path, tmp_path / "nothing") as daemon:
             time.sleep(pause)
             sent = time.monotonic()
@@ -153,6 +155,7 @@ def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_ow
     assert peer.session.stream == b""
 
 
+@pytest.mark.slow
 def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
     tmp_path: Path, peer: Peer
 ) -> None:

@@ -31,11 +31,16 @@ def full_disk() -> Iterator[int]:
     os.close(file)
 
 
+def slow(value: str) -> object:
+    """Each alone, beside all at once."""
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 STREAMS = {"readerless pipe": readerless_pipe, "full disk": full_disk}
 
 
 @pytest.mark.parametrize("stream", STREAMS)
-@pytest.mark.parametrize("which", ["stdout", "stderr", "both"])
+@pytest.mark.parametrize("which", [slow("stdout"), slow("stderr"), "both"])
 def test_control_goes_on_when_output_cannot_be_written(
     tmp_path: Path, peer: Peer, stream: str, which: str
 ) -> None:
@@ -46,7 +51,9 @@ def test_control_goes_on_when_output_cannot_be_written(
         drives_and_leaves(daemon, peer)
 
 
-@pytest.mark.parametrize("redirection", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    "redirection", [slow(">&-"), slow("2>&-"), slow(">&- 2>&-"), "<&- >&- 2>&-"]
+)
 def test_control_goes_on_when_a_stream_was_closed_before_the_start(
     tmp_path: Path, peer: Peer, redirection: str
 ) -> None:

@@ -1,0 +1,32 @@
+"""`python -m tests.lowest`: what pip is held to for the lowest versions `pyproject.toml` allows.
+
+It writes one `name==version` a line, of all that is depended on, for `pip install --constraint`.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from itertools import chain
+from pathlib import Path
+
+PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
+
+BOUND = re.compile(r"^([A-Za-z0-9-]+)>=([0-9.]+)")
+
+
+def lowest() -> dict[str, str]:
+    """The lowest version of each distribution."""
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    found: dict[str, str] = {}
+    for one in chain(project["dependencies"], *project["optional-dependencies"].values()):
+        bound = BOUND.match(one)
+        assert bound is not None, f"{one} has no lower bound"
+        name, version = bound.groups()
+        assert found.setdefault(name, version) == version, f"{name} has two lower bounds"
+    return found
+
+
+if __name__ == "__main__":
+    for name, version in sorted(lowest().items()):
+        print(f"{name}=={version}")
