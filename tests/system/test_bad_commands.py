@@ -325,6 +325,7 @@ def flooded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 @pytest.mark.parametrize("way", ["bridge", "rmw"])
+@pytest.mark.slow
 def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
     flooded: Daemon, tmp_path: Path, way: str
 ) -> None:
@@ -355,6 +356,7 @@ def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
     assert taken + overrun + counted("command_stale") <= 1100 * lasted
 
 
+@pytest.mark.slow
 def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at_once(
     flooded: Daemon, tmp_path: Path
 ) -> None:

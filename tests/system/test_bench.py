@@ -34,6 +34,7 @@ auto_activate = false
 """
 
 
+@pytest.mark.slow
 def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -92,6 +93,7 @@ def test_a_port_that_is_no_device_is_66_at_once(tmp_path: Path, what: str) -> No
     assert done.err.startswith(f"acsard: {what} is not a serial port")
 
 
+@pytest.mark.slow
 def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason() -> None:
     config = bench_config(Config(), simulated=True)
     config = replace(config, control=ControlConfig(auto_activate=False))

@@ -233,6 +233,7 @@ def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.
     assert echo.stderr == ""
 
 
+@pytest.mark.slow
 def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
     begun = time.monotonic()
     ended = tool(shared, "hz", "odom", "-n", "2", "--json")
@@ -314,6 +315,7 @@ def test_call_with_the_wrong_values_ends_with_2_and_the_form(
 # sim and run in two processes
 
 
+@pytest.mark.slow
 def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Path) -> None:
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
@@ -334,6 +336,7 @@ def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Pat
     assert not (tmp_path / "mcu").is_symlink()
 
 
+@pytest.mark.slow
 def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
     with Program(acsard("sim", "--fault", "mute"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
@@ -471,6 +474,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
             bus.at_rest()
 
 
+@pytest.mark.slow
 def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
     with teleop(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
@@ -514,6 +518,7 @@ def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
         assert after == fresh.settings
 
 
+@pytest.mark.slow
 def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus: Bus) -> None:
     with teleop(shared) as (terminal, program):
         for payload in (b"\xff", b"{}", b""):

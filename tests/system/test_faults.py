@@ -558,6 +558,7 @@ def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_b
         assert ramp == sorted(ramp)
 
 
+@pytest.mark.slow
 def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first(
     far: tuple[FarPeer, Daemon],
 ) -> None:
@@ -622,7 +623,7 @@ def full_pipe() -> Iterator[int]:
         os.close(writer)
 
 
-@pytest.mark.parametrize("which", ["stdout", "stderr"])
+@pytest.mark.parametrize("which", [pytest.param("stdout", marks=pytest.mark.slow), "stderr"])
 def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
     tmp_path: Path, peer: Peer, which: str
 ) -> None:

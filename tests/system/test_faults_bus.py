@@ -592,6 +592,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
     return found
 
 
+@pytest.mark.slow
 def test_a_router_that_dies_and_returns_does_not_touch_local_driving(tmp_path: Path) -> None:
     assert max(rerouted(tmp_path, 1)) <= 2.0
 

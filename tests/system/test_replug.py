@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.system.bystander import lost
 from tests.system.harness import ZERO, ZERO_LINE, Bus, Daemon, Peer, twist, until, wheels
 
@@ -62,6 +64,7 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
             assert bus.state()["x"] > moved, "odometry went on from where it was"
 
 
+@pytest.mark.slow
 def test_the_port_can_be_lost_and_found_again_and_again(tmp_path: Path, peer: Peer) -> None:
     with (
         Daemon(tmp_path, peer.path) as daemon,

@@ -96,7 +96,11 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
 # Several times: a STOP that is thrown away behind the last line is lost once in five to ten.
 @pytest.mark.parametrize(
     "second",
-    [signal.SIGTERM, signal.SIGINT, pytest.param(signal.SIGTERM, id="SIGTERM again")],
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, id="SIGTERM again", marks=pytest.mark.slow),
+    ],
 )
 def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signal.Signals) -> None:
     config = {"limits": SLOW_STOP}
@@ -136,6 +140,7 @@ def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
     assert peer.last_line() == ZERO_LINE
 
 
+@pytest.mark.slow
 def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
     tmp_path: Path, peer: Peer
 ) -> None:

@@ -196,6 +196,7 @@ def unprivileged() -> list[str]:
     return drop
 
 
+@pytest.mark.slow
 def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, peer: Peer) -> None:
     drop = unprivileged()
     device = os.path.realpath(peer.path)

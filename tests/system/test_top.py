@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from tests.system.harness import Bus, Daemon, Program, acsard, environment, finish, until
 from tests.system.test_cli import ON_TERMINAL, Terminal
 
@@ -107,6 +109,7 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
         assert after == fresh.settings
 
 
+@pytest.mark.slow
 def test_once_shows_the_state_of_this_moment_however_seldom_it_is_published(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"rates": {"state": 0.1}}) as daemon:
         done = finish(acsard("top", "--once", "--config", str(daemon.config)), tmp_path)

@@ -1,0 +1,101 @@
+"""`python -m tests.lock`: writes `deploy/systemd/requirements.lock` anew, with today's versions.
+
+It asks pip what an install of acsard with the extra `lan` takes from the package index, for each
+Python we support on x86_64 and aarch64, and pins it with the hashes of those wheels. All get the
+same versions. `--check` tells what would change and writes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections import defaultdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
+
+EXTRAS = ("lan",)
+
+PYTHONS = ("3.11", "3.12", "3.13")
+
+MACHINES = ("x86_64", "aarch64")
+
+GLIBC = 36
+"""Debian 12 has 2.36: wheels for it and for all before."""
+
+HEAD = """\
+# What the service runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
+#
+#     pip install --require-hashes --only-binary :all: -r requirements.lock
+#
+# Written by `python -m tests.lock`; all tests of .ci/run run on it.
+"""
+
+
+def wanted() -> list[str]:
+    """What `pyproject.toml` asks for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = set(project["dependencies"])
+    return sorted(asked.union(*(project["optional-dependencies"][name] for name in EXTRAS)))
+
+
+def resolved(python: str, machine: str, held: dict[str, str]) -> dict[str, tuple[str, str]]:
+    """Version and hash of each distribution pip would install there, held to these versions."""
+    platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 4, -1)]
+    platforms += [f"manylinux2014_{machine}"]
+    with tempfile.TemporaryDirectory() as path:
+        constraints = Path(path, "held")
+        constraints.write_text("".join(f"{name}=={one}\n" for name, one in held.items()))
+        words = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--report", "-"]
+        words += ["--ignore-installed", "--only-binary", ":all:", "--target", path]
+        words += ["--implementation", "cp", "--python-version", python]
+        words += [word for one in platforms for word in ("--platform", one)]
+        done = subprocess.run(
+            [*words, "--constraint", str(constraints), *wanted()],
+            stdout=subprocess.PIPE, text=True, check=True,
+        )  # fmt: skip
+    found: list[Any] = json.loads(done.stdout)["install"]
+    return {
+        one["metadata"]["name"].lower().replace("_", "-"): (
+            one["metadata"]["version"],
+            one["download_info"]["archive_info"]["hashes"]["sha256"],
+        )
+        for one in found
+    }
+
+
+def lock() -> str:
+    """The whole file."""
+    versions: dict[str, str] = {}
+    hashes: defaultdict[str, set[str]] = defaultdict(set)
+    # The oldest Python first: what it cannot have no other one gets.
+    for python, machine in product(PYTHONS, MACHINES):
+        for name, (version, digest) in resolved(python, machine, versions).items():
+            assert versions.setdefault(name, version) == version, name
+            hashes[name].add(digest)
+    lines = [HEAD]
+    for name in sorted(versions):
+        digests = "".join(f" \\\n    --hash=sha256:{one}" for one in sorted(hashes[name]))
+        lines.append(f"{name}=={versions[name]}{digests}\n")
+    return "".join(lines)
+
+
+def main() -> int:
+    text = lock()
+    if "--check" in sys.argv:
+        same = LOCK.read_text() == text
+        print("as it is" if same else text)
+        return 0 if same else 1
+    LOCK.write_text(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
