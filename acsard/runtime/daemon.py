@@ -28,8 +28,8 @@ from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.ros.trees import left_out
 from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.ticker import Alarm, Ticker
-from acsard.runtime.wakeup import Wakeup
+from acsard.runtime.ticker import Ticker
+from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
 from acsard.serial.sim_pty import SimPty
 from acsard.sim.fake_mcu import FakeMcu
@@ -129,7 +129,7 @@ async def _run(
             config.robot.id,
             sources,
             access_control(config),
-            wake.from_thread,
+            wake,
         )
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         if config.bus.tls:
@@ -167,17 +167,15 @@ async def _control(
     await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
     gc.collect()
     gc.freeze()  # what lives now lives to the end; later collections need not look at it
-    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker, Alarm(wake) as alarm:
+    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
 
-        def step() -> bool:
+        def step() -> Next | None:
             now = clock.now()
-            period = ticker.take()
             control.leaving = departure.begun_ns is not None
-            late_ns = now.mono_ns - period.due_ns
-            outputs = control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
-            manager.step(outputs)
-            alarm.set(control.retry_ns)
-            return departure.over(now.mono_ns, control.at_rest)
+            manager.step(control.step(now, ticker.take()))
+            if departure.over(now.mono_ns, control.at_rest):
+                return None
+            return Next(control.listens, control.retry_ns)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)
