@@ -33,4 +33,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/robot.py Robot._drive: 'elif self._life.mode is Mode.DRIVING and twist is not None:' -> 'elif self._life.mode is Mode.DRIVING:'": "without a twist NO_COMMAND has just ended driving; the rest is for the type checker",
     "acsard/drive/sanity.py _Wheel.__init__: 'self.seen = 0.0' -> 'self.seen = 1.0'": "one line more of evidence, for a wheel first seen at just this speed",
     "acsard/drive/arbiter.py Arbiter.__init__: 'self._since_ns = 0' -> 'self._since_ns = -1'": "no command arrives before 0",
+    "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'pass'": "set as the proof begins, before they are read",
+    "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'self._least = self._most = self._since_ns = 1'": "set as the proof begins, before they are read",
+    "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'self._least = self._most = self._since_ns = -1'": "set as the proof begins, before they are read",
 }

@@ -224,6 +224,15 @@ def test_delays_that_waver_by_more_than_a_tenth_of_a_second_begin_the_proof_agai
     assert late_s(freshness, 23.0, 3600.02) == 0.0
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.104])
+def test_who_is_prompt_after_a_long_silence_has_nothing_to_prove(delay_s: float) -> None:
+    # The promptest may have risen by 20 s x 2e-4 = 4 ms: 104 ms are just prompt.
+    freshness = Freshness()
+    late_s(freshness, 0.0, 0.0)
+    assert late_s(freshness, 20.0, delay_s) == pytest.approx(max(0.0, delay_s - 0.004))
+    assert all(late_s(freshness, tenth / 10, delay_s + 1.0) > 0.9 for tenth in range(201, 240))
+
+
 def test_another_long_silence_begins_the_proof_again() -> None:
     freshness = returned()
     assert late_s(freshness, 30.001, 3600.0) > 3000
