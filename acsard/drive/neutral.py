@@ -57,7 +57,7 @@ class Sender:
         self.state = state
 
     def take(self, command: Command, since_ns: int) -> None:
-        """A command of it that counts, as neutral too if it arrived after `since_ns`."""
+        """A command of it that counts, as neutral too unless it arrived before `since_ns`."""
         now_ns = command.arrived_ns
         if now_ns >= since_ns:
             self.state = NEXT[self.state, self._sign(command)]

@@ -36,4 +36,5 @@ EQUIVALENT: dict[str, str] = {
     "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'pass'": "set as the proof begins, before they are read",
     "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'self._least = self._most = self._since_ns = 1'": "set as the proof begins, before they are read",
     "acsard/drive/freshness.py _Clock.__init__: 'self._least = self._most = self._since_ns = 0' -> 'self._least = self._most = self._since_ns = -1'": "set as the proof begins, before they are read",
+    "acsard/drive/neutral.py Sender.__init__: 'self.twist = REST' -> 'pass'": "set by the first command, before it is read",
 }

@@ -34,7 +34,7 @@ MACHINE: list[tuple[State, Sign, State]] = [
 def after(sign: Sign) -> Command:
     """What shows this of a sender that was noticed at 0 and times out after 250 ms."""
     twist = REST if sign == "zero" else GO
-    return Command("high", twist, 251 * MS if sign == "pause" else 250 * MS)
+    return Command("high", twist, 250 * MS + (sign == "pause"))
 
 
 @pytest.mark.parametrize(("state", "sign", "then"), MACHINE)
@@ -58,6 +58,9 @@ def test_what_arrived_before_it_was_required_leads_nowhere(sign: Sign) -> None:
     sender.take(command, command.arrived_ns + 1)
     assert sender.state == "heard"
     assert (sender.arrived_ns, sender.noticed_ns) == (command.arrived_ns, command.arrived_ns)
+    again = Sender(250 * MS, "heard")
+    again.take(command, command.arrived_ns)
+    assert again.state == NEXT["heard", sign]
 
 
 # neutral first
