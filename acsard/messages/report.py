@@ -12,6 +12,7 @@ from msgspec.structs import asdict
 
 from acsard.config.baud import wire_use
 from acsard.config.settings import Config
+from acsard.drive.words import waiting
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -198,7 +199,8 @@ class Report:
             link=outputs.link,
             source=outputs.source,
             sources=[
-                SourceState(s.name, s.priority, s.age_s, s.waits_for) for s in snapshot.sources
+                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for))
+                for s in snapshot.sources
             ],
             refused=snapshot.refused,
             certificate=self._certificate(outputs.now)[1],
@@ -252,7 +254,7 @@ class Report:
                 "commands",
                 ok,
                 f"commanded by {outputs.source}" if outputs.source else "no commands",
-                {s.name: s.waits_for or "driving" for s in snapshot.sources}
+                {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
             *([("certificate", *certificate, {})] if certificate[1] else []),

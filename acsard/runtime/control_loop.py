@@ -14,7 +14,7 @@ from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.bus import Bus
-from acsard.incoming.commands import Receiver, voice
+from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.queries import Queries
 from acsard.mcu.pace import Pace
 from acsard.mcu.port import Port
@@ -152,7 +152,7 @@ class ControlLoop:
                         error.reason,
                         f"{arrival.key}: {error}",
                         arrival.key.partition("/")[2],
-                        voice(arrival),
+                        sender(arrival),
                         arrival.arrived_ns,
                     )
                 )

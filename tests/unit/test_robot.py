@@ -17,6 +17,7 @@ from acsard.config.settings import (
     McuConfig,
     Source,
 )
+from acsard.drive.words import waiting
 from acsard.mcu.frames import Codec
 from acsard.robot import Robot
 from acsard.values import (
@@ -361,7 +362,7 @@ def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None
     bench.step(REST, source="teleop")
     assert bench.step(GO).source == "teleop"
     snapshot = bench.robot.snapshot(bench.now_ns)
-    waits = {source.name: source.waits_for for source in snapshot.sources}
+    waits = {source.name: waiting(source.waits_for) for source in snapshot.sources}
     assert waits["app"] == "teleop has the higher priority: until it is silent"
     assert waits["teleop"] == ""
 
@@ -396,7 +397,7 @@ def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there()
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # never yet
     bench.step(GO)
-    waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns).sources}
+    waits = {s.name: waiting(s.waits_for) for s in bench.robot.snapshot(bench.now_ns).sources}
     assert waits["app"] == ""
 
 

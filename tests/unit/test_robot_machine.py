@@ -30,6 +30,7 @@ from acsard.config.settings import (
     McuConfig,
     Source,
 )
+from acsard.drive.words import waiting
 from acsard.guard import Guard
 from acsard.robot import Robot
 from acsard.values import (
@@ -470,7 +471,9 @@ class RobotMachine(RuleBasedStateMachine):
         snapshot = self.robot.snapshot(self.now_ns)
         told = msgspec.to_builtins((outputs.samples, snapshot, outputs.applied, outputs.speeds))
         assert all(map(math.isfinite, numbers(told)))
-        assert all(source.waits_for or source.age_s is not None for source in snapshot.sources)
+        assert all(
+            waiting(source.waits_for) or source.age_s is not None for source in snapshot.sources
+        )
 
     def check_mode(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         done = {r.verb for r, a in zip(requests, outputs.answers, strict=True) if a.success}

@@ -17,6 +17,7 @@ from acsard.values import (
     SourceStatus,
     Spread,
     Twist,
+    Wait,
     WheelSpeeds,
 )
 
@@ -52,8 +53,8 @@ SNAPSHOT = Snapshot(
     measured=Twist(0.26, -0.76),
     speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
     sources=(
-        SourceStatus("app", 50, 0.01, ""),
-        SourceStatus("nav", 10, None, "a command"),
+        SourceStatus("app", 50, 0.01, Wait("nothing")),
+        SourceStatus("nav", 10, None, Wait("command")),
     ),
     counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
     refused="source nav: held up",
