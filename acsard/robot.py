@@ -24,13 +24,13 @@ from acsard.values import (
     NS_PER_S,
     STILL,
     Answer,
+    Estimate,
     Event,
     Inputs,
     Outputs,
     Pose,
     Refusal,
     Request,
-    Sample,
     Snapshot,
 )
 
@@ -99,7 +99,7 @@ class Robot:
         """Take all that happened since the last step; decide what happens now."""
         events: list[Event] = []
         self._settle(inputs)
-        samples = self._fold(inputs, events)
+        estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
         self._hear(inputs)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
@@ -117,7 +117,7 @@ class Robot:
             speeds=self._speeds,
             applied=applied,
             linked=self.session.link == "up",
-            samples=samples,
+            estimates=estimates,
             mode=status[0],
             reason=status[1],
             link=status[2],
@@ -146,7 +146,7 @@ class Robot:
 
     # fold
 
-    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Sample, ...]:
+    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
@@ -173,10 +173,10 @@ class Robot:
             self._life.link(up=True)
         now_ns = inputs.now.mono_ns
         return tuple(
-            [sample for line in feedback if (sample := self._believe(line, now_ns, events))]
+            [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
 
-    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Sample | None:
+    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Estimate | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
         if why:

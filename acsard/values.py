@@ -141,7 +141,7 @@ class Event(Struct, frozen=True):
     level: Literal["info", "warning", "error"] = "info"
 
 
-class Sample(Struct, frozen=True):
+class Estimate(Struct, frozen=True):
     """One feedback line folded into odometry; all its parts share the stamp `at`."""
 
     at: Instant
@@ -215,7 +215,7 @@ class Outputs(Struct, frozen=True):
     speeds: WheelSpeeds
     applied: Twist
     linked: bool
-    samples: tuple[Sample, ...]
+    estimates: tuple[Estimate, ...]
     mode: str
     reason: str
     """Why it moves or does not, in words."""

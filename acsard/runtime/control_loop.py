@@ -195,8 +195,8 @@ class ControlLoop:
             bus.publish(key, message)
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
-        for sample in outputs.samples:
-            self._stopwatch.feedback(sample, told_ns)
+        for estimate in outputs.estimates:
+            self._stopwatch.feedback(estimate, told_ns)
         for answer in outputs.answers:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:
