@@ -31,7 +31,7 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
-from acsard.messages.topics import by_key, full_key
+from acsard.messages.topics import by_key, full_key, service_key
 from acsard.values import Pose
 
 ENDPOINT = "tcp/127.0.0.1:7448"
@@ -79,7 +79,7 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
         payload = msgspec.json.encode(fields) if fields else None
-        replies = self._ask(f"srv/{service}", payload)
+        replies = self._ask(service_key(service), payload)
         return Decoder(schema.ServiceReply).decode(*replies[0])
 
     def get(self, name: str) -> Any:

@@ -7,7 +7,6 @@ clear anything. Everything else may also be asked by wildcard.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import msgspec
 from msgspec import Struct
@@ -27,11 +26,11 @@ from acsard.messages.schema import (
     TopicInfo,
     Topics,
 )
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.messages.topics import PUBLISHED, TOPICS, VERBS, full_key
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.trees import PARAMETERS
-from acsard.values import Answer, Outputs, Request, Verb
+from acsard.values import Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
 
@@ -89,7 +88,7 @@ class Queries:
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
         try:
             form = _format(query)
-            if query.topic.startswith("srv/"):
+            if query.topic in VERBS:
                 return self._service(query, form)
             return [
                 Reply(query.number, key, encode(value, form), encoding_name(form, name))
@@ -111,8 +110,8 @@ class Queries:
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
         """A std_srvs/Trigger, or one of the parameter services."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
-        if query.topic.startswith("srv/"):
-            verb = cast(Verb, query.topic.removeprefix("srv/"))
+        verb = VERBS.get(query.topic)
+        if verb is not None:
             self._waiting[query.number] = (query.topic, "cdr", asked)
             return Request(verb, query.number, asked_ns=query.arrived_ns)
         try:
@@ -124,12 +123,11 @@ class Queries:
         return [Reply(query.number, query.topic, payload, encoding, attachment=attachment)]
 
     def _service(self, query: Query, form: Format) -> list[Reply] | Request:
-        verb = query.topic.removeprefix("srv/")
-        if query.asked != query.topic or verb not in SERVICES:
+        if query.asked != query.topic:
             return []
         try:
             request = Receiver.request(
-                cast(Verb, verb),
+                VERBS[query.topic],
                 query.number,
                 query.encoding,
                 query.payload,
@@ -177,7 +175,7 @@ def _format(query: Query) -> Format:
         raise DecodeError(
             "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
         )
-    if query.topic.startswith("srv/") and query.payload:
+    if query.topic in VERBS and query.payload:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:
