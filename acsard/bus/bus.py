@@ -18,7 +18,7 @@ from acsard.bus.replies import Replies
 from acsard.bus.session import daemon_session
 from acsard.config.settings import BusConfig, RosConfig
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
 from acsard.incoming.bus import BusInput
 from acsard.incoming.queries import Reply
@@ -100,8 +100,7 @@ class ZenohBus:
         self._inbox.own_id = session.new_timestamp().get_id()
         if settings.connect and self._twin(session):
             session.close()
-            raise ExitError(
-                Exit.IN_USE,
+            raise InUseError(
                 f"another daemon on this bus already is {self._id}; "
                 "give this robot its own robot.id",
             )

@@ -184,7 +184,7 @@ def certificates(config: Config) -> Iterator[Finding]:
     from acsard.bus.certificates import check, ends_ns
     from acsard.bus.session import CA, CERTIFICATE, KEY
     from acsard.host.clock import now
-    from acsard.host.exits import ExitError
+    from acsard.host.errors import MendableError
     from acsard.messages.report import EXPIRY_DAYS
 
     if not config.bus.tls:
@@ -199,7 +199,7 @@ def certificates(config: Config) -> Iterator[Finding]:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
         check(config.bus.tls)
-    except ExitError as error:
+    except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
     ends = ends_ns(config.bus.tls)
@@ -220,7 +220,7 @@ def certificates(config: Config) -> Iterator[Finding]:
 def bus(config: Config) -> Iterator[Finding]:
     """Is there a daemon, and what does it say?"""
     from acsard.client import connect
-    from acsard.host.exits import ExitError
+    from acsard.host.errors import MendableError
 
     for endpoint in config.bus.connect:
         if endpoint.startswith("tls/"):
@@ -235,7 +235,7 @@ def bus(config: Config) -> Iterator[Finding]:
     try:
         with connect(endpoint, robot_id=config.robot.id, tls=tls) as robot:
             state = robot.get("state")
-    except ExitError as error:
+    except MendableError as error:
         yield Finding("daemon", "failure", str(error), "is another program on that port?")
         return
     level: Level = "failure" if state.mode == "fault" else "ok"

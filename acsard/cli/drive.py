@@ -141,8 +141,6 @@ def _loop(robot: object, teleop: Teleop) -> None:
         if wish is not None:
             robot.send(wish.linear, wish.angular)
         while (sample := states.try_recv()) is not None:
-            if str(sample.key_expr) != robot.key("state"):
-                continue  # a stranger's put on a wildcard
             heard = time.monotonic()
             state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
             shown = f"x {state.x:7.2f}  y {state.y:7.2f}  yaw {state.yaw:6.2f}  {state.reason}"
