@@ -163,20 +163,20 @@ class Inbox:
         if topic == STOP:
             # The stop itself never waits in a line with other questions, nor is it turned away.
             self._stop(Arrival("stop", True, b"", "", arrived_ns, None, ""))
-        number = self._replies.open(query, key)
-        if number is None:
+        ticket = self._replies.issue(query, key)
+        if ticket is None:
             return
         waiting = self._line_for(topic, via)
         if len(waiting) >= QUERIES:
             if via == "native":  # a ROS client hears no errors
                 busy = b"busy: too many queries at once; ask again"
-                self._replies.send(Reply(number, topic, busy, "text/plain", ok=False))
-            self._replies.done(number)
+                self._replies.send(Reply(ticket, topic, busy, "text/plain", ok=False))
+            self._replies.retire(ticket)
             return
         encoding = query.encoding
         waiting.append(
             Query(
-                number,
+                ticket,
                 topic,
                 asked,
                 query.parameters.get("fmt", "") or "",

@@ -23,6 +23,8 @@ from acsard.config.settings import Config
 from acsard.values import NS_PER_S
 
 Level = Literal["ok", "warning", "failure"]
+LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
+"""As diagnostics number them."""
 
 LEAST_YEAR = 2026
 """A clock before this was never set: boards without a battery start in the past."""
@@ -185,7 +187,7 @@ def certificates(config: Config) -> Iterator[Finding]:
     from acsard.bus.session import CA, CERTIFICATE, KEY
     from acsard.host.clock import now
     from acsard.host.errors import MendableError
-    from acsard.messages.report import EXPIRY_DAYS
+    from acsard.messages.expiry import expiry
 
     if not config.bus.tls:
         return
@@ -203,18 +205,11 @@ def certificates(config: Config) -> Iterator[Finding]:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
     ends = ends_ns(config.bus.tls)
+    level, words = expiry(ends, now().wall_ns)
+    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:
         mend = "pip install 'acsard[lan]' to have it read"
-        yield Finding("certificates", "warning", "cannot tell when they end", mend)
-        return
-    days = (ends - now().wall_ns) / NS_PER_S / 86400
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
-    if days < 0:
-        yield Finding("certificates", "failure", f"ended {-days:.0f} days ago", mend)
-    elif days < EXPIRY_DAYS:
-        yield Finding("certificates", "warning", f"ends in {days:.0f} days", mend)
-    else:
-        yield Finding("certificates", "ok", f"valid for {days:.0f} days")
+    yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 
 def bus(config: Config) -> Iterator[Finding]:

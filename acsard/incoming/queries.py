@@ -38,7 +38,8 @@ Current = Callable[[str], Message | None]
 class Query(Struct, frozen=True):
     """A query as the bus shell took it from Zenoh, keys below `acsard/<id>/`."""
 
-    number: int
+    ticket: int
+    """What it is answered by."""
     topic: str
     """The row of the topic table it reached."""
     asked: str
@@ -55,7 +56,8 @@ class Query(Struct, frozen=True):
 class Reply(Struct, frozen=True):
     """What goes back; `ok` False is an error reply."""
 
-    number: int
+    ticket: int
+    """Of the query it answers."""
     key: str
     payload: bytes
     encoding: str
@@ -91,7 +93,7 @@ class Queries:
             if query.topic in VERBS:
                 return self._service(query, form)
             return [
-                Reply(query.number, key, encode(value, form), encoding_name(form, name))
+                Reply(query.ticket, key, encode(value, form), encoding_name(form, name))
                 for key, name, value in self._values(query, current, outputs)
             ]
         except DecodeError as error:
@@ -112,15 +114,15 @@ class Queries:
         asked = unpack(query.attachment) if query.via == "rmw" else None
         verb = VERBS.get(query.topic)
         if verb is not None:
-            self._waiting[query.number] = (query.topic, "cdr", asked)
-            return Request(verb, query.number, asked_ns=query.arrived_ns)
+            self._waiting[query.ticket] = (query.topic, "cdr", asked)
+            return Request(verb, query.ticket, asked_ns=query.arrived_ns)
         try:
             service = query.topic.removeprefix(PARAMETERS)
             payload = self._parameters.answer(service, query.payload)
         except CdrError as error:
             raise DecodeError("malformed", str(error)) from None
         attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
-        return [Reply(query.number, query.topic, payload, encoding, attachment=attachment)]
+        return [Reply(query.ticket, query.topic, payload, encoding, attachment=attachment)]
 
     def _service(self, query: Query, form: Format) -> list[Reply] | Request:
         if query.asked != query.topic:
@@ -128,7 +130,7 @@ class Queries:
         try:
             request = Receiver.request(
                 VERBS[query.topic],
-                query.number,
+                query.ticket,
                 query.encoding,
                 query.payload,
                 query.arrived_ns,
@@ -136,8 +138,8 @@ class Queries:
         except DecodeError as error:
             message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
-            return [Reply(query.number, query.topic, payload, name)]
-        self._waiting[query.number] = (query.topic, form, None)
+            return [Reply(query.ticket, query.topic, payload, name)]
+        self._waiting[query.ticket] = (query.topic, form, None)
         return request
 
     def _values(
@@ -158,7 +160,7 @@ class Queries:
 
     @staticmethod
     def _error(query: Query, text: str) -> Reply:
-        return Reply(query.number, query.topic, text.encode(), "text/plain", ok=False)
+        return Reply(query.ticket, query.topic, text.encode(), "text/plain", ok=False)
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
