@@ -31,9 +31,9 @@ from typing import Any
 
 import msgspec
 import zenoh
-import zenoh.ext
 
 from acsard.bus.session import client_session
+from acsard.bus.subscription import Subscription, queue_on
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
 from acsard.host.threads import in_thread
@@ -63,27 +63,6 @@ SEND_PERIOD_S = 0.05
 
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
-QUEUED = 1000
-"""Messages held for a slow reader; the oldest are dropped beyond that."""
-
-
-class Subscription:
-    """The samples of one key as they come, without what a stranger put on a wildcard."""
-
-    def __init__(self, queue: Any, key: str) -> None:
-        self._queue, self._key = queue, key
-
-    def try_recv(self) -> zenoh.Sample | None:
-        """The next sample, or None when there is none now."""
-        for _ in range(QUEUED):  # no flood holds the caller
-            sample: zenoh.Sample | None = self._queue.try_recv()
-            if sample is None or str(sample.key_expr) == self._key:
-                return sample
-        return None
-
-    def undeclare(self) -> None:
-        """No more of them."""
-        self._queue.undeclare()
 
 
 class Client:
@@ -137,12 +116,12 @@ class Client:
     def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
         """The typed messages of a published key as they come; ends after `timeout` s of silence."""
         decoder = _decoder(name)
-        for sample in _until_silence(self.subscribe(name), timeout):
+        for sample in self.subscribe(name).until_silence(timeout):
             yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
         """The raw samples of any key below the robot's id, whatever key they were put on."""
-        yield from _until_silence(self._queue(name), timeout)
+        yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         """Call back for each sample of a key, on a thread of Zenoh's; `undeclare` it to end."""
@@ -157,15 +136,8 @@ class Client:
 
     def _queue(self, name: str) -> Any:
         topic = by_key(name)
-        # A ring: a full FIFO would hold up everything else this session receives.
-        queue: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(QUEUED)
         try:
-            if topic is not None and topic.latched:
-                history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-                return zenoh.ext.declare_advanced_subscriber(
-                    self.session, self.key(name), queue, history=history
-                )
-            return self.session.declare_subscriber(self.key(name), queue)
+            return queue_on(self.session, self.key(name), topic is not None and topic.latched)
         except zenoh.ZError:
             raise _no_key(name) from None
 
@@ -301,21 +273,6 @@ def _close(session: zenoh.Session) -> None:
         session.close()
     except zenoh.ZError:
         pass  # the other side is stuck; we are leaving anyway
-
-
-def _until_silence(subscriber: Any, timeout: float | None) -> Iterator[zenoh.Sample]:
-    """What comes, until nothing has for `timeout` s; then it is undeclared."""
-    quiet_since = time.monotonic()
-    try:
-        while timeout is None or time.monotonic() - quiet_since < timeout:
-            sample = subscriber.try_recv()
-            if sample is None:
-                time.sleep(0.001)
-                continue
-            quiet_since = time.monotonic()
-            yield sample
-    finally:
-        subscriber.undeclare()
 
 
 def _no_key(name: str) -> UsageError:

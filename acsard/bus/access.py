@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
-from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key
+from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
 from acsard.ros.trees import Endpoint, endpoints
 from acsard.values import ROOT, Verb
 
@@ -103,7 +103,7 @@ class _Keys:
         self.heard += _of(ros, "in")
         """What the daemon subscribes to, whoever sends."""
         sources = [source.name for source in config.commands.sources]
-        self.commands = [full_key(robot, f"{k}/{s}") for k in ("cmd", "wheel_cmd") for s in sources]
+        self.commands = [full_key(robot, key) for key in source_keys(sources)]
         self.commands += [
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]

@@ -18,7 +18,7 @@ from acsard.incoming.bus import BusInput
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
-from acsard.messages.topics import VERBS, service_key
+from acsard.messages.topics import VERBS, service_key, source_keys
 from acsard.ros.trees import Endpoint
 
 ARRIVALS = 16
@@ -53,9 +53,8 @@ class Inbox:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
         self._prefix, self._replies = prefix, replies
-        listed = [f"{kind}/{name}" for kind in ("cmd", "wheel_cmd") for name in sources]
         self._arrivals: dict[str, deque[Arrival]] = {
-            key: deque(maxlen=ARRIVALS) for key in (*listed, OTHERS)
+            key: deque(maxlen=ARRIVALS) for key in (*source_keys(sources), OTHERS)
         }
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
         self._services: deque[Query] = deque()

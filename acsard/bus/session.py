@@ -13,7 +13,7 @@ import zenoh
 
 from acsard.config.settings import BusConfig
 from acsard.host.errors import InUseError, UnreachableError, UsageError
-from acsard.messages.topics import full_key
+from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
@@ -134,8 +134,7 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    names = [*sources, "*"]
-    keys = [full_key(robot_id, f"{kind}/{n}") for kind in ("cmd", "wheel_cmd") for n in names]
+    keys = [full_key(robot_id, key) for key in source_keys([*sources, "*"])]
     keys += limited
     return {
         "id": "commands",

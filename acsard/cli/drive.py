@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
 from acsard.values import REST, Twist
+
+if TYPE_CHECKING:
+    from acsard.client import Client
 
 HOLD_S = 0.6
 """Longer than a keyboard's delay before its first repeat (0.25 to 0.5 s), or it would stutter."""
@@ -120,16 +124,14 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _loop(robot: object, teleop: Teleop) -> None:
+def _loop(robot: Client, teleop: Teleop) -> None:
     import os
     import select
     import time
 
-    from acsard.client import Client
     from acsard.messages.encodings import Decoder
     from acsard.messages.schema import RobotState
 
-    assert isinstance(robot, Client)
     decoder, states = Decoder(RobotState), robot.subscribe("state")
     shown, heard = "", time.monotonic()
     while True:

@@ -97,7 +97,8 @@ class Queries:
                 for key, name, value in self._values(query, current, outputs)
             ]
         except DecodeError as error:
-            return [self._error(query, str(error))]
+            words = str(error).encode()
+            return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
         """The reply that carries a robot's answer now; None when nobody waits for it."""
@@ -157,10 +158,6 @@ class Queries:
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
         value = current(topic)
         return [] if value is None else [(topic, type(value).__name__, value)]
-
-    @staticmethod
-    def _error(query: Query, text: str) -> Reply:
-        return Reply(query.ticket, query.topic, text.encode(), "text/plain", ok=False)
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:

@@ -6,6 +6,7 @@ that is not here does not exist.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 from msgspec import Struct
@@ -81,6 +82,13 @@ PUBLISHED: tuple[Topic, ...] = tuple(
 def full_key(robot_id: str, key: str) -> str:
     """The key on the bus."""
     return f"{ROOT}/{robot_id}/{key}"
+
+
+def source_keys(sources: Iterable[str]) -> list[str]:
+    """The keys that these sources command on."""
+    templates = [topic.key for topic in TOPICS if "<source>" in topic.key]
+    names = list(sources)
+    return [key.replace("<source>", name) for key in templates for name in names]
 
 
 def by_key(key: str) -> Topic | None:

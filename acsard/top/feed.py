@@ -12,7 +12,8 @@ from collections.abc import Collection
 
 import zenoh
 
-from acsard.client import QUEUED, Client
+from acsard.bus.subscription import QUEUED
+from acsard.client import Client
 from acsard.host.errors import MendableError, ReplyError
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, VERBS, by_key, full_key
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, VERBS, by_key, full_key, source_keys
 
 PROMISED = [
     ("odom", "out", "Odometry"),
@@ -77,6 +77,11 @@ def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
     row = by_key(key)
     assert row is not None
     assert row.pattern == pattern
+
+
+def test_a_source_commands_by_twist_or_by_wheels() -> None:
+    keys = ["cmd/app", "cmd/nav", "wheel_cmd/app", "wheel_cmd/nav"]
+    assert source_keys(["app", "nav"]) == keys
 
 
 def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
