@@ -130,19 +130,20 @@ class ZenohBus:
 
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key
-        if endpoint.direction == "in":
-            on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
-            self._kept.append(session.declare_subscriber(key, on_sample))
-        elif endpoint.direction == "query":
-            on_query = direct(partial(self._inbox.on_ros_query, endpoint))
-            # rmw_zenoh's clients ask complete queryables only.
-            self._kept.append(session.declare_queryable(key, on_query, complete=True))
-        else:
-            identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
-            encoding = encoding_name("cdr")
-            self._outlets.declare(
-                session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
-            )
+        match endpoint.direction:
+            case "in":
+                on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
+                self._kept.append(session.declare_subscriber(key, on_sample))
+            case "query" | "service":
+                on_query = direct(partial(self._inbox.on_ros_query, endpoint))
+                # rmw_zenoh's clients ask complete queryables only.
+                self._kept.append(session.declare_queryable(key, on_query, complete=True))
+            case "out":
+                identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
+                encoding = encoding_name("cdr")
+                self._outlets.declare(
+                    session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
+                )
         if endpoint.token:
             self._kept.append(session.liveliness().declare_token(endpoint.token))
 
