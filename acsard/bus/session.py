@@ -74,7 +74,7 @@ def daemon_session(
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """A client of the daemon (or a router) at `endpoint`; raises `UnreachableError`.
+    """A client of the daemon (or a router) at `endpoint`; raises `UnreachableError`, `UsageError`.
 
     `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
 
