@@ -98,10 +98,10 @@ def main(args: argparse.Namespace) -> int:
     import tty
 
     from acsard.client import connect
-    from acsard.host.exits import Exit, ExitError
+    from acsard.host.errors import UsageError
 
     if not sys.stdin.isatty():
-        raise ExitError(Exit.USAGE, "drive reads keys and needs a terminal; use acsard.client")
+        raise UsageError("drive reads keys and needs a terminal; use acsard.client")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         print(HELP)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.cli import main
 from acsard.cli.exits import CODES, code_of
 from acsard.host import errors
 from acsard.host.errors import MendableError
@@ -36,6 +37,13 @@ def test_no_family_is_without_a_code() -> None:
     kinds = {kind for kind in vars(errors).values() if isinstance(kind, type)}
     families = {kind for kind in kinds if issubclass(kind, MendableError)} - {MendableError}
     assert families == set(CODES) == {kind for kind, _, _ in PROMISED}
+
+
+def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
+    assert all(f" {int(code)} " in told for code in Exit)
 
 
 @pytest.mark.parametrize("code", list(Exit))
