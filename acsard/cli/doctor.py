@@ -23,6 +23,8 @@ from acsard.config.settings import Config
 from acsard.values import NS_PER_S
 
 Level = Literal["ok", "warning", "failure"]
+LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
+"""As diagnostics number them."""
 
 LEAST_YEAR = 2026
 """A clock before this was never set: boards without a battery start in the past."""
@@ -184,8 +186,8 @@ def certificates(config: Config) -> Iterator[Finding]:
     from acsard.bus.certificates import check, ends_ns
     from acsard.bus.session import CA, CERTIFICATE, KEY
     from acsard.host.clock import now
-    from acsard.host.exits import ExitError
-    from acsard.messages.report import EXPIRY_DAYS
+    from acsard.host.errors import MendableError
+    from acsard.messages.expiry import expiry
 
     if not config.bus.tls:
         return
@@ -199,28 +201,21 @@ def certificates(config: Config) -> Iterator[Finding]:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
         check(config.bus.tls)
-    except ExitError as error:
+    except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
     ends = ends_ns(config.bus.tls)
+    level, words = expiry(ends, now().wall_ns)
+    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:
         mend = "pip install 'acsard[lan]' to have it read"
-        yield Finding("certificates", "warning", "cannot tell when they end", mend)
-        return
-    days = (ends - now().wall_ns) / NS_PER_S / 86400
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
-    if days < 0:
-        yield Finding("certificates", "failure", f"ended {-days:.0f} days ago", mend)
-    elif days < EXPIRY_DAYS:
-        yield Finding("certificates", "warning", f"ends in {days:.0f} days", mend)
-    else:
-        yield Finding("certificates", "ok", f"valid for {days:.0f} days")
+    yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 
 def bus(config: Config) -> Iterator[Finding]:
     """Is there a daemon, and what does it say?"""
     from acsard.client import connect
-    from acsard.host.exits import ExitError
+    from acsard.host.errors import MendableError
 
     for endpoint in config.bus.connect:
         if endpoint.startswith("tls/"):
@@ -235,7 +230,7 @@ def bus(config: Config) -> Iterator[Finding]:
     try:
         with connect(endpoint, robot_id=config.robot.id, tls=tls) as robot:
             state = robot.get("state")
-    except ExitError as error:
+    except MendableError as error:
         yield Finding("daemon", "failure", str(error), "is another program on that port?")
         return
     level: Level = "failure" if state.mode == "fault" else "ok"

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
+from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def _once(feed: Feed) -> int:
 def _live(feed: Feed) -> int:
     from rich.console import Console
 
-    with suppress(ExitError):  # it may come by itself; the screen says that it waits
+    with suppress(MendableError):  # it may come by itself; the screen says that it waits
         feed.ask()
     _be_lenient()
     console, suspend = Console(), []
