@@ -98,7 +98,8 @@ def examine(path: str | None) -> Iterator[Finding]:
 
 def serial_port(config: Config) -> Iterator[Finding]:
     """Is it there, may we use it, does somebody else?"""
-    from acsard.host.machine import BOARDS, holders, serial_devices
+    from acsard.host.ports import BOARDS, serial_devices
+    from acsard.host.processes import holders
 
     path = config.mcu.port
     if path == "sim":
@@ -122,7 +123,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
     name = Path(os.path.realpath(path)).name
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
-        known = ", ".join(sorted(f"{vid:04x}:{pid:04x}" for vid, pid in BOARDS))
+        known = ", ".join(sorted(BOARDS))
         text = f"{usb[0].usb_id} is none of the usual boards ({known})"
         yield Finding("port", "warning", text, "add it to 70-acsar.rules if it is your MCU")
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
@@ -148,7 +149,7 @@ def _group_of(number: int) -> str:
 
 def meddlers() -> Iterator[Finding]:
     """Programs that take serial ports for something else."""
-    from acsard.host.machine import running
+    from acsard.host.processes import running
 
     if running("brltty"):
         mend = "sudo apt remove brltty, unless you read Braille: it takes CH340 and FTDI ports"
