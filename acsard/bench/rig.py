@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import random
-import socket
 import subprocess
 import sys
 import time
@@ -59,13 +58,6 @@ FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
 """Between two commands, evenly spread: they fall anywhere within a period."""
-
-
-def free_endpoint() -> str:
-    """A loopback address nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Rig:

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli.bench import bench_config, measure
+from acsard.bench.measure import measure
+from acsard.bench.setup import bench_config
 from acsard.config.settings import Config, ControlConfig
 from acsard.host.exits import Exit, ExitError
 from tests.system.harness import (
