@@ -17,9 +17,9 @@ from contextlib import contextmanager, suppress
 from rich.console import Console
 from rich.live import Live
 
-from acsard.host.exits import ExitError
 from acsard.top.feed import Feed
 from acsard.top.view import screen
+from acsard.values import AcsardError
 
 PERIOD_S = 0.25
 
@@ -41,7 +41,7 @@ def once(feed: Feed) -> str:
 
 def live(feed: Feed) -> None:
     """Show the screen, and what changes, until a key or a signal."""
-    with suppress(ExitError):  # it may come by itself; the screen says that it waits
+    with suppress(AcsardError):  # it may come by itself; the screen says that it waits
         feed.ask()
     _be_lenient()
     console, suspend = Console(), []
