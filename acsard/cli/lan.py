@@ -79,6 +79,10 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 def main_init(args: argparse.Namespace) -> int:
     """Make everything a first robot needs."""
+    from acsard.host.files import require_tomlkit
+
+    if args.write:
+        require_tomlkit()
     identities.init(args.directory, args.address, args.days, force=args.force)
     directory = args.directory.resolve()
     if args.write:
@@ -110,9 +114,8 @@ def main_renew(args: argparse.Namespace) -> int:
 
 def _configure(file: Path, directory: Path) -> None:
     """Set the bus's keys in a configuration, its comments kept."""
-    from acsard.host.files import change, require_tomlkit
+    from acsard.host.files import change
 
-    require_tomlkit()
     changed = change(file, lambda config: identities.keys(config, directory), new=True)
     print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 from acsard.cli.common import add_config, load
-from acsard.config.settings import Baud
+from acsard.config.settings import Baud, Config
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.faults import ARGUMENTS, FAULTS
@@ -97,16 +97,14 @@ def _reset_again(mcu: FakeMcu, period_s: float) -> None:
     asyncio.get_running_loop().call_later(period_s, reset)
 
 
-async def _play(config: object, args: argparse.Namespace) -> int:
+async def _play(config: Config, args: argparse.Namespace) -> int:
     import asyncio
     import signal
     from contextlib import ExitStack
 
-    from acsard.config.settings import Config
     from acsard.host import clock
     from acsard.serial.sim_pty import SimPty
 
-    assert isinstance(config, Config)
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)

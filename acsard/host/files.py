@@ -16,6 +16,9 @@ from acsard.host.exits import Exit, ExitError
 NEW_MODE = 0o644
 """A configuration has no secrets, and the service reads it as a user of its own."""
 
+Keys = Mapping[str, object]
+"""Values by dotted keys, as "mcu.port"."""
+
 
 def require_tomlkit() -> None:
     """Say at once what is missing, before anybody has spent a minute on a check."""
@@ -29,19 +32,15 @@ def require_tomlkit() -> None:
         ) from None
 
 
-Keys = Mapping[str, object]
-"""Values by dotted keys, as "mcu.port"."""
-
-
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml`, given or made from what it says; the keys.
+    """Set keys in an `acsard.toml`, given or made from what it says, and return them.
 
     Raises `ExitError` and leaves it as it was when it cannot be done. `new`: it need not be there.
     """
     try:
         file = file.resolve(strict=not new)
-        there = not new or file.exists()
-        text = file.read_bytes().decode() if there else ""  # not read_text: it would lose CRLF
+        # Not read_text: it would lose CRLF.
+        text = "" if new and not file.exists() else file.read_bytes().decode()
         given = keys(parse(text.encode())) if callable(keys) else keys
         replace(file, edited(text, given))
         return given

@@ -11,18 +11,18 @@ import re
 import socket
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
-from acsard.bus.access import Role
 from acsard.bus.session import CA
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
+    from acsard.bus.access import Role
     from acsard.lan.authority import Authority
 
 PORT = 7449
-ROLES: tuple[Role, ...] = get_args(Role)
+ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """A host name or IP address."""
