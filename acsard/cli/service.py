@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.host.service import Step
+    from acsard.host.steps import Step
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

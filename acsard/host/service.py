@@ -1,4 +1,4 @@
-"""acsard as a system service: its files, its commands, and what is done with them, step by step.
+"""acsard as a system service: its files, its commands, and which steps install or remove it.
 
 The files are those of `deploy/`, with the path of this installation in the unit. Nothing that
 somebody else wrote is overwritten or removed without force.
@@ -12,10 +12,9 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from msgspec import Struct
-
 import acsard
 from acsard.host.exits import Exit, ExitError
+from acsard.host.steps import File, Keep, Remove, Run, Step, Write, called
 
 UNIT, STOP = "acsard.service", "acsard-stop"
 DROP_IN = Path("/etc/systemd/system/acsard.service.d/lan.conf")
@@ -28,118 +27,11 @@ TLS = "/etc/acsard/tls"
 OUT_OF_SIGHT = ("/home/", "/root", "/tmp/")
 """Places a service cannot see."""
 
-OURS = ("bin", "acsard", "acsard.service.d")
-"""Directories that are removed with the last file in them."""
-
-RUN_S, ASK_S = 60.0, 10.0
-"""A command, a question, that takes longer has hung."""
-
-
-class File(Struct, frozen=True):
-    """One file of the service."""
-
-    path: Path
-    content: bytes
-    mode: int = 0o644
-    kept: bool = False
-    """The user's to change: never replaced, removed only while it is as it was written."""
-
-    def found(self) -> bytes | None:
-        """What is there now, None for nothing."""
-        try:
-            return self.path.read_bytes()
-        except FileNotFoundError:
-            return None
-
-    def condition(self) -> str:
-        """How it is, in a word or two."""
-        found = self.found()
-        if found is None:
-            return "missing"
-        return "as installed" if found == self.content else "changed"
-
-
 Found = Mapping[Path, bytes | None]
 """What is there now in the place of each file."""
 
-
-class Write(Struct, frozen=True):
-    """A file is made, or made anew."""
-
-    file: File
-
-    def __str__(self) -> str:
-        return (
-            f"write   {self.file.path}  ({len(self.file.content)} bytes, mode {self.file.mode:o})"
-        )
-
-    def do(self) -> None:
-        """With directories that the service's own user can enter whatever the umask."""
-        path = self.file.path
-        made = [place for place in path.parents if not place.exists()]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for place in made:
-            place.chmod(0o755)
-        path.unlink(missing_ok=True)  # a link is replaced, not written through
-        path.write_bytes(self.file.content)
-        path.chmod(self.file.mode)
-
-
-class Remove(Struct, frozen=True):
-    """A file is removed, and the directories made for it as far as they are empty."""
-
-    path: Path
-
-    def __str__(self) -> str:
-        return f"remove  {self.path}"
-
-    def do(self) -> None:
-        """Remove it."""
-        self.path.unlink()
-        for place in self.path.parents:
-            if place.name not in OURS:
-                return
-            try:
-                place.rmdir()
-            except OSError:
-                return  # something else lives there
-
-
-class Keep(Struct, frozen=True):
-    """A file stays as it is."""
-
-    path: Path
-    why: str = ""
-
-    def __str__(self) -> str:
-        return f"keep    {self.path}" + (f"  ({self.why})" if self.why else "")
-
-    def do(self) -> None:
-        """Nothing."""
-
-
-class Run(Struct, frozen=True):
-    """A command is run."""
-
-    words: tuple[str, ...]
-    may_fail: bool = False
-    """A machine without udev, or a unit that never failed, is no reason to stop halfway."""
-
-    def __str__(self) -> str:
-        return f"run     {' '.join(self.words)}"
-
-    def do(self) -> None:
-        """Raises `ExitError` with what it says unless it may fail."""
-        try:
-            done = _called(self.words, RUN_S)
-            failed = done.stderr.strip() if done.returncode else ""
-        except (OSError, subprocess.TimeoutExpired) as error:
-            failed = str(error)
-        if failed and not self.may_fail:
-            raise ExitError(Exit.FAILURE, f"{' '.join(self.words)}: {failed}")
-
-
-Step = Write | Remove | Keep | Run
+ASK_S = 10.0
+"""systemd answers at once, or hangs."""
 
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
@@ -249,14 +141,10 @@ def state() -> str:
     """What systemd says of the service, "" where it does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = _called(("systemctl", "show", UNIT, about), ASK_S)
+        done = called(("systemctl", "show", UNIT, about), ASK_S)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()
-
-
-def _called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)
 
 
 def _source() -> Path:

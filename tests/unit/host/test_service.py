@@ -1,4 +1,4 @@
-"""The service's files and commands: which steps, when; and what each does to a directory."""
+"""The service's files and commands: which steps, when."""
 
 from __future__ import annotations
 
@@ -13,18 +13,14 @@ from acsard.host.service import (
     LEAVING,
     STOP,
     UNIT,
-    File,
     Found,
-    Keep,
-    Remove,
-    Run,
-    Write,
     files,
     installing,
     misplaced,
     present,
     uninstalling,
 )
+from acsard.host.steps import File, Keep, Remove, Write
 
 ETC = Path("/etc/x")
 UNIT_FILE = File(ETC / UNIT, b"unit")
@@ -90,39 +86,6 @@ def test_a_changed_configuration_stays_whatever_is_said() -> None:
 
 def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
     assert kept(there(unit=b"mine"), force=False) == {UNIT_FILE.path, STOP_FILE.path}
-
-
-def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").write_text("untouched")
-    file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
-    Write(file).do()
-    assert file.condition() == "as installed"
-    assert file.path.stat().st_mode & 0o777 == 0o755
-    file.path.unlink()
-    file.path.symlink_to(tmp_path / "elsewhere")
-    assert file.condition() == "changed"
-    Write(file).do()
-    assert (tmp_path / "elsewhere").read_text() == "untouched"
-    Remove(file.path).do()
-    assert file.condition() == "missing"
-    assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]
-
-
-def test_a_directory_with_something_else_in_it_stays(tmp_path: Path) -> None:
-    file = File(tmp_path / "bin" / "tool", b"new")
-    Write(file).do()
-    (tmp_path / "bin" / "other").touch()
-    Remove(file.path).do()
-    assert [path.name for path in (tmp_path / "bin").iterdir()] == ["other"]
-
-
-def test_a_command_that_fails_ends_it_unless_it_may() -> None:
-    words = ("sh", "-c", "echo no >&2; exit 1")
-    with pytest.raises(ExitError, match="no"):
-        Run(words).do()
-    Run(words, may_fail=True).do()
-    with pytest.raises(ExitError, match="no such program"):
-        Run(("no such program",)).do()
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
