@@ -164,8 +164,8 @@ class SourceStatus(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """Everything one step may know.
 
-    `tick` says that a line goes out with this step, `at_once` that one may if there is something
-    new to say; without either only feedback is folded.
+    `tick` says that the clock's line goes out with this step, `at_once` that one may if there is
+    something new to say; without either only feedback is folded.
     `opened` counts how often the port has been opened: a new number is a new session with the MCU.
     """
 
@@ -183,7 +183,7 @@ class Inputs(Struct, frozen=True):
     guard_trip: str = ""
     """Why the guard replaced the previous line with STOP; latches a fault."""
     superseded: bool = False
-    """The line of the previous tick did not go out: what it said never happened."""
+    """The line of the step before did not go out: what it said never happened."""
     at_once: bool = False
     leaving: bool = False
     """The daemon is going down: ramp to zero and stay there."""
@@ -193,8 +193,8 @@ class Outputs(Struct, frozen=True):
     """Everything one step decided."""
 
     now: Instant
-    tick: bool
-    """A line was due, by the clock or at once."""
+    due: bool
+    """A line was, by the clock or at once."""
     line: bytes | None
     """The line for the MCU, or None when none is due."""
     speeds: WheelSpeeds

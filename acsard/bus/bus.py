@@ -6,7 +6,6 @@ Whatever may block (open, declare, reply, close) runs in a thread.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 from types import TracebackType
 
@@ -20,7 +19,7 @@ from acsard.config.settings import BusConfig, RosConfig
 from acsard.host import clock
 from acsard.host.exits import Exit, ExitError
 from acsard.host.threads import in_thread
-from acsard.incoming.bus import BusInput
+from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
@@ -46,13 +45,13 @@ class ZenohBus:
         robot_id: str,
         sources: tuple[str, ...],
         access: dict[str, object],
-        wake: Callable[[], None],
+        waker: Waker,
     ) -> None:
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
-        self._inbox = Inbox(prefix, self._replies, sources, wake)
+        self._inbox = Inbox(prefix, self._replies, sources, waker)
         self._outlets = Outlets()
         self._session: zenoh.Session | None = None
         self._kept: list[object] = []
@@ -80,10 +79,6 @@ class ZenohBus:
     def done(self, number: int) -> None:
         """No more replies to this query."""
         self._replies.done(number)
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
-        self._inbox.alert(on)
 
     # opening
 

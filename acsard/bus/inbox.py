@@ -7,14 +7,13 @@ from it when it steps.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import TypeVar
 
 import zenoh
 
 from acsard.bus.replies import Replies
 from acsard.host import clock
-from acsard.incoming.bus import BusInput
+from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
@@ -46,7 +45,7 @@ class Inbox:
     """Samples and queries of one robot, until they are taken."""
 
     def __init__(
-        self, prefix: str, replies: Replies, sources: tuple[str, ...], wake: Callable[[], None]
+        self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
@@ -61,18 +60,7 @@ class Inbox:
         self._slow: deque[Query] = deque()
         """Questions that take as long to answer as all others of a step."""
         self._overrun = 0
-        self._wake, self._alert, self._stop_told = wake, False, False
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop for the next command, once; or leave it to the next period.
-
-        A stop wakes it all the same, but not every one of a flood of them.
-        """
-        self._alert = on
-        if on:
-            self._stop_told = False
-            if any(self._arrivals.values()):
-                self._rouse()
+        self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
@@ -124,19 +112,11 @@ class Inbox:
         if len(held) == ARRIVALS:
             self._overrun += 1
         held.append(arrival)
-        self._rouse()
+        self._waker.command()
 
     def _stop(self, arrival: Arrival) -> None:
         self._stops.append(arrival)
-        if not self._stop_told:
-            self._stop_told = True
-            self._wake()
-
-    def _rouse(self) -> None:
-        # Once until the loop asks for it again: a flood wakes nobody more often than that.
-        if self._alert:
-            self._alert = False
-            self._wake()
+        self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
         """A query that reached a row of the native table."""

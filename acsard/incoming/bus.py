@@ -21,6 +21,16 @@ class BusInput(Struct, frozen=True):
     """Samples dropped because they came faster than they could be taken."""
 
 
+class Waker(Protocol):
+    """Whom the bus tells, from whatever thread, that something came in."""
+
+    def command(self) -> None:
+        """What may be a command."""
+
+    def stop(self) -> None:
+        """A stop."""
+
+
 class Bus(Protocol):
     """The bus as the loop sees it."""
 
@@ -39,6 +49,3 @@ class Bus(Protocol):
 
     def done(self, number: int) -> None:
         """No more replies to this query."""
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop when a command or a stop comes in, or leave it to the next period."""

@@ -103,7 +103,7 @@ class Report:
             if "wheel_states" in wanted and self._rates["wheel_states"].due(sample.at.mono_ns):
                 yield "wheel_states", self._wheel_states(sample)
         now_ns = outputs.now.mono_ns
-        if outputs.tick and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
+        if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):

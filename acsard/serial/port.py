@@ -20,8 +20,7 @@ import serial_asyncio
 from acsard.host import clock
 from acsard.host.exits import Exit, ExitError
 from acsard.host.threads import in_thread
-from acsard.mcu.port import Offered
-from acsard.mcu.wire import LineGate
+from acsard.mcu.port import Gate, Offered
 from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
 
@@ -33,10 +32,6 @@ BACK_OFF_S = (0.05, 0.1, 0.2)
 
 PERMISSION_PATIENCE_S = 2.0
 """How long a start waits for udev to grant access before it gives up."""
-
-STALE_NS = 10_000_000
-"""From the start of a step to its line: a period at the usual rate, a hundred times what it takes
-unless the process is stopped in between."""
 
 FAREWELL_S = 0.15
 """Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
@@ -58,16 +53,19 @@ class SerialPort:
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
         self._wake, self._log = wake, log
         self._received: list[Received] = []
-        self._gate = LineGate(baud_rate)
+        self._gate = Gate(baud_rate, stop)
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
-        self.sent_ns = 0
-        """When the last line had been handed to the kernel, monotonic."""
         self.trouble = ""
         """Why the port is closed, in words; "" while it is open."""
 
     # the control loop's view
+
+    @property
+    def sent_ns(self) -> int:
+        """When the last line had been handed to the kernel, monotonic."""
+        return self._gate.sent_ns
 
     def take(self) -> tuple[Received, ...]:
         """What was received since the last call."""
@@ -81,12 +79,9 @@ class SerialPort:
         """Send the line now, or say that it did not go; it is never kept."""
         if not self.is_open:
             return "down"
-        if not self._gate.may_send(now.mono_ns, self._kernel_bytes()):
+        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), unsent(self._fd))
+        if data is None:
             return "superseded"
-        if line != self._stop and clock.mono_ns() - now.mono_ns > STALE_NS:
-            return "superseded"  # we stood still in the middle of a step: what it says is old
-        instead = self._gate.first and line != self._stop
-        data = self._gate.prefix + (self._stop if instead else line)
         try:
             taken = os.write(self._fd, data)
         except BlockingIOError:
@@ -95,12 +90,7 @@ class SerialPort:
             self._leave(error)
             return "down"
         # From the moment it went, not from the start of the step that made it.
-        self.sent_ns = clock.now().mono_ns
-        self._gate.note_sent(self.sent_ns, len(data), taken)
-        return "sent" if taken == len(data) and not instead else "superseded"
-
-    def _kernel_bytes(self) -> int:
-        return unsent(self._fd)
+        return self._gate.took(line, data, taken, clock.mono_ns())
 
     # opening and reopening
 
@@ -145,7 +135,7 @@ class SerialPort:
             raise OSError(errno.EIO, "the driver did not answer") from None
         self._lost.clear()
         self._fd = device.fileno()
-        self._gate = LineGate(baud_rate)
+        self._gate = Gate(baud_rate, self._stop)
         self._received.clear()
         loop = asyncio.get_running_loop()
         self._transport, _ = await serial_asyncio.connection_for_serial(

@@ -38,7 +38,7 @@ FIGURES = {
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
     "command_to_wire": ("arrival → first line", "from arrival in its turn to the first such line"),
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
-    "mcu_round_trip": ("line out → answer in", "from a line to its answer; unchecked: by time"),
+    "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
 """`figures.Name` in few words and in more. An arrow is from one moment to another."""
 

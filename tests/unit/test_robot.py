@@ -202,7 +202,7 @@ def test_a_step_without_a_tick_folds_feedback_and_sends_nothing() -> None:
     bench = Bench().driving()
     out = bench.step(GO, tick=False)
     assert len(out.samples) == 1
-    assert (out.line, out.tick) == (None, False)
+    assert (out.line, out.due) == (None, False)
     assert out.mode == "driving"
 
 

@@ -151,6 +151,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.guard = Guard(
             self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
         )
+        self.last = self.robot.session.codec.stop
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s, config.commands.neutral_first) for s in SOURCES}
@@ -482,7 +483,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert mode in (was, "fault")
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
             assert mode == "fault"
-        if mode == "ready" and outputs.tick:
+        if mode == "ready" and outputs.due:
             assert outputs.reason.startswith(("neutral first: ", "no commands: "))
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")
@@ -508,18 +509,17 @@ class RobotMachine(RuleBasedStateMachine):
 
     def send(self, outputs: Outputs) -> None:
         """The rest of `ControlLoop._send`, with the wire watched."""
-        line = self.guard.check(outputs)
-        self.trip = self.guard.trip
+        line, self.trip = self.guard.check(outputs, self.last)
         assert self.trip == ""
         if line is None:
-            self.superseded = self.superseded and not outputs.tick
+            self.superseded = False
             return
-        assert outputs.tick
+        assert outputs.due
         wheels = self.check_line(line, outputs)
         self.superseded = self.blocked or not self.port_open
         if self.superseded:
             return
-        self.guard.note_sent()
+        self.last = line
         self.sent, self.sent_ns, self.sent_twist = wheels, self.now_ns, outputs.applied
         self.broken = False
         self.told = wheels

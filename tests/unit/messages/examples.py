@@ -33,7 +33,7 @@ SAMPLE = Sample(
 
 OUTPUTS = Outputs(
     now=Instant(104_004_000_000, 1_700_000_003_254_000_002),
-    tick=True,
+    due=True,
     line=None,
     speeds=WheelSpeeds(5.0, 6.0, 7.0, 8.0),
     applied=Twist(0.3, 0.9),
