@@ -10,26 +10,27 @@ from __future__ import annotations
 from collections import Counter
 
 from acsard.config.settings import Config
-from acsard.drive.arbiter import REASONS, Arbiter, Choice
+from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger
 from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
+from acsard.drive.words import REFUSED, chosen
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
     NS_PER_S,
     STILL,
     Answer,
+    Estimate,
     Event,
     Inputs,
     Outputs,
     Pose,
     Refusal,
     Request,
-    Sample,
     Snapshot,
 )
 
@@ -59,7 +60,7 @@ class Robot:
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate)
-        self._choice = Choice("", None, "no commands: no source has sent one yet")
+        self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
         """Whose command, by its arrival, and the mode: what the last line was made of."""
@@ -98,7 +99,7 @@ class Robot:
         """Take all that happened since the last step; decide what happens now."""
         events: list[Event] = []
         self._settle(inputs)
-        samples = self._fold(inputs, events)
+        estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
         self._hear(inputs)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
@@ -116,7 +117,7 @@ class Robot:
             speeds=self._speeds,
             applied=applied,
             linked=self.session.link == "up",
-            samples=samples,
+            estimates=estimates,
             mode=status[0],
             reason=status[1],
             link=status[2],
@@ -145,7 +146,7 @@ class Robot:
 
     # fold
 
-    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Sample, ...]:
+    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
@@ -172,10 +173,10 @@ class Robot:
             self._life.link(up=True)
         now_ns = inputs.now.mono_ns
         return tuple(
-            [sample for line in feedback if (sample := self._believe(line, now_ns, events))]
+            [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
 
-    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Sample | None:
+    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Estimate | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
         if why:
@@ -249,11 +250,11 @@ class Robot:
         for refusal in inputs.refusals:
             self._refuse(refusal)
             if refusal.source:
-                self._arbiter.notice(refusal.source, refusal.voice, refusal.arrived_ns)
+                self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
             reason = self._arbiter.accept(command)
             if reason:
-                self._refuse(Refusal(reason, f"source {command.source}: {REASONS[reason]}"))
+                self._refuse(Refusal(reason, f"source {command.source}: {REFUSED[reason]}"))
             else:
                 self.counters["commands"] += 1
 
@@ -283,9 +284,9 @@ class Robot:
     def _reason(self) -> str:
         match self._life.mode:
             case Mode.DRIVING:
-                return f"driving: {self._choice.reason}{self.session.note}"
+                return f"driving: {chosen(self._choice)}{self.session.note}"
             case Mode.READY:
-                return f"{self._choice.reason}{self.session.note}"
+                return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT:

@@ -16,6 +16,7 @@ from msgspec import Struct
 from acsard.config.baud import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
+from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S
 
 SLACK_COUNTS = 4
@@ -55,8 +56,8 @@ class Encoders:
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
-        self._late_ms = 0.0
-        """How much later than the promptest one the last reading was read."""
+        self._promptest = Promptest(DRIFT, LATEST_MS)
+        """In ms: which reading was read soonest after it was made."""
 
     def forget(self) -> None:
         """The next reading is a first one: what came before is of another run or accounted for."""
@@ -73,10 +74,7 @@ class Encoders:
         before, before_ns = last
         host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
         mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
-        late_ms = self._late_ms + host_ms - mcu_ms
-        self._late_ms = min(max(0.0, late_ms - DRIFT * host_ms), LATEST_MS)
-        if late_ms < -self._early_ms:
-            self._late_ms = 0.0
+        if self._promptest.add(host_ms, mcu_ms) < -self._early_ms:
             return "restarted"
         if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
             return "unknown"

@@ -14,7 +14,7 @@ from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.bus import Bus
-from acsard.incoming.commands import Receiver, voice
+from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.queries import Queries
 from acsard.mcu.pace import Pace
 from acsard.mcu.port import Port
@@ -152,7 +152,7 @@ class ControlLoop:
                         error.reason,
                         f"{arrival.key}: {error}",
                         arrival.key.partition("/")[2],
-                        voice(arrival),
+                        sender(arrival),
                         arrival.arrived_ns,
                     )
                 )
@@ -195,8 +195,8 @@ class ControlLoop:
             bus.publish(key, message)
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
-        for sample in outputs.samples:
-            self._stopwatch.feedback(sample, told_ns)
+        for estimate in outputs.estimates:
+            self._stopwatch.feedback(estimate, told_ns)
         for answer in outputs.answers:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:

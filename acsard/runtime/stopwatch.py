@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.runtime.figures import Figures
-from acsard.values import Measured, Outputs, Sample
+from acsard.values import Estimate, Measured, Outputs
 
 
 class Stopwatch:
@@ -29,9 +29,9 @@ class Stopwatch:
         if command_ns > before_ns:  # else it waited for its turn, not for the wire
             self._figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
 
-    def feedback(self, sample: Sample, told_ns: int | None) -> None:
+    def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """A feedback line was folded, and told to the bus at `told_ns` if anybody listens."""
-        at_ns, asked_ns = sample.at.mono_ns, sample.asked_ns
+        at_ns, asked_ns = estimate.at.mono_ns, estimate.asked_ns
         if asked_ns is not None:
             self._figures.add("mcu_round_trip", at_ns, at_ns - asked_ns)
         if told_ns is not None:

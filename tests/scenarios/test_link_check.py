@@ -526,8 +526,8 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
                 assert protocol.whole(line)
                 assert b"#" in line
                 assert world.loop.robot.session.check.checked
-            for sample in outputs.samples:
-                here = [sample.pose.x, sample.pose.y]
+            for estimate in outputs.estimates:
+                here = [estimate.pose.x, estimate.pose.y]
                 # 0.6 m/s for as long as counts bridge at most, and what the motors run on
                 assert math.dist(here, last) < 0.6
                 last[:] = here

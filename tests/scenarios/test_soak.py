@@ -404,8 +404,8 @@ def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
     def watch(outputs: Outputs) -> None:
         nonlocal ticks
         ticks += outputs.due
-        for sample in outputs.samples:
-            told = (sample.at.mono_ns, msgspec.to_builtins(sample.pose), sample.positions)
+        for estimate in outputs.estimates:
+            told = (estimate.at.mono_ns, msgspec.to_builtins(estimate.pose), estimate.positions)
             trace[0] = zlib.crc32(repr(told).encode(), trace[0])
         if outputs.line is not None:
             trace[1] = zlib.crc32(b"%d %s" % (outputs.now.mono_ns, outputs.line), trace[1])

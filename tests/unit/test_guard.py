@@ -71,7 +71,7 @@ def outputs(
         speeds=STILL,
         applied=REST,
         linked=linked,
-        samples=(),
+        estimates=(),
         mode=mode,
         reason="",
         link="up" if linked else "down",

@@ -72,7 +72,7 @@ def outputs(
         speeds=WheelSpeeds(0.0, 0.0, 0.0, 0.0),
         applied=applied,
         linked=True,
-        samples=(),
+        estimates=(),
         mode=mode,
         reason=reason,
         link="up",
