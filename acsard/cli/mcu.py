@@ -142,9 +142,9 @@ def _wire(config: Config) -> Wire:
         from acsard.sim.virtual_wire import VirtualWire
 
         return VirtualWire(FakeMcu(config))
-    from acsard.serial.wire import SerialWire
+    from acsard.serial.blocking import BlockingPort
 
-    return SerialWire(config.mcu.port)
+    return BlockingPort(config.mcu.port)
 
 
 # who may
@@ -169,7 +169,7 @@ def _may(args: argparse.Namespace, port: str) -> None:
         return
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
         return
-    from acsard.host.machine import master_of
+    from acsard.host.processes import master_of
 
     master = master_of(port)
     if master is None or master.name != "acsard":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import fcntl
 import os
 import pty
 import termios
@@ -19,6 +18,7 @@ from typing import get_args
 from acsard.config.settings import Baud
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
+from acsard.serial.device import unlock
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.garble import garbled
 
@@ -68,7 +68,7 @@ class SimPty:
                 return
             raise
         # A host that was killed leaves its exclusive mark on the pty, as no real port would.
-        fcntl.ioctl(self._slave, termios.TIOCNXCL)
+        unlock(self._slave)
         self.mcu.receive(clock.now().mono_ns, garbled(data, self._speed(), self.mcu.baud_rate))
         self._arm()
 

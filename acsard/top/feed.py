@@ -17,7 +17,7 @@ from acsard.client import Client
 from acsard.host.errors import MendableError, ReplyError
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState
-from acsard.top.view import SILENT_S, Seen
+from acsard.top.seen import SILENT_S, Seen
 
 SPAN_S = 1.0
 """Rates are taken over about this; over less they would jump."""

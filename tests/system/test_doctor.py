@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from acsard.cli.certificates import Authority
+from acsard.lan.authority import Authority
 from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
 
 pytestmark = pytest.mark.network

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from acsard.bus.certificates import check, ends_ns
-from acsard.cli.certificates import Authority
 from acsard.host.errors import CertificateError, NotPermittedError
+from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
 
 DAY_NS = 86400 * NS_PER_S

@@ -11,10 +11,9 @@ import msgspec
 from acsard.checkup import advice, procedure
 from acsard.checkup.bench import Bench
 from acsard.checkup.findings import Finding
-from acsard.cli.sim import fault
 from acsard.config.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import ARGUMENTS
+from acsard.sim.named_faults import named
 from acsard.sim.virtual_wire import VirtualWire
 
 MS = 1_000_000
@@ -51,11 +50,7 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                name, values = fault(text)
-                kinds = ARGUMENTS.get(name, "")
-                given = [int(v) if v.is_integer() else v for v in values]
-                assert len(kinds) == len(given)
-                stack.enter_context(getattr(self.mcu, name)(*given))
+                stack.enter_context(named(text).on(self.mcu))
             yield
 
     @contextmanager

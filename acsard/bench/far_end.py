@@ -7,13 +7,11 @@ line of output is the device; when its input ends it writes all it saw and ends.
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import os
 import pty
 import select
 import sys
-import termios
 import tty
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from acsard.config.parsing import from_builtins
 from acsard.config.settings import Config
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
+from acsard.serial.device import unlock
 from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80
@@ -95,7 +94,7 @@ class FarEnd:
             return  # nobody has it open
         self.seen.heard.append((now_ns, data))
         # A host that was killed leaves its exclusive mark on the pty, as no real port would.
-        fcntl.ioctl(self._slave, termios.TIOCNXCL)
+        unlock(self._slave)
         self._mcu.receive(now_ns, data)
 
     def _advance(self) -> None:
