@@ -1,4 +1,7 @@
-"""What the pages say to type is typed here, as it stands there, beside a simulated robot."""
+"""What the pages say to type is typed here, as it stands there, beside a simulated robot.
+
+The README's Python is run by `test_client.py`.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -25,7 +27,6 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
-    until,
     write_config,
 )
 from tests.system.test_fleet import Fleet
@@ -87,28 +88,6 @@ def test_what_a_page_says_to_type_does_what_it_says(block: Block, desk: Path, bu
             assert done.code in how.codes, f"{command}\n{done.out}\n{done.err}"
             assert re.search(how.says, done.out, re.M), f"{command}\n{done.out}\n{done.err}"
             assert "Traceback" not in done.err
-
-
-def test_the_examples_drive_the_robot(tmp_path: Path) -> None:
-    examples = blocks("python")
-    assert len(examples) == 3
-    with ExitStack() as stack:
-        enter = stack.enter_context
-        daemons = [enter(Daemon(tmp_path, name=f"daemon{n}")) for n in range(len(examples))]
-        buses = [enter(Bus(daemon.endpoint)) for daemon in daemons]
-        for bus in buses:
-            until(lambda bus=bus: bus.state()["link"] == "up", 15.0, "link up")  # type: ignore[misc]
-        programs = []
-        for block, daemon in zip(examples, daemons, strict=True):
-            text = block.text.replace("tcp/127.0.0.1:7448", daemon.endpoint)
-            text = re.sub(r"(connect\w*)\(\)", rf'\1("{daemon.endpoint}")', text)
-            programs.append(enter(Program([sys.executable, "-c", text], tmp_path)))
-        for block, program, bus in zip(examples, programs, buses, strict=True):
-            assert program.ended(60.0) == 0, f"{block.where}\n{program}"
-            assert program.out
-            moved = bus.get("odom")["pose"]["pose"]["position"]["x"]
-            print(f"{block.where}: {moved:.2f} m")
-            assert moved > 0.1
 
 
 def test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port() -> None:
