@@ -246,6 +246,15 @@ def test_a_gap_between_arrivals_that_is_none_between_stamps_is_no_pause() -> Non
     assert bench.driver() == ""
 
 
+def test_stamps_that_are_just_the_timeout_apart_show_no_pause() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.stamped(HIGH)
+    bench.wait(251).stamped(HIGH, late_ms=1)
+    assert bench.driver() == ""
+    bench.wait(251).stamped(HIGH)
+    assert bench.driver() == "high"
+
+
 def test_a_pause_that_shows_in_the_stamps_too_is_neutral() -> None:
     bench = Bench(HIGH, armed=False)
     bench.stamped(HIGH)
