@@ -34,6 +34,7 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.host import clock
+from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.host.exits import Exit, ExitError
 from acsard.mcu.frames import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
@@ -150,7 +151,7 @@ class Rig:
     def _connect(self) -> zenoh.Session | None:
         try:
             return client_session(self._endpoint)
-        except ExitError:
+        except UnreachableError:
             return None
 
     def _wait(self, look: Callable[[], T | None], what: str) -> T:
@@ -168,7 +169,7 @@ class Rig:
         """What the daemon waits for, if it can be asked."""
         try:
             return f": {self.state().reason}"
-        except ExitError:
+        except NoAnswerError:
             return ""
 
     def _alive(self) -> None:
@@ -236,7 +237,7 @@ class Rig:
             if reply.ok is not None:
                 sample: Any = reply.ok
                 return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
-        raise ExitError(Exit.UNREACHABLE, f"no answer on {key}")
+        raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
         """End the program."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from acsard.bus.certificates import check, ends_ns
 from acsard.bus.session import CA, CERTIFICATE, KEY
 from acsard.config.settings import Config
-from acsard.doctor.finding import Finding
+from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now
-from acsard.messages.report import EXPIRY_DAYS
-from acsard.values import NS_PER_S, AcsardError
+from acsard.host.errors import MendableError
+from acsard.messages.expiry import expiry
 
 
 def certificates(config: Config) -> Iterator[Finding]:
@@ -29,19 +29,12 @@ def certificates(config: Config) -> Iterator[Finding]:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
         check(config.bus.tls)
-    except AcsardError as error:
+    except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
     ends = ends_ns(config.bus.tls)
+    level, words = expiry(ends, now().wall_ns)
+    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:
         mend = "pip install 'acsard[lan]' to have it read"
-        yield Finding("certificates", "warning", "cannot tell when they end", mend)
-        return
-    days = (ends - now().wall_ns) / NS_PER_S / 86400
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
-    if days < 0:
-        yield Finding("certificates", "failure", f"ended {-days:.0f} days ago", mend)
-    elif days < EXPIRY_DAYS:
-        yield Finding("certificates", "warning", f"ends in {days:.0f} days", mend)
-    else:
-        yield Finding("certificates", "ok", f"valid for {days:.0f} days")
+    yield Finding("certificates", LEVELS[level], words, mend if level else "")

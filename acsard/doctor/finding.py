@@ -7,6 +7,8 @@ from typing import Literal
 from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
+LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
+"""As diagnostics number them."""
 
 
 class Finding(Struct, frozen=True):

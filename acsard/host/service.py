@@ -95,7 +95,7 @@ def misplaced(prefix: str = sys.prefix, base: str = sys.base_prefix) -> str:
         return ""
     return (
         f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard in a "
-        f"venv at {HOME} (README, As a service)"
+        f"venv at {HOME} (deploy/systemd/README.md)"
     )
 
 

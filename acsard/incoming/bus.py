@@ -45,7 +45,7 @@ class Bus(Protocol):
         """Send a message to its listeners."""
 
     def reply(self, reply: Reply) -> None:
-        """Answer a query; the last reply to its number."""
+        """Answer a query by its ticket."""
 
-    def done(self, number: int) -> None:
-        """No more replies to this query."""
+    def retire(self, ticket: int) -> None:
+        """No more replies by this ticket."""

@@ -131,11 +131,11 @@ class Receiver:
 
     @staticmethod
     def request(
-        verb: Verb, number: int, encoding: str, payload: bytes, asked_ns: int | None = None
+        verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """The request in a service query, to be answered as `number`; raises `DecodeError`."""
+        """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
         if verb != "set_pose":
-            return Request(verb, number, asked_ns=asked_ns)
+            return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
         got = _poses.decode(encoding, payload)
@@ -144,7 +144,7 @@ class Receiver:
             or max(abs(got.x), abs(got.y)) > 1e6
         ):
             raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
-        return Request(verb, number, Pose(got.x, got.y, got.yaw), asked_ns)
+        return Request(verb, ticket, Pose(got.x, got.y, got.yaw), asked_ns)
 
 
 def _stamp(arrival: Arrival) -> tuple[int | None, str]:

@@ -13,6 +13,7 @@ from msgspec.structs import asdict
 from acsard.config.baud import wire_use
 from acsard.config.settings import Config
 from acsard.drive.words import waiting
+from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -40,9 +41,6 @@ from acsard.messages.schema import (
 from acsard.values import NS_PER_S, Estimate, Instant, Outputs, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
-
-EXPIRY_DAYS = 30
-"""From when on a certificate that ends is a warning."""
 
 Look = Callable[[], Snapshot]
 
@@ -217,12 +215,7 @@ class Report:
         """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""
         if not self._config.bus.tls:
             return 0, ""
-        if self._certificate_ends_ns is None:
-            return 1, "unknown: the library to read it is missing (pip install 'acsard[lan]')"
-        days = (self._certificate_ends_ns - now.wall_ns) / NS_PER_S / 86400
-        if days < 0:
-            return 2, f"ended {-days:.0f} days ago: nobody can join any more"
-        return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"
+        return expiry(self._certificate_ends_ns, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures

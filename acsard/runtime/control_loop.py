@@ -167,7 +167,7 @@ class ControlLoop:
                 continue
             for reply in served:
                 self._bus.reply(reply)
-            self._bus.done(query.number)
+            self._bus.retire(query.ticket)
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bool:
@@ -201,7 +201,7 @@ class ControlLoop:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:
                 bus.reply(reply)
-                bus.done(reply.number)
+                bus.retire(reply.ticket)
         for event in outputs.events:
             self._log(event)
 

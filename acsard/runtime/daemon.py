@@ -49,7 +49,7 @@ Announce = Callable[[str, str], None]
 
 
 async def run(config: Config, log: Log, announce: Announce) -> None:
-    """Run until a signal; raises `ExitError` when it cannot start."""
+    """Run until a signal; raises a `MendableError` when it cannot start."""
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
     departure = Departure(log, wake, manager)

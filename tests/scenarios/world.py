@@ -95,10 +95,10 @@ class MemoryBus:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
 
     def reply(self, reply: Reply) -> None:
-        self.replies.setdefault(reply.number, []).append(reply)
+        self.replies.setdefault(reply.ticket, []).append(reply)
 
-    def done(self, number: int) -> None:
-        self.finished.add(number)
+    def retire(self, ticket: int) -> None:
+        self.finished.add(ticket)
 
 
 class World:
@@ -242,7 +242,7 @@ class World:
         query = Query(self._queries, key, name, fmt, payload, "", self.now_ns)
         self.bus.queries.append(query)
         self.run(2 / self.config.rate_hz)
-        return self.bus.replies.get(query.number, [])
+        return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
         """A service's answer."""

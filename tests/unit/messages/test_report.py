@@ -446,7 +446,7 @@ def test_a_step_without_feedback_publishes_no_odometry() -> None:
 
 
 def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
-    assert "cmd_vel_out" not in published(replace(OUTPUTS, tick=False))
+    assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
 
 
 # how often
