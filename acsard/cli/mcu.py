@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_config, find, load
 from acsard.cli.person import Nobody, Person
+from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.files import change, require_tomlkit
 
@@ -103,11 +104,11 @@ def main(args: argparse.Namespace) -> int:
     if not args.json:
         simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""
         print(f"port {port}{simulated}, configuration {where}", flush=True)
-    trouble: ExitError | None = None
+    trouble: MendableError | None = None
     try:
         with ended_by_signals():
             procedure.run(_wire(config), person, config, tell)
-    except ExitError as error:
+    except MendableError as error:
         if not args.json:
             raise
         trouble = error  # programs get their object all the same
@@ -250,7 +251,7 @@ def _print_json(
     findings: Sequence[Finding],
     changes: dict[str, object],
     written: str | None,
-    trouble: ExitError | None,
+    trouble: MendableError | None,
 ) -> None:
     import msgspec
 

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 import serial
 
 from acsard.host import clock
+from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.processes import holder_of
 
@@ -104,20 +105,19 @@ def close(device: serial.Serial, *, lost: bool = False) -> threading.Thread:
     return thread
 
 
-def refusal(path: str, error: OSError) -> ExitError:
+def refusal(path: str, error: OSError) -> MendableError:
     """Why the port cannot be opened: how a one-shot tool ends; the daemon may wait instead."""
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
-            text = f"{path} is not there; plug it in, or name another ({_LISTED})"
-            return ExitError(Exit.NO_PORT, text)
+            return NoPortError(f"{path} is not there; plug it in, or name another ({_LISTED})")
         case errno.ENOTTY | errno.EISDIR:
-            return ExitError(Exit.NO_PORT, f"{path} is not a serial port; name another ({_LISTED})")
+            return NoPortError(f"{path} is not a serial port; name another ({_LISTED})")
         case errno.EACCES | errno.EPERM:
-            return ExitError(Exit.NO_PERMISSION, f"no permission to open {path}; {_JOIN}")
+            return NotPermittedError(f"no permission to open {path}; {_JOIN}")
         case errno.EBUSY | errno.EAGAIN:
             holder = holder_of(path)
             who = f"process {holder.pid}" if holder else "another process"
-            return ExitError(Exit.IN_USE, f"{path} is in use by {who}; {_FREE}")
+            return InUseError(f"{path} is in use by {who}; {_FREE}")
         case _:
             return ExitError(Exit.FAILURE, f"cannot open {path}: {error}")
 

@@ -18,7 +18,7 @@ import serial
 import serial_asyncio
 
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import in_thread
 from acsard.mcu.port import Gate, Offered
 from acsard.serial.device import close, draining, open_raw, refusal, unsent
@@ -102,10 +102,10 @@ class SerialPort:
                 return self
             except OSError as error:
                 refused = refusal(self._path, error)
-            over = clock.now().mono_ns > deadline_ns
-            if refused.code is Exit.IN_USE or (refused.code is Exit.NO_PERMISSION and over):
+            denied = isinstance(refused, NotPermittedError)
+            if isinstance(refused, InUseError) or (denied and clock.mono_ns() > deadline_ns):
                 raise refused
-            if refused.code is not Exit.NO_PERMISSION:
+            if not denied:
                 self._complain(refused)
                 return self
             await asyncio.sleep(BACK_OFF_S[-1])
@@ -145,7 +145,7 @@ class SerialPort:
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
-    def _complain(self, refused: ExitError) -> None:
+    def _complain(self, refused: MendableError) -> None:
         """Say once why the port cannot be opened, not at every attempt."""
         text = f"{refused}; retrying"
         if text != self.trouble:

@@ -16,9 +16,11 @@ from msgspec import structs
 
 from acsard.checkup.findings import Finding
 from acsard.cli import mcu
+from acsard.cli.exits import code_of
 from acsard.cli.person import Person
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
+from acsard.host.errors import NoPortError
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
@@ -146,7 +148,7 @@ def test_the_port_that_was_named_is_written_with_the_rate_it_has(
 def test_a_port_without_an_answer_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(ExitError):
+    with pytest.raises(NoPortError):
         called(tmp_path, "--port", str(tmp_path / "none"), "--yes", "--write", "--json")
     found = json.loads(capsys.readouterr().out)
     assert (found["passed"], found["changes"]) == (False, {})
@@ -168,9 +170,9 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("words", [["--yes"], ["--yes", "--wheels-are-lifted"]])
 def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> None:
-    with pytest.raises(ExitError, match="acsard ports") as end:
+    with pytest.raises(NoPortError, match="acsard ports") as end:
         called(tmp_path, *words, "--port", str(tmp_path / "none"))
-    assert int(end.value.code) == 66
+    assert code_of(end.value) == 66
 
 
 def test_a_person_is_asked_until_the_answer_is_one(

@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from acsard.cli.exits import code_of
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import InUseError, NoPortError
+from acsard.host.exits import Exit
 from acsard.serial.device import close, draining, open_raw, refusal, require, unsent
 
 
@@ -40,7 +42,7 @@ def path() -> Iterator[str]:
 )
 def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
     refused = refusal("/dev/acsar_that_is_not", OSError(number, "the driver did not answer"))
-    assert refused.code is code
+    assert code_of(refused) is code
     assert str(refused).count("/dev/acsar_that_is_not") == 1
     assert words in str(refused)
 
@@ -49,7 +51,7 @@ def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str)
     device = open_raw(path, 115200)
     with pytest.raises(OSError, match="lock") as locked:
         open_raw(path, 115200)
-    assert refusal(path, locked.value).code is Exit.IN_USE
+    assert isinstance(refusal(path, locked.value), InUseError)
     close(device).join(5.0)
     # Root may pass the mark, so it is looked for itself.
     after = os.open(path, os.O_RDWR | os.O_NOCTTY)
@@ -81,9 +83,8 @@ def test_what_cannot_say_what_it_holds_is_drained_at_once(path: str) -> None:
 @pytest.mark.parametrize("name", ["nothing", "file", "."])
 def test_what_is_no_device_is_no_port(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ExitError, match=r"`acsard ports` lists") as told:
+    with pytest.raises(NoPortError, match=r"`acsard ports` lists"):
         require(str(tmp_path / name))
-    assert told.value.code == Exit.NO_PORT
 
 
 def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
