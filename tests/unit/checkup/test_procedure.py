@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from acsard.checkup import procedure
-from acsard.checkup.bench import FAREWELL, SPEED
+from acsard.checkup.board import FAREWELL
 from acsard.checkup.findings import Finding, WireLostError
+from acsard.checkup.limits import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.frames import Codec
 from acsard.sim import protocol
@@ -404,8 +405,8 @@ def test_after_a_runaway_zeros_go_out_once_and_then_nothing() -> None:
 
 def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it() -> None:
     robot = Regulates("reversed_encoder=b", lag=0.05)
-    with robot.bench() as bench:
-        bench.drive((0.0, SPEED, 0.0, 0.0), 0.05)
+    with robot.board() as board:
+        board.drive((0.0, SPEED, 0.0, 0.0), 0.05)
     assert 1 <= zeros_after(robot.sent) < FAREWELL
     assert not any(robot.later())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import dialect
+from acsard.checkup import dialect, pace
 from acsard.checkup.silence import UNKNOWN, Silence, measured
 from acsard.checkup.turning import turn
 from tests.unit.checkup.robots import Robot
@@ -15,14 +15,14 @@ SLACK_S = 0.02
 
 
 def silence(robot: Robot) -> Silence:
-    with robot.bench() as bench:
-        list(dialect.pace(bench))
-        dialect.check(bench)
+    with robot.board() as board:
+        pace.rate(board)
+        dialect.check(board)
         for motor in ALL:
-            turn(bench, motor, 3.0)
-            bench.rest()
-        found = measured(bench, ALL)
-        assert bench.turning() == []
+            turn(board, motor, 3.0)
+            board.rest()
+        found = measured(board, ALL)
+        assert board.turning() == []
     return found
 
 
