@@ -86,3 +86,23 @@ def test_more_counts_than_the_host_takes_are_a_warning() -> None:
     with Robot().board() as board:
         board.sampled, board.identity = True, {"counts": "400000"}
         assert counts.finding(board, []).verdict == "WARN"
+
+
+@pytest.mark.parametrize("configured", [1600, 2700, 3700, 12800])
+def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) -> None:
+    with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
+        board.sampled = True
+        board.replies = replies(3200)
+        finding = counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
+    assert finding.figure == f"3200, not {configured}"
+    assert "every distance would be off by" in finding.text
+
+
+def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None:
+    with Robot(encoder_counts=3200).board() as board:
+        board.sampled = True
+        board.replies = [Reply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
+                         for n, r in enumerate(replies(3200))]  # fmt: skip
+        finding = counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})
