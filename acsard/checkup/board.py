@@ -29,9 +29,6 @@ from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, STILL, WheelSpeeds
 
-KEPT = 0.8
-"""A wheel still this share as fast after the wait as at its start has not been stopped."""
-
 LEAST_S = 0.001
 """No line goes out for less than this."""
 
@@ -47,8 +44,6 @@ class Board:
         self.is_open = False
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
-        self.latched = False
-        """The last motor had to be stopped by zeros with the other last comma: `comma`, now."""
         self.sealed = self.sampled = False
         """Lines go out with the check, and ask for the sample fields."""
         self.own_clock = False
@@ -230,51 +225,32 @@ class Board:
         return len(last) == 2 and all(abs(v) < STANDING for r in last for v in r.motors)
 
     def rest(self) -> None:
-        """Stop, and wait until everything stands; ends the check when nothing stops it.
-
-        Where the last motor alone keeps its speed until zeros with the other last comma stop it,
-        that is the form in force from then on.
-        """
+        """Stop, and wait until everything stands; ends the check when zeros of neither form, with
+        a comma at their end or without, do that."""
         began_s = self.now_s
-        if self._settles():
+        if self._settles(self.comma) or self._settles(not self.comma):
             return
         turning = self.turning()
-        kept = turning == [3] and self._kept(3, began_s)
-        self.comma = not self.comma
-        settled = self._settles()
-        if settled and kept:
-            self.latched = True
-            return
-        self.comma = not self.comma
-        if settled:
-            return
         self._let_go()
         motors = motor_names(self.mcu, turning, ", ") or "something"
         seconds = round(self.now_s - began_s, 1)
         raise StoppedError(manual.find("stop: turns", motors=motors, seconds=seconds))
 
-    def _settles(self) -> bool:
-        """Zeros in the form in force until everything stands; False when it does not, be it that
-        no motor slows down any more."""
+    def _settles(self, comma: bool) -> bool:
+        """Zeros until everything stands; False when it does not, be it that no motor slows down
+        any more."""
         began_s = self.now_s
         while not self.standing(began_s):
             waited_s = self.now_s - began_s
             if waited_s >= PATIENCE_S or (waited_s >= MOTOR_S and not self._slows()):
                 return False
-            self.ask(ZERO)
+            self.ask(ZERO, comma=comma)
         self.slowest_rest_s = max(self.slowest_rest_s, self.now_s - began_s)
         return True
 
     def _slows(self) -> bool:
         """Some motor slows down."""
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS
-
-    def _kept(self, motor: int, began_s: float) -> bool:
-        """It is about as fast now as it was then: zeros have not reached it."""
-        span_s = 0.4 * MOTOR_S
-        first = motion.mean(motion.since(self.replies, began_s, began_s + span_s))
-        last = motion.mean(motion.since(self.replies, self.now_s - span_s))
-        return abs(last[motor]) >= KEPT * abs(first[motor])
 
     def turning(self) -> list[int]:
         """The motors that turn by the last reply."""

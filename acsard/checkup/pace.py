@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import pairwise
 from statistics import fmean, median
 
-from acsard.checkup import manual
+from acsard.checkup import manual, motion
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import CUT_S, GLANCE_S
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import ZERO
 from acsard.config.baud import COMFORTABLE_USE, highest_rate, line_bytes
 
 ENOUGH = 10
@@ -22,7 +22,7 @@ SLOW_S = 0.008
 """A round trip longer than the lines' time on the wire and this holds the control loop's news
 back; an MCU takes 1 to 5 ms."""
 
-TRIPS = 20
+TRIPS = 10
 
 
 def rate(board: Board) -> Finding:
@@ -73,15 +73,12 @@ def trip(board: Board) -> Finding:
     """How soon a line is answered."""
     if board.own_clock:
         return manual.find("round trip: own clock")
+    board.listen(GLANCE_S)
     trips: list[float] = []
     for _ in range(TRIPS):
-        # No reply to an earlier line may be taken for this one's.
-        board.listen(0.0 if trips and board.gap_s <= 2 * board.period_s else GLANCE_S)
-        board.send(ZERO)
-        got: list[Reply] = []
-        while not got and board.now_s < board.sent_s + GLANCE_S:
-            got = board.listen(0.002)
-        trips += [reply.at_s - board.sent_s for reply in got[:1]]
+        board.ask(ZERO, GLANCE_S)  # no reply to an earlier line may be taken for this one's
+        answer = motion.since(board.replies, board.sent_s)[:1]
+        trips += [reply.at_s - board.sent_s for reply in answer]
     if not trips:
         return manual.find("round trip: none")
     middle_s = median(trips)

@@ -68,8 +68,6 @@ def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], No
                  dialect.replies, dialect.check):  # fmt: skip
         tell(step(board))
     board.rest()
-    if board.latched:
-        tell(turning.comma(board, None))
     board.armed = True
     channels = []
     for channel in turning.channels(board, operator):

@@ -86,7 +86,7 @@ def channels(board: Board, operator: Operator) -> Iterator[Channel]:
     for motor in range(4):
         operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
         channel = _both_ways(board, motor)
-        if motor == 3 and channel.kind == "dead" and not board.latched:
+        if motor == 3 and channel.kind == "dead":
             channel = _with_other_comma(board, channel)
         yield _seen(board, operator, channel)
 
@@ -166,23 +166,19 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
         board.comma = not board.comma
         _let_go(board, CUT_S)
         return dead
-    if board.comma:
-        # Zeros without the comma: firmware that needs it keeps this motor turning.
-        last = board.drive(ZERO, 0.5, comma=False)[-3:]
-        board.latched = bool(moving(motion.mean(last)))
+    # Zeros without the comma: firmware that needs it keeps this motor turning.
+    last = board.drive(ZERO, 0.5, comma=False)[-3:] if board.comma else []
     board.rest()
     back = turn(board, dead.motor, -SPEED)
     board.rest()
-    return Channel(dead.motor, forth, back)
+    return Channel(dead.motor, forth, back, latched=bool(moving(motion.mean(last))))
 
 
-def comma(board: Board, last: Channel | None) -> Finding:
+def comma(board: Board, last: Channel) -> Finding:
     """What the last motor says of the comma at the line's end."""
-    if board.latched and board.comma:
-        return comma_wrong(board, "latched")
     if board.comma != board.mcu.trailing_comma:
-        return comma_wrong(board, "disobeyed")
-    if last is not None and last.kind == "dead":
+        return comma_wrong(board, "latched" if last.latched else "disobeyed")
+    if last.kind == "dead":
         return manual.find("trailing comma: dead")
     how = "sent" if board.comma else "not sent"
     return manual.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})

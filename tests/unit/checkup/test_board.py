@@ -57,8 +57,7 @@ def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: b
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
         board.rest()
-        assert board.latched is not sent
-        assert board.comma
+        assert board.turning() == []
     assert robot.later() == [0.0] * 4
 
 
@@ -74,11 +73,13 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
         board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
         with pytest.raises(StoppedError) as end:
             board.rest()
+        sent = len(robot.sent)
     assert end.value.finding.name == "stop"
     assert f"{2 * MOTOR_S:g} s" in end.value.finding.figure
     assert "motor a (front right)" in end.value.finding.text
     assert robot.sent[-1].startswith(b"\r\n")  # once, then silence
     assert not robot.sent[-2].startswith(b"\r\n")
+    assert len(robot.sent) == sent
 
 
 def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
@@ -124,7 +125,6 @@ def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool)
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 3.0)
         board.rest()
-        assert not board.latched
         assert board.comma is sent
         assert MOTOR_S < board.slowest_rest_s < PATIENCE_S
 
@@ -137,5 +137,4 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
         began = robot.now_ns()
         board.rest()  # by the second wait
         assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
-        assert not board.latched
         assert not board.comma
