@@ -9,17 +9,8 @@ from __future__ import annotations
 
 from math import ceil
 
-from acsard.checkup import manual, motion
+from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
-from acsard.checkup.limits import (
-    MOTOR_S,
-    PATIENCE_S,
-    PERIOD_S,
-    RUNAWAY,
-    STANDING,
-    WATCHDOG_LEAST_S,
-    WATCHDOG_S,
-)
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
 from acsard.config.baud import line_bytes, wire_ns
@@ -128,7 +119,7 @@ class Board:
     @property
     def period_s(self) -> float:
         """Between two lines."""
-        return max(PERIOD_S, self.line_s)
+        return max(limits.PERIOD_S, self.line_s)
 
     # sending
 
@@ -180,7 +171,7 @@ class Board:
                 if reply is not None:
                     got.append(reply)
         self.replies += got
-        if self.armed and any(abs(v) > RUNAWAY for r in got for v in r.motors):
+        if self.armed and any(abs(v) > limits.RUNAWAY for r in got for v in r.motors):
             self._guard()
         return got
 
@@ -206,7 +197,7 @@ class Board:
             self.longest_pause_s = max(self.longest_pause_s, now_s - self.sent_s)
             self.send(motors, comma)
             got += self._listen(min(period_s, end_s - now_s))
-            if self.now_s - now_s > period_s + WATCHDOG_LEAST_S:
+            if self.now_s - now_s > period_s + limits.WATCHDOG_LEAST_S:
                 self._excused_s = self.now_s  # it was the host that paused
             self._present()
         return got
@@ -222,7 +213,7 @@ class Board:
     def standing(self, since_s: float) -> bool:
         """The last two replies since then say that every motor stands."""
         last = motion.since(self.replies[-2:], since_s)
-        return len(last) == 2 and all(abs(v) < STANDING for r in last for v in r.motors)
+        return len(last) == 2 and all(abs(v) < limits.STANDING for r in last for v in r.motors)
 
     def rest(self) -> None:
         """Stop, and wait until everything stands; ends the check when zeros of neither form, with
@@ -242,7 +233,7 @@ class Board:
         began_s = self.now_s
         while not self.standing(began_s):
             waited_s = self.now_s - began_s
-            if waited_s >= PATIENCE_S or (waited_s >= MOTOR_S and not self._slows()):
+            if waited_s >= limits.PATIENCE_S or (waited_s >= limits.MOTOR_S and not self._slows()):
                 return False
             self.ask(ZERO, comma=comma)
         self.slowest_rest_s = max(self.slowest_rest_s, self.now_s - began_s)
@@ -255,7 +246,7 @@ class Board:
     def turning(self) -> list[int]:
         """The motors that turn by the last reply."""
         speeds = self.replies[-1].motors if self.replies else ()
-        return [motor for motor, speed in enumerate(speeds) if abs(speed) >= STANDING]
+        return [motor for motor, speed in enumerate(speeds) if abs(speed) >= limits.STANDING]
 
     # safety
 
@@ -273,7 +264,7 @@ class Board:
                 letter=LETTERS[motor],
                 told=told,
                 seen=seen,
-                most=RUNAWAY,
+                most=limits.RUNAWAY,
             )
         )
 
@@ -291,13 +282,13 @@ class Board:
     def _fastest(self) -> tuple[int, float] | None:
         """A motor that runs away, and its speed."""
         per_turn = self.named_counts or self.mcu.encoder_counts
-        return motion.fastest(self.replies, RUNAWAY, per_turn)
+        return motion.fastest(self.replies, limits.RUNAWAY, per_turn)
 
     def _present(self) -> None:
         """Ends the check when the MCU has fallen silent: nobody would see a runaway."""
         last_s = self.replies[-1].at_s if self.replies else 0.0
         silent_s = self.now_s - max(last_s, self._excused_s)
-        if not self.armed or silent_s <= WATCHDOG_S + 4 * self.gap_s:
+        if not self.armed or silent_s <= limits.WATCHDOG_S + 4 * self.gap_s:
             return
         asked = [motor for motor, speed in enumerate(self._commanded) if speed]
         self.zeros()

@@ -80,7 +80,6 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 def _moves(board: Board, line: bytes) -> bool:
     """Whether anything that stands turns because of it; it stands again."""
-    board.rest()
     for _ in range(REPEATS):
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))

@@ -12,7 +12,7 @@ from acsard.checkup import manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.limits import GLANCE_S
-from acsard.checkup.motion import ZERO
+from acsard.checkup.motion import ZERO, Reply
 from acsard.config.settings import Baud
 from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
@@ -85,12 +85,13 @@ def form(board: Board) -> Finding | None:
     return comma_wrong(board, "refused")
 
 
-def _answers(board: Board, comma: bool) -> bool:
+def _answers(board: Board, comma: bool) -> list[Reply]:
+    """What comes back for some lines of this form, and for no earlier one."""
     board.listen(GLANCE_S / 4)
     before = len(board.replies)
     for _ in range(TRIES):
-        board.ask(ZERO, GLANCE_S / 6, comma)
-    return len(board.replies) > before
+        board.ask(ZERO, max(GLANCE_S / 6, 1.5 * board.period_s), comma)
+    return board.replies[before:]
 
 
 def comma_wrong(board: Board, how: str) -> Finding:
@@ -121,12 +122,11 @@ def replies(board: Board) -> Finding:
 def check(board: Board) -> Finding:
     """Whether it knows the checked link and the sample fields; from here on they are used."""
     wanted = board.mcu.link_check
-    board.sealed = True
-    for board.sampled in (True, False):
-        if _sealed_answers(board):
-            break
-    else:
-        board.sealed = False
+    board.sealed = board.sampled = True
+    if not any(reply.reading for reply in _answers(board, board.comma)):
+        board.sampled = False
+        board.sealed = bool(_answers(board, board.comma))
+    if not board.sealed:
         if wanted == "require":
             return manual.find("checked link: required", {"mcu.link_check": "auto"})
         return manual.find("checked link: plain")
@@ -135,12 +135,3 @@ def check(board: Board) -> Finding:
         {"mcu.link_check": "auto" if wanted == "off" else wanted},
         figure="checked, with samples" if board.sampled else "checked",
     )
-
-
-def _sealed_answers(board: Board) -> bool:
-    """Whether lines with a suffix are answered with one, and with the sample if asked for it."""
-    before = len(board.replies)
-    for _ in range(TRIES):
-        board.ask(ZERO, max(GLANCE_S / 6, 1.5 * board.period_s))
-    got = board.replies[before:]
-    return any(reply.reading is not None for reply in got) if board.sampled else bool(got)

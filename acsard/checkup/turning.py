@@ -10,21 +10,10 @@ from collections.abc import Iterator
 
 from msgspec import structs
 
-from acsard.checkup import manual, motion
+from acsard.checkup import limits, manual, motion
 from acsard.checkup.board import Board
 from acsard.checkup.dialect import comma_wrong
 from acsard.checkup.findings import Finding, motor_name
-from acsard.checkup.limits import (
-    CUT_S,
-    GLANCE_S,
-    MOTOR_S,
-    PATIENCE_S,
-    PROBE_MOVES,
-    SPEED,
-    STANDING,
-    STOOD_S,
-    WATCHDOG_LEAST_S,
-)
 from acsard.checkup.motion import ZERO
 from acsard.checkup.outside import Operator
 from acsard.checkup.wheels import NO_WHEEL, TOLERANCE, Channel, moving
@@ -44,7 +33,7 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> Motors:
     """Bring a motor to speed, once more if this host has paused; each encoder's speed by then."""
     means = run_up(board, one(motor, speed))
-    if board.longest_pause_s >= WATCHDOG_LEAST_S:
+    if board.longest_pause_s >= max(limits.WATCHDOG_LEAST_S, 2 * board.period_s):
         board.rest()
         means = run_up(board, one(motor, speed))
     return means
@@ -53,29 +42,29 @@ def turn(board: Board, motor: int, speed: float) -> Motors:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up and hold until the encoders show a steady speed; what they show."""
     board.begin()
-    steps = max(1, int(GLANCE_S / board.period_s))
+    steps = max(1, int(limits.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
         board.drive((a, b, c, d), board.period_s)
-    began_s, look_s = board.now_s, max(GLANCE_S / 2, 2.5 * board.gap_s)
+    began_s, look_s = board.now_s, max(limits.GLANCE_S / 2, 2.5 * board.gap_s)
     asked = sum(1 for speed in motors if speed)
     means, looks, steady = ZERO, 0, 0
-    while steady < 2 and (looks * look_s < MOTOR_S or _speeds_up(board, motors, began_s)):
+    while steady < 2 and (looks * look_s < limits.MOTOR_S or _speeds_up(board, motors, began_s)):
         board.drive(motors, look_s)
         looks += 1
         # A coarse encoder needs more of them, a quick one is seen to be steady before.
         last = min(CHUNKS, max(1, looks - 1))
         means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
-        near = [m for m in moving(means) if abs(abs(means[m]) / SPEED - 1) < 0.4 * TOLERANCE]
+        near = [m for m in moving(means) if abs(abs(means[m]) / limits.SPEED - 1) < 0.4 * TOLERANCE]
         steady = steady + 1 if len(near) >= asked else 0
-        if looks * look_s >= CUT_S and max(map(abs, means)) < STANDING:
+        if looks * look_s >= limits.CUT_S and max(map(abs, means)) < limits.STANDING:
             break  # not held for longer: a control loop without its encoder may be winding up
     return means
 
 
 def _speeds_up(board: Board, motors: Motors, began_s: float) -> bool:
     """A motor is not at the speed it was told yet, and getting there."""
-    if board.now_s - began_s >= PATIENCE_S:
+    if board.now_s - began_s >= limits.PATIENCE_S:
         return False
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     return any(share > 1 / motion.FALLS for share, told in zip(shares, motors, strict=True) if told)
@@ -95,12 +84,12 @@ def _both_ways(board: Board, motor: int) -> Channel:
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
-    forth, back = turn(board, motor, SPEED), ZERO
+    forth, back = turn(board, motor, limits.SPEED), ZERO
     if motor in moving(forth):
         board.rest()
-        back = turn(board, motor, -SPEED)
+        back = turn(board, motor, -limits.SPEED)
     if motor not in moving(back):
-        _let_go(board, CUT_S)
+        _let_go(board, limits.CUT_S)
     board.rest()
     return Channel(motor, forth, back)
 
@@ -113,16 +102,16 @@ def probe(board: Board, motor: int) -> Motors | None:
     coarse encoders: they may need more to show anything, and one count back is nothing yet.
     """
     began_s = board.now_s
-    shown = _probe(board, motor, SPEED / 2)
+    shown = _probe(board, motor, limits.SPEED / 2)
     if shown is None:
         return None
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
     if len(seen) >= 3 and max(seen) < 0:
         return shown  # no need to drive a reversed one away twice
-    if not moving(shown, PROBE_MOVES):
-        return _probe(board, motor, SPEED)
-    again = _probe(board, motor, SPEED / 2)
+    if not moving(shown, limits.PROBE_MOVES):
+        return _probe(board, motor, limits.SPEED)
+    again = _probe(board, motor, limits.SPEED / 2)
     return shown if again is not None and not any(again) else again
 
 
@@ -135,19 +124,19 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
-        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / GLANCE_S)
+        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / limits.GLANCE_S)
 
     own = 0.0
-    while board.now_s < began_s + GLANCE_S and own > -4 * PROBE_MOVES:
+    while board.now_s < began_s + limits.GLANCE_S and own > -4 * limits.PROBE_MOVES:
         board.drive(one(motor, speed), board.period_s)
         own = shown()[motor]
-    if own >= PROBE_MOVES:
+    if own >= limits.PROBE_MOVES:
         return None
     # The firmware may regulate zeros into a runaway, and its watchdog cuts the motor; one that was
     # seen to turn must stand before the next zeros are regulated.
-    _let_go(board, STOOD_S if moving(shown(), PROBE_MOVES) else CUT_S)
+    _let_go(board, limits.STOOD_S if moving(shown(), limits.PROBE_MOVES) else limits.CUT_S)
     seen = shown()
-    return None if seen[motor] >= PROBE_MOVES else seen
+    return None if seen[motor] >= limits.PROBE_MOVES else seen
 
 
 def _let_go(board: Board, silent_s: float) -> None:
@@ -161,15 +150,15 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
     """The last motor does nothing: does it with the comma at the line's end turned round?"""
     board.comma = not board.comma
     shown = probe(board, dead.motor)
-    forth = ZERO if shown is not None else turn(board, dead.motor, SPEED)
+    forth = ZERO if shown is not None else turn(board, dead.motor, limits.SPEED)
     if dead.motor not in moving(forth):
         board.comma = not board.comma
-        _let_go(board, CUT_S)
+        _let_go(board, limits.CUT_S)
         return dead
     # Zeros without the comma: firmware that needs it keeps this motor turning.
     last = board.drive(ZERO, 0.5, comma=False)[-3:] if board.comma else []
     board.rest()
-    back = turn(board, dead.motor, -SPEED)
+    back = turn(board, dead.motor, -limits.SPEED)
     board.rest()
     return Channel(dead.motor, forth, back, latched=bool(moving(motion.mean(last))))
 
