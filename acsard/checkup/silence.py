@@ -24,6 +24,9 @@ from acsard.mcu.frames import LETTERS, Motors
 FINE_S = 0.03
 """How finely it is found by asking."""
 
+MOST_ASKED = 8
+"""How often; each halves what is left, unless the host pauses."""
+
 QUICK_S = 0.012
 """Between the two lines that ask: the second reply's speed is of this time."""
 
@@ -76,8 +79,8 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
         board.send(ZERO)
     told_s = board.sent_s
     while (left_s := told_s + length_s - board.now_s) > 0:
-        line = next(lines, b"")
-        board.wire.send(line)
+        if line := next(lines, b""):
+            board.wire.send(line)
         board.listen(min(left_s, board.period_s) if line else left_s)
     silent_s, before = board.now_s - told_s, len(board.replies)
     if length_s:
@@ -95,7 +98,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     answered = not board.own_clock and course[0].at_s < told_s + PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
-    ran_s = max(abs(ran[motor] / full[motor]) for motor in motors)
+    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= SPEED / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
 
 
@@ -103,7 +106,7 @@ def _at_speed(board: Board, motors: Sequence[int]) -> tuple[Motors, float]:
     """Bring the motors to speed: what they show, and its grain."""
     began_s = board.now_s
     full = run_up(board, command(motors))
-    if min(abs(full[motor]) for motor in motors) < SPEED / 2:
+    if max(abs(full[motor]) for motor in motors) < SPEED / 2:
         board.rest()
         letters = ", ".join(LETTERS[motor] for motor in motors)
         raise StoppedError(manual.find("watchdog: weak", letters=letters))
@@ -156,12 +159,14 @@ def _asked(
     board: Board, motors: Sequence[int], stop: Run, least_s: float, most_s: float
 ) -> Silence:
     """Between two silences: one that they turn through, and one that they do not."""
-    while most_s - least_s > max(FINE_S, 0.1 * most_s):
+    for _ in range(MOST_ASKED):
+        if most_s - least_s <= max(FINE_S, 0.1 * most_s):
+            break
         answer = run(board, motors, (least_s + most_s) / 2)
         if answer.turned:
-            least_s = answer.silent_s
+            least_s = max(least_s, answer.silent_s)
         else:
-            most_s = answer.silent_s
+            most_s = min(most_s, answer.silent_s)
     # The reply that tells is of a moment after the silence, as the ordinary stop's is.
     least_s -= stop.slow_s - QUICK_S + 2 * stop.grain_s
     most_s -= stop.slow_s - QUICK_S - PERIOD_S - 2 * stop.grain_s
