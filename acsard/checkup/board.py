@@ -35,6 +35,8 @@ class Board:
         self.is_open = False
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
+        self.latched = False
+        """Zeros without what is `comma` now left the last motor turning."""
         self.sealed = self.sampled = False
         """Lines go out with the check, and ask for the sample fields."""
         self.own_clock = False
@@ -216,12 +218,20 @@ class Board:
         return len(last) == 2 and all(abs(v) < limits.STANDING for r in last for v in r.motors)
 
     def rest(self) -> None:
-        """Stop, and wait until everything stands; ends the check when zeros of neither form, with
-        a comma at their end or without, do that."""
+        """Stop, and wait until everything stands; ends the check when nothing does that.
+
+        Where zeros in the other form stop the last motor, which kept its speed, that form is in
+        force from then on.
+        """
         began_s = self.now_s
-        if self._settles(self.comma) or self._settles(not self.comma):
+        if self._settles(self.comma):
             return
         turning = self.turning()
+        kept = turning == [3] and not self._slows()
+        if self._settles(not self.comma):
+            if kept:
+                self.latched, self.comma = True, not self.comma
+            return
         self._let_go()
         motors = motor_names(self.mcu, turning, ", ") or "something"
         seconds = round(self.now_s - began_s, 1)
@@ -251,22 +261,16 @@ class Board:
     # safety
 
     def _guard(self) -> None:
-        found = self._fastest()
-        if found is None:
+        fastest = self._fastest()
+        if fastest is None:
             return
-        motor, seen = found
+        motor, seen = fastest
         told = self._commanded[motor]
         self._let_go()
-        raise StoppedError(
-            manual.find(
-                "runaway: against" if told * seen < 0 else "runaway: along",
-                motor=motor_name(self.mcu, motor),
-                letter=LETTERS[motor],
-                told=told,
-                seen=seen,
-                most=limits.RUNAWAY,
-            )
-        )
+        outcome = "runaway: against" if told * seen < 0 else "runaway: along"
+        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], limits.RUNAWAY
+        found = manual.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
+        raise StoppedError(found)
 
     def _let_go(self) -> None:
         """Zeros once, and none after them."""

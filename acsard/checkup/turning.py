@@ -75,7 +75,7 @@ def channels(board: Board, operator: Operator) -> Iterator[Channel]:
     for motor in range(4):
         operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
         channel = _both_ways(board, motor)
-        if motor == 3 and channel.kind == "dead":
+        if motor == 3 and channel.kind == "dead" and not board.latched:
             channel = _with_other_comma(board, channel)
         yield _seen(board, operator, channel)
 
@@ -160,13 +160,14 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
     board.rest()
     back = turn(board, dead.motor, -limits.SPEED)
     board.rest()
-    return Channel(dead.motor, forth, back, latched=bool(moving(motion.mean(last))))
+    board.latched = bool(moving(motion.mean(last)))
+    return Channel(dead.motor, forth, back)
 
 
 def comma(board: Board, last: Channel) -> Finding:
     """What the last motor says of the comma at the line's end."""
     if board.comma != board.mcu.trailing_comma:
-        return comma_wrong(board, "latched" if last.latched else "disobeyed")
+        return comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
     if last.kind == "dead":
         return manual.find("trailing comma: dead")
     how = "sent" if board.comma else "not sent"

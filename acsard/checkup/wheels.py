@@ -36,8 +36,6 @@ class Channel(Struct, frozen=True):
     """Which wheel a person saw turn, in `WHEELS` order, or `NO_WHEEL`; None: nobody looked."""
     forward: bool = True
     """It turned forward first, as seen by a person."""
-    latched: bool = False
-    """Zeros without a comma at their end left it turning."""
     probed: bool = False
     """Its own encoder did not follow a short probe: it was not turned further, and not back."""
 

@@ -57,7 +57,8 @@ def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: b
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
         board.rest()
-        assert board.turning() == []
+        assert board.latched is not sent
+        assert board.comma
     assert robot.later() == [0.0] * 4
 
 
@@ -125,6 +126,7 @@ def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool)
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 3.0)
         board.rest()
+        assert not board.latched
         assert board.comma is sent
         assert MOTOR_S < board.slowest_rest_s < PATIENCE_S
 
@@ -137,4 +139,5 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
         began = robot.now_ns()
         board.rest()  # by the second wait
         assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
+        assert not board.latched
         assert not board.comma

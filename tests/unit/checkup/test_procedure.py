@@ -475,3 +475,20 @@ def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> No
         if not moving:
             turning_since.clear()
         assert at_ns - since < 4000 * MS
+
+
+def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_turns() -> None:
+    def obeys(line: bytes) -> protocol.Command | None:
+        """Plain lines; a zero for motor d needs a comma after it."""
+        command = None if b"#" in line else protocol.whole(line)
+        if command and not command.values[3] and not line.endswith(b",\r\n"):
+            command.values.pop(3)
+        return command
+
+    robot = Robot()
+    robot.mcu.understand = obeys
+    checked = Checked(robot)
+    finding = checked["trailing comma"]
+    assert (finding.verdict, finding.figure) == ("FAIL", "needed")
+    assert "still turns after zeros" in finding.text
+    assert checked.changes["mcu.trailing_comma"] is True
