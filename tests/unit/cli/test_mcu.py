@@ -14,10 +14,9 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from acsard.checkup.findings import Finding
 from acsard.cli import mcu
 from acsard.cli.exits import code_of
-from acsard.cli.person import Person
+from acsard.cli.person import Person, ended_by_signals
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.errors import NoPortError
@@ -207,7 +206,7 @@ def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
     reached = []
 
     def signalled() -> None:
-        with mcu.ended_by_signals():
+        with ended_by_signals():
             try:
                 os.kill(os.getpid(), number)
             finally:
@@ -218,12 +217,3 @@ def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
         signalled()
     assert reached == [True]
     assert signal.getsignal(number) is before
-
-
-def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
-    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
-    head, *rest = mcu.row(finding, colours=False)
-    assert head == "FAIL    watchdog               none"
-    assert all(line.startswith("        ") and len(line) <= 100 for line in rest)
-    assert rest[-1] == "        -> give it one"
-    assert "\033[31m" in mcu.row(finding, colours=True)[0]
