@@ -32,6 +32,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     runtime/       S  the control loop and the daemon; figures of itself
     client.py      S  drive and follow a robot from Python
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
+    doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
     cli/           S  one verb per file
 
 Three invariants, each tested:

@@ -8,8 +8,16 @@
 
 `connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
 messages (`acsard.messages.schema`). Commands are stamped and each client opens with a zero, so
-the daemon's staleness and neutral-first rules are met without thinking of them. Errors are
-`ExitError` when no daemon answers, and `DecodeError` when what answers is not one of ours.
+the daemon's staleness and neutral-first rules are met without thinking of them.
+
+Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
+
+    UnreachableError  ConnectionError  nobody listens at the endpoint
+    NoAnswerError     TimeoutError     no robot of this id there, no such key, or you may not ask it
+    ReplyError        RuntimeError     the daemon answers that it cannot; a service that refuses
+                                       says so in its reply instead
+    UsageError        ValueError       an endpoint, a key or a number that cannot be
+    DecodeError                        what was sent is not one of our messages
 """
 
 from __future__ import annotations
@@ -23,16 +31,31 @@ from typing import Any
 
 import msgspec
 import zenoh
-import zenoh.ext
 
 from acsard.bus.session import client_session
+from acsard.bus.subscription import Subscription, queue_on
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
 from acsard.host.threads import in_thread
 from acsard.messages import schema
-from acsard.messages.encodings import Decoder, encode, encoding_name
-from acsard.messages.topics import by_key, full_key
-from acsard.values import Pose
+from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
+from acsard.messages.topics import by_key, full_key, service_key
+from acsard.values import AcsardError, Pose
+
+__all__ = (
+    "AcsardError",
+    "AsyncClient",
+    "Client",
+    "DecodeError",
+    "NoAnswerError",
+    "Pose",
+    "ReplyError",
+    "Subscription",
+    "UnreachableError",
+    "UsageError",
+    "connect",
+    "connect_async",
+)
 
 ENDPOINT = "tcp/127.0.0.1:7448"
 SEND_PERIOD_S = 0.05
@@ -40,8 +63,6 @@ SEND_PERIOD_S = 0.05
 
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
-QUEUED = 1000
-"""Messages held for a slow reader; the oldest are dropped beyond that."""
 
 
 class Client:
@@ -79,7 +100,7 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
         payload = msgspec.json.encode(fields) if fields else None
-        replies = self._ask(f"srv/{service}", payload)
+        replies = self._ask(service_key(service), payload)
         return Decoder(schema.ServiceReply).decode(*replies[0])
 
     def get(self, name: str) -> Any:
@@ -95,25 +116,12 @@ class Client:
     def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
         """The typed messages of a published key as they come; ends after `timeout` s of silence."""
         decoder = _decoder(name)
-        for sample in self.samples(name, timeout):
-            if str(sample.key_expr) != self.key(name):
-                continue  # a stranger's put on a wildcard
+        for sample in self.subscribe(name).until_silence(timeout):
             yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """The raw samples of any key below the robot's id."""
-        subscriber = self.subscribe(name)
-        quiet_since = time.monotonic()
-        try:
-            while timeout is None or time.monotonic() - quiet_since < timeout:
-                sample = subscriber.try_recv()
-                if sample is None:
-                    time.sleep(0.001)
-                    continue
-                quiet_since = time.monotonic()
-                yield sample
-        finally:
-            subscriber.undeclare()
+        """The raw samples of any key below the robot's id, whatever key they were put on."""
+        yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         """Call back for each sample of a key, on a thread of Zenoh's; `undeclare` it to end."""
@@ -122,26 +130,16 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def subscribe(self, name: str) -> Any:
-        """A queue of the raw samples of a key: `try_recv` gives the next or None; `undeclare` it.
+    def subscribe(self, name: str) -> Subscription:
+        """The raw samples of a key, for a loop of your own, which must not wait here."""
+        return Subscription(self._queue(name), self.key(name))
 
-        For a loop of your own, which must not wait here.
-        """
+    def _queue(self, name: str) -> Any:
+        topic = by_key(name)
         try:
-            return self._declare(name)
+            return queue_on(self.session, self.key(name), topic is not None and topic.latched)
         except zenoh.ZError:
             raise _no_key(name) from None
-
-    def _declare(self, name: str) -> Any:
-        topic = by_key(name)
-        # A ring: a full FIFO would hold up everything else this session receives.
-        queue: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(QUEUED)
-        if topic is not None and topic.latched:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            return zenoh.ext.declare_advanced_subscriber(
-                self.session, self.key(name), queue, history=history
-            )
-        return self.session.declare_subscriber(self.key(name), queue)
 
     def _put(self, linear: float, angular: float) -> None:
         # The daemon takes 1000 commands a second on a key: a zero on the heels of another command
@@ -171,10 +169,9 @@ class Client:
             if reply.ok is not None:
                 found.append((str(reply.ok.encoding), reply.ok.payload.to_bytes()))
             elif reply.err is not None:
-                raise ExitError(Exit.FAILURE, f"{name}: {reply.err.payload.to_string()}")
+                raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
-            raise ExitError(
-                Exit.UNREACHABLE,
+            raise NoAnswerError(
                 f"no answer on {self.key(name)}; is the daemon running with robot.id "
                 f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
             )
@@ -222,8 +219,6 @@ class AsyncClient:
                 if sample is None:
                     await asyncio.sleep(0.001)
                     continue
-                if str(sample.key_expr) != self._client.key(name):
-                    continue
                 yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
         finally:
             subscriber.undeclare()
@@ -249,7 +244,7 @@ async def connect_async(
     endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
 ) -> AsyncIterator[AsyncClient]:
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
-    session = await in_thread(lambda: client_session(endpoint, tls), 10.0)
+    session = await in_thread(lambda: client_session(endpoint, tls), 10.0, late=_close)
     try:
         yield AsyncClient(Client(session, robot_id, source))
     finally:
@@ -259,7 +254,7 @@ async def connect_async(
 def _drive(client: Client, linear: float, angular: float, seconds: float) -> Iterator[float]:
     """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
     if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
-        raise ValueError("linear, angular and seconds must be finite numbers")
+        raise UsageError("linear, angular and seconds must be finite numbers")
     # A zero each time: the robot may have been stopped and cleared since the last drive.
     client.send(0.0, 0.0)
     yield SEND_PERIOD_S
@@ -280,8 +275,8 @@ def _close(session: zenoh.Session) -> None:
         pass  # the other side is stuck; we are leaving anyway
 
 
-def _no_key(name: str) -> ExitError:
-    return ExitError(Exit.USAGE, f"{name!r} is not a key; `acsard topics` lists them")
+def _no_key(name: str) -> UsageError:
+    return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
 
 def _decoder(name: str) -> Decoder[Any]:

@@ -12,12 +12,15 @@ from __future__ import annotations
 from acsard.config.settings import Source
 from acsard.values import Outputs
 
-_ZERO = (0, 0, 0, 0)
+Wheels = tuple[int, int, int, int]
+"""The motors a to d in hundredths of rad/s."""
+
+_ZERO: Wheels = (0, 0, 0, 0)
 _HEX = b"0123456789ABCDEF"
 
 
 class Guard:
-    """Passes a line on or replaces it with `stop`; `trip` says why it did."""
+    """Passes a line on or replaces it with `stop`. Remembers nothing: the last line is told it."""
 
     def __init__(
         self,
@@ -31,33 +34,21 @@ class Guard:
         self._require_check = require_check
         self._most = int(wheel_speed * 100 + 1)
         self._timeouts = {source.name: source.timeout * 1e9 for source in sources}
-        self._sent = _ZERO
-        self._passed = _ZERO
-        self.trip = ""
-        """Why the line just checked was replaced; "" when it passed."""
 
-    def check(self, outputs: Outputs) -> bytes | None:
-        """The line that may really go out for these outputs."""
-        self.trip = ""
+    def check(self, outputs: Outputs, last: bytes) -> tuple[bytes | None, str]:
+        """The line that may really go out, and why it is not the one these outputs have, or "".
+
+        `last` is the line that went out last, which an MCU with power is obeying.
+        """
         line = outputs.line
         if line is None:
-            return None
-        wheels = self._read(line)
-        self.trip = self._objection(wheels, line, outputs)
-        if self.trip or wheels is None:
-            self._passed = _ZERO
-            return self._stop
-        self._passed = wheels
-        return line
+            return None, ""
+        trip = self._objection(line, outputs, _wheels(last) or _ZERO)
+        return (self._stop, trip) if trip else (line, "")
 
-    def note_sent(self) -> None:
-        """The line passed last has gone out: the next one is compared with it."""
-        self._sent = self._passed
-
-    def _objection(
-        self, wheels: tuple[int, int, int, int] | None, line: bytes, outputs: Outputs
-    ) -> str:
-        if wheels is None:
+    def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
+        wheels = _wheels(line)
+        if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "it is not a whole line of four wheels"
         if wheels == _ZERO:
             return ""
@@ -68,8 +59,7 @@ class Guard:
         if self._require_check and b"#" not in line:
             return "it moves a wheel without the check that mcu.link_check requires"
         grows = any(
-            abs(new) > abs(old) or new * old < 0
-            for new, old in zip(wheels, self._sent, strict=True)
+            abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
             return "a wheel grows without a fresh command in mode driving"
@@ -81,20 +71,6 @@ class Guard:
             return False
         # A command may arrive on Zenoh's thread just after this step's clock was read.
         return abs(outputs.now.mono_ns - arrived) <= timeout
-
-    def _read(self, line: bytes) -> tuple[int, int, int, int] | None:
-        """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
-        if line[31:] != self._stop[31:] and not self._sealed(line):
-            return None
-        found = []
-        for motor, start in zip(b"abcd", (0, 8, 16, 24), strict=True):
-            token = line[start : start + 7]
-            digits = token[2:4] + token[5:7]
-            right = token[0] == motor and token[1] in b"pn" and token[4] == 0x2E
-            if not right or not digits.isdigit() or (start and line[start - 1] != 0x2C):
-                return None
-            found.append(int(digits) if token[1] == 0x70 else -int(digits))
-        return found[0], found[1], found[2], found[3]
 
     def _sealed(self, line: bytes) -> bool:
         """From column 31 on: the dialect's comma, `#`, two digits, perhaps `S` or `H`, a right
@@ -108,6 +84,19 @@ class Guard:
             and all(digit in _HEX for digit in digits)
             and check == b"*%04X\r\n" % _crc(body)
         )
+
+
+def _wheels(line: bytes) -> Wheels | None:
+    """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
+    found = []
+    for motor, start in zip(b"abcd", (0, 8, 16, 24), strict=True):
+        token = line[start : start + 7]
+        digits = token[2:4] + token[5:7]
+        right = len(token) == 7 and token[0] == motor and token[1] in b"pn" and token[4] == 0x2E
+        if not right or not digits.isdigit() or (start and line[start - 1] != 0x2C):
+            return None
+        found.append(int(digits) if token[1] == 0x70 else -int(digits))
+    return found[0], found[1], found[2], found[3]
 
 
 def _crc(data: bytes) -> int:

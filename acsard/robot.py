@@ -10,26 +10,27 @@ from __future__ import annotations
 from collections import Counter
 
 from acsard.config.settings import Config
-from acsard.drive.arbiter import REASONS, Arbiter, Choice
+from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger
 from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
+from acsard.drive.words import REFUSED, chosen
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
     NS_PER_S,
     STILL,
     Answer,
+    Estimate,
     Event,
     Inputs,
     Outputs,
     Pose,
     Refusal,
     Request,
-    Sample,
     Snapshot,
 )
 
@@ -59,20 +60,22 @@ class Robot:
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate)
-        self._choice = Choice("", None, "no commands: no source has sent one yet")
+        self._choice = Choice()
         self._speeds = STILL
-        self._told: tuple[int | None, Mode] = (None, self._life.mode)
+        self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
         """Whose command, by its arrival, and the mode: what the last line was made of."""
-        self._limited_ns = 0
-        self._before = (self._limiter.state, 0)
-        """The limiter and its time before the last line: restored when that line did not go."""
+        self._made_ns = 0
+        """When a line was made last."""
+        self._made = self._said = (self._limiter.state, 0)
+        """The limiter and its time at the last line made, and at the last one that went: one that
+        does not go never was."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (superseded lines, missed periods)."""
         self._refused = ""
         self._sanity = Sanity(config.feedback)
-        self._told_ns: dict[str, int] = {}
+        self._logged_ns: dict[str, int] = {}
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
@@ -95,7 +98,8 @@ class Robot:
     def step(self, inputs: Inputs) -> Outputs:
         """Take all that happened since the last step; decide what happens now."""
         events: list[Event] = []
-        samples = self._fold(inputs, events)
+        self._settle(inputs)
+        estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
         self._hear(inputs)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
@@ -108,12 +112,12 @@ class Robot:
         changed, self._status = status != self._status, status
         return Outputs(
             now=inputs.now,
-            tick=due,
+            due=due,
             line=line,
             speeds=self._speeds,
             applied=applied,
             linked=self.session.link == "up",
-            samples=samples,
+            estimates=estimates,
             mode=status[0],
             reason=status[1],
             link=status[2],
@@ -127,11 +131,22 @@ class Robot:
 
     def _news(self) -> bool:
         """The next line has something to say that the last did not: worth going at once."""
-        return (self._choice.arrived_ns, self._life.mode) != self._told
+        return (self._choice.arrived_ns, self._life.mode) != self._made_of
+
+    # the fate of the line before
+
+    def _settle(self, inputs: Inputs) -> None:
+        """What the last line said counts if it went; a line that did not go never was."""
+        if inputs.guard_trip:
+            self._limiter.cut()  # STOP was offered in its place
+            self._made = (self._limiter.state, self._made_ns)
+        if not inputs.superseded:
+            self._said = self._made
+        self._made = self._said
 
     # fold
 
-    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Sample, ...]:
+    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
@@ -149,7 +164,7 @@ class Robot:
             # Nobody can be ramped at the other end, and what was wished then is old now.
             self._limiter.cut()
             self._speeds = STILL
-            self._before = (self._limiter.state, inputs.now.mono_ns)
+            self._made = self._said = (self._limiter.state, self._made_ns)
             self._life.link(up=False)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral(inputs.now.mono_ns)
@@ -158,10 +173,10 @@ class Robot:
             self._life.link(up=True)
         now_ns = inputs.now.mono_ns
         return tuple(
-            [sample for line in feedback if (sample := self._believe(line, now_ns, events))]
+            [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
 
-    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Sample | None:
+    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Estimate | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
         if why:
@@ -179,7 +194,6 @@ class Robot:
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
-            self._limiter.cut()  # STOP went out in the line's place
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now.mono_ns, events)
         if inputs.leaving and self._life.mode is not Mode.LEAVING:
@@ -193,10 +207,10 @@ class Robot:
             message = self._obey(request, now_ns)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
-        last_ns = self._told_ns.get(request.verb)
+        last_ns = self._logged_ns.get(request.verb)
         if self._life.mode is not before or last_ns is None or now_ns - last_ns > NS_PER_S:
             # What is repeated as fast as it can be sent is still a line of log a second.
-            self._told_ns[request.verb] = now_ns
+            self._logged_ns[request.verb] = now_ns
             events.append(Event(request.verb, message))
         return Answer(request.id, True, message)
 
@@ -227,7 +241,7 @@ class Robot:
 
     def _fault(self, why: str, now_ns: int, events: list[Event]) -> None:
         if self._life.fault(why, now_ns):
-            self._arbiter.require_neutral(self._limited_ns)
+            self._arbiter.require_neutral(self._made_ns)
             events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
     # commands
@@ -236,11 +250,11 @@ class Robot:
         for refusal in inputs.refusals:
             self._refuse(refusal)
             if refusal.source:
-                self._arbiter.notice(refusal.source, refusal.voice, refusal.arrived_ns)
+                self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
             reason = self._arbiter.accept(command)
             if reason:
-                self._refuse(Refusal(reason, f"source {command.source}: {REASONS[reason]}"))
+                self._refuse(Refusal(reason, f"source {command.source}: {REFUSED[reason]}"))
             else:
                 self.counters["commands"] += 1
 
@@ -252,18 +266,16 @@ class Robot:
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
-        self._told = (self._choice.arrived_ns, self._life.mode)
-        if inputs.superseded:
-            limiter.state, self._limited_ns = self._before
-        self._before = (limiter.state, self._limited_ns)
-        since = (now_ns - self._limited_ns) / NS_PER_S
-        self._limited_ns = now_ns
+        self._made_of = (self._choice.arrived_ns, self._life.mode)
+        limiter.state, said_ns = self._said
+        since = (now_ns - said_ns) / NS_PER_S
         if self.session.link != "up" or since > UNHEARD_S:
             limiter.cut()
         elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))
         else:
             limiter.coast(since, stop=self._life.mode in HALTED)
+        self._made, self._made_ns = (limiter.state, now_ns), now_ns
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)
         return self.session.line(now_ns, self._speeds)
 
@@ -272,9 +284,9 @@ class Robot:
     def _reason(self) -> str:
         match self._life.mode:
             case Mode.DRIVING:
-                return f"driving: {self._choice.reason}{self.session.note}"
+                return f"driving: {chosen(self._choice)}{self.session.note}"
             case Mode.READY:
-                return f"{self._choice.reason}{self.session.note}"
+                return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT:

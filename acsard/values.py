@@ -81,19 +81,22 @@ class Received(Struct, frozen=True):
 
 
 class Command(Struct, frozen=True):
-    """A velocity wish of one commander.
+    """A velocity wish of one commander. Three words tell whose it is, here and everywhere:
 
-    `arrived_ns` is the monotonic time of arrival and alone decides the age. `stamp_ns` is the
-    sender's own wall clock, if it gave one; `sender` tells whose clock that is. `voice` is who
-    sent it, as far as the envelope says.
+        source  what it commands as, one of `commands.sources`: the `app` of `cmd/app`
+        sender  who sent it, as far as the envelope says: two programs on one source are two
+        clock   what stamped it: a router's may stamp for many, a header's is the sender's own
+
+    `arrived_ns` is the monotonic time of arrival and alone decides the age; `stamp_ns` is when it
+    was sent by that clock, which nobody has set by ours.
     """
 
     source: str
     twist: Twist
     arrived_ns: int
     stamp_ns: int | None = None
+    clock: str = ""
     sender: str = ""
-    voice: str = ""
     cancelled: bool = False
     """The twist is zero only because what was asked for cancels out: nobody let go."""
 
@@ -125,7 +128,7 @@ class Refusal(Struct, frozen=True):
     reason: str
     text: str
     source: str = ""
-    voice: str = ""
+    sender: str = ""
     arrived_ns: int = 0
     """Whose command it would have been, as far as that is known."""
 
@@ -138,7 +141,7 @@ class Event(Struct, frozen=True):
     level: Literal["info", "warning", "error"] = "info"
 
 
-class Sample(Struct, frozen=True):
+class Estimate(Struct, frozen=True):
     """One feedback line folded into odometry; all its parts share the stamp `at`."""
 
     at: Instant
@@ -152,20 +155,32 @@ class Sample(Struct, frozen=True):
     """When the line it answers was made, monotonic; None where a reply does not tell which."""
 
 
+class Wait(Struct, frozen=True):
+    """What a source waits for, and what `drive/words.py` needs to say it."""
+
+    what: Literal["nothing", "command", "neutral", "higher", "equal", "senders"]
+    source: str = ""
+    """Who must be neutral; of higher or equal priority, who has the robot."""
+    timeout: float = 0.0
+    """s of silence that are neutral."""
+    senders: int = 0
+    """How many wait while another sender of the same source is followed."""
+
+
 class SourceStatus(Struct, frozen=True):
-    """What one commander is doing: `age_s` since its last accepted command, None if never heard."""
+    """What one source is doing: `age_s` since its last accepted command, None if never heard."""
 
     name: str
     priority: int
     age_s: float | None
-    waits_for: str
+    waits_for: Wait
 
 
 class Inputs(Struct, frozen=True):
     """Everything one step may know.
 
-    `tick` says that a line goes out with this step, `at_once` that one may if there is something
-    new to say; without either only feedback is folded.
+    `tick` says that the clock's line goes out with this step, `at_once` that one may if there is
+    something new to say; without either only feedback is folded.
     `opened` counts how often the port has been opened: a new number is a new session with the MCU.
     """
 
@@ -183,7 +198,7 @@ class Inputs(Struct, frozen=True):
     guard_trip: str = ""
     """Why the guard replaced the previous line with STOP; latches a fault."""
     superseded: bool = False
-    """The line of the previous tick did not go out: what it said never happened."""
+    """The line of the step before did not go out: what it said never happened."""
     at_once: bool = False
     leaving: bool = False
     """The daemon is going down: ramp to zero and stay there."""
@@ -193,14 +208,14 @@ class Outputs(Struct, frozen=True):
     """Everything one step decided."""
 
     now: Instant
-    tick: bool
-    """A line was due, by the clock or at once."""
+    due: bool
+    """A line was, by the clock or at once."""
     line: bytes | None
     """The line for the MCU, or None when none is due."""
     speeds: WheelSpeeds
     applied: Twist
     linked: bool
-    samples: tuple[Sample, ...]
+    estimates: tuple[Estimate, ...]
     mode: str
     reason: str
     """Why it moves or does not, in words."""

@@ -1,6 +1,6 @@
 """A daemon under measurement: started as a user starts it, with both its ends in our hands.
 
-    bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  wire.py (simulated MCU)
+    bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
 Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
 taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import random
-import socket
 import subprocess
 import sys
 import time
@@ -27,14 +26,15 @@ import msgspec
 import zenoh
 
 from acsard.bench.child import END_S, daemon_ended, end_with_us, ended, leave, processor_ns
+from acsard.bench.far_end import Part
 from acsard.bench.record import Record, Sample, Seen, Sent
-from acsard.bench.wire import Part
 from acsard.bus.outlets import direct
 from acsard.bus.session import client_session
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.host import clock
+from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.host.exits import Exit, ExitError
 from acsard.mcu.frames import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
@@ -61,13 +61,6 @@ SPACING_S = (0.02, 0.06)
 """Between two commands, evenly spread: they fall anywhere within a period."""
 
 
-def free_endpoint() -> str:
-    """A loopback address nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 class Rig:
     """Enter it to have the program up and linked; `end` gives what was recorded."""
 
@@ -87,7 +80,7 @@ class Rig:
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)
         self._stack = ExitStack()
-        self._wire: subprocess.Popen[bytes] | None = None
+        self._far_end: subprocess.Popen[bytes] | None = None
         self._session: zenoh.Session | None = None
         self._arrived: list[tuple[Instant, bytes]] = []
         self._sent: list[Sent] = []
@@ -97,7 +90,7 @@ class Rig:
         with ExitStack() as stack:
             where = Path(stack.enter_context(TemporaryDirectory(prefix="acsard-bench-")))
             self._log = where / "log"
-            port = self._port or self._start_wire(stack, where)
+            port = self._port or self._start_far_end(stack, where)
             self._start_program(stack, port)
             session = self._session = self._wait(self._connect, f"answer at {self._endpoint}")
             stack.callback(session.close)
@@ -123,20 +116,20 @@ class Rig:
 
     # starting
 
-    def _start_wire(self, stack: ExitStack, where: Path) -> str:
+    def _start_far_end(self, stack: ExitStack, where: Path) -> str:
         part = where / "part.json"
         part.write_bytes(msgspec.json.encode(self._part))
-        wire = self._wire = subprocess.Popen(
-            [sys.executable, "-m", "acsard.bench.wire", str(part)],
+        far_end = self._far_end = subprocess.Popen(
+            [sys.executable, "-m", "acsard.bench.far_end", str(part)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        stack.callback(leave, wire)
-        assert wire.stdout is not None
-        device = wire.stdout.readline().decode().strip()
+        stack.callback(leave, far_end)
+        assert far_end.stdout is not None
+        device = far_end.stdout.readline().decode().strip()
         if not device:
-            raise ended(FAR_END, wire.wait())
+            raise ended(FAR_END, far_end.wait())
         return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
@@ -158,7 +151,7 @@ class Rig:
     def _connect(self) -> zenoh.Session | None:
         try:
             return client_session(self._endpoint)
-        except ExitError:
+        except UnreachableError:
             return None
 
     def _wait(self, look: Callable[[], T | None], what: str) -> T:
@@ -176,13 +169,13 @@ class Rig:
         """What the daemon waits for, if it can be asked."""
         try:
             return f": {self.state().reason}"
-        except ExitError:
+        except NoAnswerError:
             return ""
 
     def _alive(self) -> None:
-        """Raises the program's own end as ours, and that of the wire."""
-        if self._wire is not None and self._wire.poll() is not None:
-            raise ended(FAR_END, self._wire.returncode)
+        """Raises the program's own end as ours, and that of the far end."""
+        if self._far_end is not None and self._far_end.poll() is not None:
+            raise ended(FAR_END, self._far_end.returncode)
         code = self.process.poll()
         if code is not None:
             raise daemon_ended(code, self._log)
@@ -244,7 +237,7 @@ class Rig:
             if reply.ok is not None:
                 sample: Any = reply.ok
                 return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
-        raise ExitError(Exit.UNREACHABLE, f"no answer on {key}")
+        raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
         """End the program."""
@@ -256,7 +249,7 @@ class Rig:
         time.sleep(0.1)  # what was under way
         self._alive()
         self.leave()
-        seen = None if self._wire is None else _told(self._wire)
+        seen = None if self._far_end is None else _told(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -269,12 +262,12 @@ class Rig:
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
 
 
-def _told(wire: subprocess.Popen[bytes]) -> Seen:
+def _told(far_end: subprocess.Popen[bytes]) -> Seen:
     """End the far end; all it saw."""
-    assert wire.stdin is not None
-    assert wire.stdout is not None
-    wire.stdin.close()
-    told = wire.stdout.read()
-    if wire.wait(END_S):
-        raise ended(FAR_END, wire.returncode)
+    assert far_end.stdin is not None
+    assert far_end.stdout is not None
+    far_end.stdin.close()
+    told = far_end.stdout.read()
+    if far_end.wait(END_S):
+        raise ended(FAR_END, far_end.returncode)
     return msgspec.msgpack.decode(told, type=Seen)

@@ -25,7 +25,7 @@ OWN = {
     "command_age": "command arrived -> each line that follows it",
     "command_to_wire": "command arrived in its source's turn -> first line after it",
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
-    "mcu_round_trip": "line -> end of its answer, matched by time unless checked",
+    "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
 """What the daemon measures of itself, within its own process, as `figures.Name` defines it."""
 

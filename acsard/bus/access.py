@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
-from acsard.messages.topics import PUBLISHED, TOPICS, full_key
-from acsard.ros.trees import PARAMETERS, Endpoint, endpoints
+from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
+from acsard.ros.trees import Endpoint, endpoints
 from acsard.values import ROOT, Verb
 
 Role = Literal["viewer", "operator", "maintainer"]
@@ -103,18 +103,18 @@ class _Keys:
         self.heard += _of(ros, "in")
         """What the daemon subscribes to, whoever sends."""
         sources = [source.name for source in config.commands.sources]
-        self.commands = [full_key(robot, f"{k}/{s}") for k in ("cmd", "wheel_cmd") for s in sources]
+        self.commands = [full_key(robot, key) for key in source_keys(sources)]
         self.commands += [
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
         """What listed sources send on."""
-        asked = [t for t in TOPICS if t.direction == "query" and not t.key.startswith("srv/")]
-        self.questions = [full_key(robot, t.pattern) for t in asked if t.key != "config"]
-        self.parameters = [e.key for e in ros if e.native.startswith(PARAMETERS)]
+        asked = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "query"]
+        self.questions = [key for key in asked if key != self.config]
+        self.parameters = _of(ros, "query")
 
     def of(self, verb: Verb) -> list[str]:
         """The keys of a service."""
-        native = f"srv/{verb}"
+        native = service_key(verb)
         return [full_key(self._robot, native)] + [e.key for e in self._ros if e.native == native]
 
 
@@ -199,5 +199,5 @@ def _rule(
     }
 
 
-def _of(ros: Sequence[Endpoint], direction: str) -> list[str]:
+def _of(ros: Sequence[Endpoint], direction: Direction) -> list[str]:
     return [e.key for e in ros if e.direction == direction]

@@ -6,7 +6,6 @@ Whatever may block (open, declare, reply, close) runs in a thread.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 from types import TracebackType
 
@@ -18,15 +17,16 @@ from acsard.bus.replies import Replies
 from acsard.bus.session import daemon_session
 from acsard.config.settings import BusConfig, RosConfig
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
-from acsard.incoming.bus import BusInput
+from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
 from acsard.messages.topics import PUBLISHED, TOPICS, full_key
 from acsard.ros.tokens import gid
 from acsard.ros.trees import Endpoint, command_keys, endpoints, node_tokens
+from acsard.values import NS_PER_S
 
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
@@ -46,15 +46,16 @@ class ZenohBus:
         robot_id: str,
         sources: tuple[str, ...],
         access: dict[str, object],
-        wake: Callable[[], None],
+        waker: Waker,
     ) -> None:
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
+        self._alive = full_key(robot_id, "alive")
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
-        self._inbox = Inbox(prefix, self._replies, sources, wake)
+        self._inbox = Inbox(prefix, self._replies, sources, waker)
         self._outlets = Outlets()
-        self._session: zenoh.Session | None = None
+        self._session: zenoh.Session
         self._kept: list[object] = []
         """Declared entities: Zenoh undeclares what is no longer referred to."""
 
@@ -74,54 +75,40 @@ class ZenohBus:
         self._outlets.publish(key, message)
 
     def reply(self, reply: Reply) -> None:
-        """Answer a query."""
+        """Answer a query by its ticket."""
         self._replies.send(reply)
 
-    def done(self, number: int) -> None:
-        """No more replies to this query."""
-        self._replies.done(number)
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
-        self._inbox.alert(on)
+    def retire(self, ticket: int) -> None:
+        """No more replies by this ticket."""
+        self._replies.retire(ticket)
 
     # opening
 
     async def __aenter__(self) -> ZenohBus:
         # A client has nothing to do without its router, and waits for it.
-        await in_thread(self._open, OPEN_TIMEOUT_S if self._settings.mode == "peer" else None)
-        self._replies.start()
+        patience_s = OPEN_TIMEOUT_S if self._settings.mode == "peer" else None
+        self._session = await in_thread(self._open, patience_s)
         return self
 
-    def _open(self) -> None:
+    def _open(self) -> zenoh.Session:
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
-        self._session = self._replies.session = session
-        self._inbox.own_id = session.new_timestamp().get_id()
-        if settings.connect and self._twin(session):
+        if settings.connect and _seen(session, self._alive):
             session.close()
-            raise ExitError(
-                Exit.IN_USE,
+            raise InUseError(
                 f"another daemon on this bus already is {self._id}; "
                 "give this robot its own robot.id",
             )
+        # Before the first key is declared, on which something may come in at once.
+        self._inbox.own_id = session.new_timestamp().get_id()
+        self._replies.start(session)
         self._declare_native(session)
         zid = str(session.zid())
         for endpoint in endpoints(self._ros, zid, self._silent):
             self._declare_ros(session, endpoint)
-        for token in (full_key(self._id, "alive"), *node_tokens(self._ros, zid)):
+        for token in (self._alive, *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
-
-    def _twin(self, session: zenoh.Session) -> bool:
-        token = full_key(self._id, "alive")
-        others = session.liveliness().declare_subscriber(token, history=True)
-        deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * 1e9)
-        found = None
-        while found is None and clock.now().mono_ns < deadline_ns:
-            time.sleep(0.01)
-            found = others.try_recv()
-        others.undeclare()
-        return found is not None
+        return session
 
     def _declare_native(self, session: zenoh.Session) -> None:
         inbox = self._inbox
@@ -138,19 +125,20 @@ class ZenohBus:
 
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key
-        if endpoint.direction == "in":
-            on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
-            self._kept.append(session.declare_subscriber(key, on_sample))
-        elif endpoint.direction == "query":
-            on_query = direct(partial(self._inbox.on_ros_query, endpoint))
-            # rmw_zenoh's clients ask complete queryables only.
-            self._kept.append(session.declare_queryable(key, on_query, complete=True))
-        else:
-            identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
-            encoding = encoding_name("cdr")
-            self._outlets.declare(
-                session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
-            )
+        match endpoint.direction:
+            case "in":
+                on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
+                self._kept.append(session.declare_subscriber(key, on_sample))
+            case "query" | "service":
+                on_query = direct(partial(self._inbox.on_ros_query, endpoint))
+                # rmw_zenoh's clients ask complete queryables only.
+                self._kept.append(session.declare_queryable(key, on_query, complete=True))
+            case "out":
+                identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
+                encoding = encoding_name("cdr")
+                self._outlets.declare(
+                    session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
+                )
         if endpoint.token:
             self._kept.append(session.liveliness().declare_token(endpoint.token))
 
@@ -163,9 +151,19 @@ class ZenohBus:
         trace: TracebackType | None,
     ) -> None:
         self._replies.stop()
-        session, self._session = self._session, None
-        if session is not None:
-            try:
-                await in_thread(session.close, CLOSE_TIMEOUT_S)
-            except TimeoutError:
-                pass  # a stuck remote; the process ends without its good-bye
+        try:
+            await in_thread(self._session.close, CLOSE_TIMEOUT_S)
+        except TimeoutError:
+            pass  # a stuck remote; the process ends without its good-bye
+
+
+def _seen(session: zenoh.Session, token: str) -> bool:
+    """Is there, or comes within our patience, somebody with this liveliness token?"""
+    others = session.liveliness().declare_subscriber(token, history=True)
+    deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * NS_PER_S)
+    found = None
+    while found is None and clock.now().mono_ns < deadline_ns:
+        time.sleep(0.01)
+        found = others.try_recv()
+    others.undeclare()
+    return found is not None

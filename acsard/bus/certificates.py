@@ -9,33 +9,31 @@ import ssl
 from pathlib import Path
 
 from acsard.bus.session import CA, CERTIFICATE, KEY
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
 
 
 def check(directory: str) -> None:
-    """Raises `ExitError` with the file and the mend when they cannot be used."""
+    """Raises `CertificateError` or `NotPermittedError`, with the file and the mend."""
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
         try:
             file.read_bytes()
         except PermissionError:
-            raise ExitError(
-                Exit.NO_PERMISSION,
+            raise NotPermittedError(
                 f"no permission to read {file}; a service gets its copies by the drop-in "
                 "deploy/systemd/lan.conf",
             ) from None
         except OSError as error:
-            raise ExitError(
-                Exit.BAD_CONFIG, f"cannot read {file}: {error.strerror}; `acsard lan init` makes it"
+            raise CertificateError(
+                f"cannot read {file}: {error.strerror}; `acsard lan init` makes it"
             ) from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(f"{directory}/{CA}")
         context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}")
     except (ssl.SSLError, ValueError) as error:
-        raise ExitError(
-            Exit.BAD_CONFIG,
+        raise CertificateError(
             f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
             "another certificate; `acsard lan init` or `lan add` makes them",
         ) from None

@@ -7,18 +7,18 @@ from it when it steps.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import TypeVar
 
 import zenoh
 
 from acsard.bus.replies import Replies
 from acsard.host import clock
-from acsard.incoming.bus import BusInput
+from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
-from acsard.ros.trees import PARAMETERS, Endpoint
+from acsard.messages.topics import VERBS, service_key, source_keys
+from acsard.ros.trees import Endpoint
 
 ARRIVALS = 16
 """Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
@@ -38,6 +38,7 @@ ATTACHMENT_BYTES = 64
 """An rmw_zenoh attachment has 33; a longer one is cut, and refused by its length."""
 
 CDR = encoding_name("cdr")
+STOP = service_key("stop")
 
 T = TypeVar("T")
 
@@ -46,33 +47,21 @@ class Inbox:
     """Samples and queries of one robot, until they are taken."""
 
     def __init__(
-        self, prefix: str, replies: Replies, sources: tuple[str, ...], wake: Callable[[], None]
+        self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
         self._prefix, self._replies = prefix, replies
-        listed = [f"{kind}/{name}" for kind in ("cmd", "wheel_cmd") for name in sources]
         self._arrivals: dict[str, deque[Arrival]] = {
-            key: deque(maxlen=ARRIVALS) for key in (*listed, OTHERS)
+            key: deque(maxlen=ARRIVALS) for key in (*source_keys(sources), OTHERS)
         }
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
         self._slow: deque[Query] = deque()
-        """Questions that take as long to answer as all others of a step."""
+        """Those of ROS, for parameters: one takes as long to answer as all others of a step."""
         self._overrun = 0
-        self._wake, self._alert, self._stop_told = wake, False, False
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop for the next command, once; or leave it to the next period.
-
-        A stop wakes it all the same, but not every one of a flood of them.
-        """
-        self._alert = on
-        if on:
-            self._stop_told = False
-            if any(self._arrivals.values()):
-                self._rouse()
+        self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
@@ -124,24 +113,16 @@ class Inbox:
         if len(held) == ARRIVALS:
             self._overrun += 1
         held.append(arrival)
-        self._rouse()
+        self._waker.command()
 
     def _stop(self, arrival: Arrival) -> None:
         self._stops.append(arrival)
-        if not self._stop_told:
-            self._stop_told = True
-            self._wake()
-
-    def _rouse(self) -> None:
-        # Once until the loop asks for it again: a flood wakes nobody more often than that.
-        if self._alert:
-            self._alert = False
-            self._wake()
+        self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
         """A query that reached a row of the native table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
-        if topic.startswith("srv/") and asked != topic:
+        if topic in VERBS and asked != topic:
             return  # letting go of it ends it
         self._asked(query, topic, asked, "", "native")
 
@@ -151,30 +132,30 @@ class Inbox:
             native = endpoint.native
             self._asked(query, native, native, endpoint.key, endpoint.transport)
 
-    def _line_for(self, topic: str) -> deque[Query]:
-        if topic.startswith("srv/"):
+    def _line_for(self, topic: str, via: Via) -> deque[Query]:
+        if topic in VERBS:
             return self._services
-        return self._slow if topic.startswith(PARAMETERS) else self._questions
+        return self._questions if via == "native" else self._slow
 
     def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived_ns = clock.now().mono_ns
-        if topic == "srv/stop":
+        if topic == STOP:
             # The stop itself never waits in a line with other questions, nor is it turned away.
             self._stop(Arrival("stop", True, b"", "", arrived_ns, None, ""))
-        number = self._replies.open(query, key)
-        if number is None:
+        ticket = self._replies.issue(query, key)
+        if ticket is None:
             return
-        waiting = self._line_for(topic)
+        waiting = self._line_for(topic, via)
         if len(waiting) >= QUERIES:
             if via == "native":  # a ROS client hears no errors
                 busy = b"busy: too many queries at once; ask again"
-                self._replies.send(Reply(number, topic, busy, "text/plain", ok=False))
-            self._replies.done(number)
+                self._replies.send(Reply(ticket, topic, busy, "text/plain", ok=False))
+            self._replies.retire(ticket)
             return
         encoding = query.encoding
         waiting.append(
             Query(
-                number,
+                ticket,
                 topic,
                 asked,
                 query.parameters.get("fmt", "") or "",

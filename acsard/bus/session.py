@@ -12,8 +12,8 @@ import re
 import zenoh
 
 from acsard.config.settings import BusConfig
-from acsard.host.exits import Exit, ExitError
-from acsard.messages.topics import full_key
+from acsard.host.errors import InUseError, UnreachableError, UsageError
+from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
@@ -37,7 +37,7 @@ def daemon_session(
 ) -> zenoh.Session:
     """The daemon's session: a peer that listens where it is told, finds nobody by itself.
 
-    `limited` are the ROS keys commands come in on, `access` is who may do what. Raises `ExitError`
+    `limited` are the ROS keys commands come in on, `access` is who may do what. Raises `InUseError`
     when the address is taken. Blocks, as a client until its router is there; call it in a thread.
     """
     settings = _base(bus.mode) | {
@@ -67,24 +67,21 @@ def daemon_session(
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         where = ", ".join(bus.listen)
-        raise ExitError(
-            Exit.IN_USE,
+        raise InUseError(
             f"cannot listen on {where}: {_first_line(error)}; another daemon or router may have "
             "it: stop that, or give this one its own bus.listen",
         ) from error
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """A client of the daemon (or a router) at `endpoint`; raises `ExitError` when nobody answers.
+    """A client of the daemon (or a router) at `endpoint`; raises `UnreachableError`, `UsageError`.
 
     `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
 
     A client, because peers behind one hub do not reach each other.
     """
     if "/" not in endpoint:
-        raise ExitError(
-            Exit.USAGE, f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"'
-        )
+        raise UsageError(f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
         # What accepts and then says nothing is no daemon; a person waits for this.
@@ -97,8 +94,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        raise ExitError(
-            Exit.UNREACHABLE,
+        raise UnreachableError(
             f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
             f"is this its bus.listen, and has it room (at most {MAX_SESSIONS} connections)?",
         ) from error
@@ -138,8 +134,7 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    names = [*sources, "*"]
-    keys = [full_key(robot_id, f"{kind}/{n}") for kind in ("cmd", "wheel_cmd") for n in names]
+    keys = [full_key(robot_id, key) for key in source_keys([*sources, "*"])]
     keys += limited
     return {
         "id": "commands",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from msgspec import ValidationError
 
@@ -19,9 +19,14 @@ OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
 """Better with, but good without: left out where the wire has no room for the longer lines."""
 
 
-def changes(findings: Iterable[Finding], config: Config) -> Changes:
-    """The keys that should be other than configured."""
-    wanted: Changes = {}
+def answered(findings: Iterable[Finding]) -> bool:
+    """A board is at the port: its rate was found."""
+    return any(finding.name == "baud rate" and finding.keys for finding in findings)
+
+
+def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
+    """The keys that should be other than configured; the `port` too if a board answered there."""
+    wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys
     differing = {key: value for key, value in wanted.items() if _value(config, key) != value}

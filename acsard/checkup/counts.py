@@ -1,17 +1,16 @@
-"""The sample fields against the speeds: encoder counts per wheel turn, and how far a motor ran."""
+"""The sample fields against the speeds: encoder counts per wheel turn, and whether they agree."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
-from msgspec import Struct
-
-from acsard.checkup.bench import Bench
+from acsard.checkup import manual, motion
+from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.checkup.motion import Reply, difference
-from acsard.config.baud import FIELD
+from acsard.checkup.limits import GLANCE_S
+from acsard.checkup.motion import Reply
 
 LEAST_ANGLE = 2.0
 """rad; over less the speeds' own rounding spoils the figure."""
@@ -23,85 +22,56 @@ MOST_COUNTS = 100_000
 """What `mcu.encoder_counts` takes."""
 
 
-class Leg(Struct, frozen=True):
-    """From one sampled reply to the next: counts by encoder, and ms, by the MCU itself."""
-
-    counts: tuple[int, ...]
-    ms: int
-    speeds: tuple[float, ...]
-    """rad/s, of the second reply: what it measured over the leg."""
-
-
-def legs(replies: Sequence[Reply]) -> Iterator[Leg]:
-    """The legs between sampled replies; the clock and counts wrap at 65536."""
-    for before, after in pairwise(replies):
-        if before.reading is not None and after.reading is not None:
-            yield Leg(
-                difference(before.reading, after.reading),
-                (after.reading.mcu_ms - before.reading.mcu_ms) % FIELD,
-                after.motors,
-            )
-
-
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Counts per turn of these motors' encoders, by the speeds the MCU says; None: too little."""
     counts = angle = 0.0
-    for leg in legs(replies):
+    for before, after in pairwise(replies):
+        leg = motion.leg(before, after)
+        if leg is None or leg[1] > GLANCE_S:
+            continue
+        made, seconds = leg
         for motor in motors:
-            if abs(leg.speeds[motor]) < 1.0 or leg.ms > 200:
-                continue
-            forth = math.copysign(1.0, leg.speeds[motor])
-            counts += forth * leg.counts[motor]
-            angle += forth * leg.speeds[motor] * leg.ms / 1000
+            speed = after.motors[motor]
+            if abs(speed) >= 1.0:
+                counts += math.copysign(1.0, speed) * made[motor]
+                angle += abs(speed) * seconds
     return counts / angle * math.tau if angle >= LEAST_ANGLE else None
 
 
-def finding(bench: Bench, motors: Sequence[int]) -> Finding:
+def finding(board: Board, motors: Sequence[int]) -> Finding:
     """`mcu.encoder_counts`, from the identification or measured; `motors` have moved right."""
-    name = "encoder counts"
-    if not bench.sampled:
-        return Finding(name, "SKIPPED", "", "the firmware sends no counts")
-    measured = per_turn(bench.replies, motors)
-    named = bench.identity.get("counts", "")
-    stated = int(named) if named.isdigit() and len(named) < 9 else 0
+    if not board.sampled:
+        return manual.find("encoder counts: none")
+    measured, named = per_turn(board.replies, motors), board.named_counts
+    configured = board.mcu.encoder_counts
     if measured is None:
-        if not stated:
-            return Finding(name, "SKIPPED", "", "too little was turned to measure them")
-        return _stated(bench, stated, "by its identification; not measured")
+        if not named:
+            return manual.find("encoder counts: not turned")
+        return _stated(configured, named, "by its identification; not measured")
     if measured < 1:
-        text = "counts run against the speeds, or stand: the pose would run backward"
-        mend = "the firmware must count up when a motor turns in its p direction"
-        return Finding(name, "FAIL", f"{measured:.0f} per turn", text, mend, _off(bench))
-    if not stated:
-        text = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
-        configured = bench.mcu.encoder_counts
+        return manual.find("encoder counts: backward", _off(configured), measured=measured)
+    if not named:
+        how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
         near = abs(measured - configured) <= AGREES * configured
-        return _stated(bench, configured if near else round(measured), text)
-    if abs(measured - stated) <= AGREES * stated:
-        return _stated(bench, stated, f"by its identification; measured {measured:.0f}")
-    text = f"it names {stated} per turn, but by its speeds there are {measured:.0f}"
-    return Finding(
-        name, "FAIL", f"{measured:.0f}", text, "the firmware's counts per turn or speeds"
-    )
+        return _stated(configured, configured if near else round(measured), how)
+    if abs(measured - named) <= AGREES * named:
+        return _stated(configured, named, f"by its identification; measured {measured:.0f}")
+    return manual.find("encoder counts: misnamed", named=named, measured=measured)
 
 
-def _stated(bench: Bench, counts: int, text: str) -> Finding:
+def _stated(configured: int, counts: int, how: str) -> Finding:
     if counts > MOST_COUNTS:
-        text = f"more than the {MOST_COUNTS} the host takes: count fewer edges"
-        return Finding("encoder counts", "WARN", f"{counts} per turn", text, "", _off(bench))
-    keys: dict[str, object] = {"mcu.encoder_counts": counts}
-    configured = bench.mcu.encoder_counts
-    if configured in (0, counts):
-        return Finding("encoder counts", "PASS", f"{counts} per turn", text, "", keys)
-    return Finding(
-        "encoder counts",
-        "FAIL",
-        f"{counts}, not {configured}",
-        f"{text}: every distance would be off by {abs(configured / counts - 1):.1%}",
-        f"write mcu.encoder_counts = {counts}",
-        keys,
+        many = "encoder counts: many"
+        return manual.find(many, _off(configured), counts=counts, most=MOST_COUNTS)
+    return manual.find(
+        "encoder counts: right" if configured in (0, counts) else "encoder counts: wrong",
+        {"mcu.encoder_counts": counts},
+        counts=counts,
+        configured=configured,
+        how=how,
+        off=abs(configured / counts - 1),
     )
 
 
-def _off(bench: Bench) -> dict[str, object]:
-    return {"mcu.encoder_counts": 0} if bench.mcu.encoder_counts else {}
+def _off(configured: int) -> dict[str, object]:
+    return {"mcu.encoder_counts": 0} if configured else {}

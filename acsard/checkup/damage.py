@@ -6,16 +6,17 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.checkup.bench import SPEED, ZERO, Bench
-from acsard.checkup.findings import LETTERS, Finding
-from acsard.checkup.wheels import MOVES
+from acsard.checkup import manual
+from acsard.checkup.board import Board
+from acsard.checkup.findings import Finding
+from acsard.checkup.limits import GLANCE_S, SPEED
+from acsard.checkup.motion import ZERO
+from acsard.checkup.wheels import moving
 from acsard.mcu.check import seal
+from acsard.mcu.frames import LETTERS
 
 REPEATS = 3
 """How often each broken line goes out: a motor needs a moment to show that it took it."""
-
-SHOWS_S = 0.12
-"""How long after it the encoders are watched."""
 
 
 class Broken(Struct, frozen=True):
@@ -59,39 +60,29 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broke
     return found
 
 
-def finding(bench: Bench, motors: Sequence[int]) -> Finding:
+def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Send them all, to motors that turn as told; they stand before and after."""
-    name = "damaged lines"
     if not motors:
-        return Finding(name, "SKIPPED", "", "no motor turns as told, so none can show it")
-    took: list[str] = []
-    whole = True
-    lines = broken_lines(bench.comma, bench.sealed, motors)
-    for broken in lines:
-        bench.rest()
-        if _moves(bench, broken.line):
-            took += [broken.what] * (broken.what not in took)
-            whole = whole and broken.whole
-    bench.rest()
+        return manual.find("damaged lines: untested")
+    lines = broken_lines(board.comma, board.sealed, motors)
+    took = [broken for broken in lines if _moves(board, broken.line)]
     if not took:
-        return Finding(name, "PASS", f"{len(lines)} lines, none moved")
-    kinds = len({broken.what for broken in lines})
-    figure = f"{len(took)} of {kinds} kinds moved"
-    text = f"motors turned on lines that are none: {', '.join(took)}"
-    if whole:
-        mend = "the firmware should take a line whole or not at all"
-        return Finding(name, "WARN", figure, text, mend)
-    mend = "the firmware must take a line whole or not at all; deploy/firmware does"
-    text += "; on a noisy cable that drives the robot"
-    return Finding(name, "FAIL", figure, text, mend)
+        return manual.find("damaged lines: right", lines=len(lines))
+    lenient = all(broken.whole for broken in took)
+    which = dict.fromkeys(broken.what for broken in took)
+    return manual.find(
+        "damaged lines: lenient" if lenient else "damaged lines: taken",
+        took=len(which),
+        kinds=len({broken.what for broken in lines}),
+        which=", ".join(which),
+    )
 
 
-def _moves(bench: Bench, line: bytes) -> bool:
-    """Whether anything turns because of it."""
+def _moves(board: Board, line: bytes) -> bool:
+    """Whether anything that stands turns because of it; it stands again."""
     for _ in range(REPEATS):
-        bench.wire.send(line)
-        bench.listen(max(0.03, len(line) * 12 / bench.baud_rate))
-    before = len(bench.replies)
-    bench.drive(ZERO, SHOWS_S + 2 * bench.gap_s)
-    shown = bench.replies[before:]
-    return any(abs(speed) >= MOVES for reply in shown for speed in reply.motors)
+        board.wire.send(line)
+        board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))
+    shown = board.drive(ZERO, GLANCE_S + 2 * board.gap_s)
+    board.rest()
+    return any(moving(reply.motors) for reply in shown)

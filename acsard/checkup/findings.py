@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from msgspec import Struct
 
 from acsard.config.settings import McuConfig
+from acsard.mcu.frames import LETTERS
 from acsard.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
-LETTERS = "abcd"
-
 
 class Finding(Struct, frozen=True):
-    """One thing that was looked at.
+    """One thing that was looked at; the words are those of `manual.py`.
 
     `figure` is what was measured, `text` what it means, `mend` what to do unless it passed, and
     `keys` what it says of the configuration: dotted key -> value, whether configured so or not.
@@ -58,3 +58,8 @@ def words(wheel: str) -> str:
 def motor_name(mcu: McuConfig, motor: int) -> str:
     """`motor d (rear right)`: the letter, and the wheel the configuration gives it."""
     return f"motor {LETTERS[motor]} ({words(wheel_of(mcu, motor)[0])})"
+
+
+def motor_names(mcu: McuConfig, motors: Sequence[int], joint: str = " and ") -> str:
+    """Several of them."""
+    return joint.join(motor_name(mcu, motor) for motor in motors)

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from statistics import fmean
 
 from msgspec import Struct
 
+from acsard.checkup.limits import GLANCE_S
 from acsard.config.baud import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
-from acsard.values import NS_PER_S
 
-SPEED_S = 0.2
-"""Speeds are a mean over so long: one count of a coarse encoder is no movement."""
+ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
-COUNTS_S = 0.1
-"""Counts tell it sooner."""
+COUNTS_S = GLANCE_S / 2
+"""Counts tell a runaway sooner than speeds do."""
 
 TREND_S = 0.5
 """Over so long speeds are compared with those just before."""
@@ -27,21 +26,70 @@ TREND_S = 0.5
 FALLS = 0.97
 """Below this share of what it was, a speed falls; above its inverse, it rises."""
 
+NEAR = 256
+"""So many replies are a second or more."""
+
 
 class Reply(Struct, frozen=True):
-    """A good line of the MCU, complete at `at_ns`."""
+    """A good line of the MCU, complete at `at_s`."""
 
-    at_ns: int
+    at_s: float
     motors: Motors
     line: bytes
     reading: Reading | None = None
 
 
-def difference(before: Reading, after: Reading) -> tuple[int, ...]:
-    """By how much each encoder went on, the short way round."""
-    half = FIELD // 2
-    pairs = zip(before.counts, after.counts, strict=True)
-    return tuple((b - a + half) % FIELD - half for a, b in pairs)
+def each(value: Callable[[int], float]) -> Motors:
+    """A value for each motor, by its number."""
+    a, b, c, d = (value(motor) for motor in range(4))
+    return a, b, c, d
+
+
+def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -> Sequence[Reply]:
+    """The replies from the one time to the other."""
+    first = bisect_left(replies, since_s, key=lambda reply: reply.at_s)
+    return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
+
+
+def mean(replies: Sequence[Reply]) -> Motors:
+    """Each encoder's speed over these replies."""
+    return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
+
+
+def leg(before: Reply, after: Reply) -> tuple[Motors, float] | None:
+    """By which counts each encoder went on from one reply to the other, the short way round, and
+    in how many seconds, by the MCU itself; None when they do not say."""
+    if before.reading is None or after.reading is None:
+        return None
+    ms = (after.reading.mcu_ms - before.reading.mcu_ms) % FIELD
+    pairs = zip(before.reading.counts, after.reading.counts, strict=True)
+    counts = [(b - a + FIELD // 2) % FIELD - FIELD // 2 for a, b in pairs]
+    return each(lambda motor: counts[motor]), ms / 1000
+
+
+def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
+    """By which angle each encoder went on since then, rad.
+
+    By the replies' speeds, or by their counts when it is said how many are a turn.
+    """
+    ran = [0.0] * 4
+    before = Reply(since_s, ZERO, b"")
+    for reply in since(replies, since_s):
+        seconds = reply.at_s - before.at_s
+        turned = leg(before, reply) if per_turn else None
+        for motor, speed in enumerate(reply.motors):
+            ran[motor] += turned[0][motor] / per_turn * math.tau if turned else speed * seconds
+        before = reply
+    return each(lambda motor: ran[motor])
+
+
+def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
+    """By which share each motor's speed is of what it was a moment before; 1 where it stands."""
+    span_s, near = max(TREND_S, 4 * gap_s), replies[-NEAR:]
+    before = mean(since(near, now_s - 2 * span_s, now_s - span_s))
+    now = mean(since(near, now_s - span_s, now_s))
+    turn = [min(abs(one), abs(other)) > 0.1 for one, other in zip(before, now, strict=True)]
+    return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
 
 
 def fastest(replies: Sequence[Reply], above: float, per_turn: int) -> tuple[int, float] | None:
@@ -50,19 +98,16 @@ def fastest(replies: Sequence[Reply], above: float, per_turn: int) -> tuple[int,
     One reading is no proof: it may be damaged, or one count of a coarse encoder. By counts, where
     the replies carry them, else by the speeds of a longer time without the highest of them.
     """
-    near = replies[-64:]
-    if not near:
+    if not replies:
         return None
-    last_ns = near[-1].at_ns
-    recent = [r for r in near if r.at_ns > last_ns - SPEED_S * NS_PER_S]
-    if len(recent) < 4:
-        recent = list(near[-4:])
-    counted = [r for r in recent if r.reading and r.at_ns > last_ns - COUNTS_S * NS_PER_S]
+    last_s = replies[-1].at_s
+    recent = max(since(replies[-NEAR:], last_s - GLANCE_S), replies[-4:], key=len)
+    counted = since(recent, last_s - COUNTS_S)
     for motor in range(4):
         if max(abs(reply.motors[motor]) for reply in recent) <= above:
             continue
-        mean = _mean_without_highest(recent, motor)
-        speed = max(mean, _by_counts(counted, motor, per_turn), key=abs)
+        speeds = _mean_without_highest(recent, motor), _by_counts(counted, motor, per_turn)
+        speed = max(speeds, key=abs)
         if abs(speed) > above:
             return motor, speed
     return None
@@ -72,52 +117,19 @@ def _mean_without_highest(replies: Sequence[Reply], motor: int) -> float:
     """The mean over time, without the reply that adds most to it: it may be one count, or wrong."""
     ran = []
     for before, after in pairwise(replies):
-        seconds = min(SPEED_S, (after.at_ns - before.at_ns) / NS_PER_S)
+        seconds = min(GLANCE_S, after.at_s - before.at_s)
         ran.append((after.motors[motor] * seconds, seconds))
     ran.sort(key=lambda piece: abs(piece[0]))
     # Two quick replies after a silence: one count in so little time is no speed.
-    seconds = max(SPEED_S / 2, sum(seconds for _, seconds in ran[:-1]))
+    seconds = max(GLANCE_S / 2, sum(seconds for _, seconds in ran[:-1]))
     return sum(angle for angle, _ in ran[:-1]) / seconds
 
 
 def _by_counts(replies: Sequence[Reply], motor: int, per_turn: int) -> float:
     """The speed by the counts from the first to the last of these, less one count; 0 if unknown."""
-    if not per_turn or len(replies) < 2:
+    turned = leg(replies[0], replies[-1]) if per_turn else None
+    if turned is None or turned[1] < COUNTS_S / 2:
         return 0.0
-    first, last = replies[0].reading, replies[-1].reading
-    assert first is not None
-    assert last is not None
-    seconds = (last.mcu_ms - first.mcu_ms) % FIELD / 1000
-    if seconds < COUNTS_S / 2:
-        return 0.0
-    counts = difference(first, last)[motor]
-    sure = math.copysign(max(0, abs(counts) - 1), counts)
+    counts, seconds = turned
+    sure = math.copysign(max(0.0, abs(counts[motor]) - 1), counts[motor])
     return sure / per_turn * math.tau / seconds
-
-
-def covered(replies: Sequence[Reply], since_ns: int) -> Motors:
-    """By which angle each encoder went on since then, as the replies' speeds say, rad."""
-    ran = [0.0] * 4
-    before_ns = since_ns
-    for reply in replies[bisect_right(replies, since_ns, key=lambda reply: reply.at_ns) :]:
-        for motor in range(4):
-            ran[motor] += reply.motors[motor] * (reply.at_ns - before_ns) / NS_PER_S
-        before_ns = reply.at_ns
-    a, b, c, d = ran
-    return a, b, c, d
-
-
-def between(replies: Sequence[Reply], since_ns: float, until_ns: float) -> Motors:
-    """Each motor's mean speed, without its sign, in that time."""
-    seen = [reply.motors for reply in replies if since_ns < reply.at_ns <= until_ns]
-    a, b, c, d = (fmean([abs(speeds[motor]) for speeds in seen] or [0.0]) for motor in range(4))
-    return a, b, c, d
-
-
-def trend(replies: Sequence[Reply], now_ns: int, gap_s: float) -> Motors:
-    """By which share each motor's speed is of what it was a moment before; 1 where it stands."""
-    span = int(max(TREND_S, 4 * gap_s) * NS_PER_S)
-    now = between(replies[-256:], now_ns - span, now_ns)
-    before = between(replies[-256:], now_ns - 2 * span, now_ns - span)
-    a, b, c, d = (n / b if n > 0.1 and b > 0.1 else 1.0 for n, b in zip(now, before, strict=True))
-    return a, b, c, d

@@ -10,7 +10,7 @@ class Wire(Protocol):
     """A serial line."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or go on at another rate; raises `ExitError` when it cannot."""
+        """Open the line, or go on at another rate; raises a `MendableError`."""
 
     def close(self) -> None:
         """Let the last bytes out, and close."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from acsard.checkup import counts, damage, dialect, watchdog
-from acsard.checkup.bench import Bench
+from acsard.checkup import counts, damage, dialect, manual, pace, turning, watchdog
+from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, WireLostError
 from acsard.checkup.outside import Operator, Wire
-from acsard.checkup.turning import channels, comma_needed
-from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
+from acsard.checkup.wheels import encoder_finding, wheel_map
 from acsard.config.settings import Config
 
 LIFTED = "lifted"
@@ -36,24 +35,26 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     Nothing but zeros goes out before the operator has confirmed that the wheels are lifted.
     Whatever happens, the last lines are zeros in both forms, then silence: the wire is closed.
     """
-    told: list[str] = []
+    told: set[str] = set()
 
-    def also(finding: Finding) -> None:
-        told.append("motors" if finding.name.startswith("motor ") else finding.name)
-        tell(finding)
+    def once(finding: Finding | None) -> None:
+        """What several steps can find is told by the first of them."""
+        if finding is not None and finding.name not in told:
+            told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
+            tell(finding)
 
     try:
-        with Bench(wire, config.mcu, config.rate_hz) as bench:
-            bench.open(config.mcu.baud_rate)
-            bench.zeros()
+        with Board(wire, config.mcu, config.rate_hz) as board:
+            board.open(config.mcu.baud_rate)
+            board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
-                raise StoppedError(Finding("wheels", "FAIL", "", "not confirmed to be lifted"))
-            _steps(bench, operator, also)
+                raise StoppedError(manual.find("wheels: not lifted"))
+            _steps(board, operator, once)
     except StoppedError as end:
-        also(end.finding)
+        once(end.finding)
         why = f"the check ended early: {end.finding.name}"
     except WireLostError as lost:
-        also(Finding("serial line", "FAIL", "lost", str(lost), "a loose plug? `dmesg | tail`"))
+        once(manual.find("serial line: lost", error=lost))
         why = "the check ended early: the serial line was lost"
     else:
         return
@@ -62,37 +63,21 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             tell(Finding(step, "SKIPPED", "", why))
 
 
-def _steps(bench: Bench, operator: Operator, tell: Tell) -> None:
-    tell(dialect.baud(bench))
-    tell(dialect.identity(bench))
-    for finding in dialect.pace(bench):
-        tell(finding)
-    refused = dialect.comma(bench)
-    if refused is not None:
-        tell(refused)
-    tell(dialect.forms(bench))
-    tell(dialect.check(bench))
-    found, right = _motors(bench, operator, tell, comma_told=refused is not None)
-    tell(wheel_map(bench.mcu, found))
-    tell(counts.finding(bench, right))
+def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], None]) -> None:
+    for step in (dialect.baud, dialect.identity, pace.rate, pace.trip, dialect.form,
+                 dialect.replies, dialect.check):  # fmt: skip
+        tell(step(board))
+    board.rest()
+    board.armed = True
+    channels = []
+    for channel in turning.channels(board, operator):
+        channels.append(channel)
+        tell(encoder_finding(board.mcu, channel))
+    tell(turning.comma(board, channels[-1]))
+    tell(wheel_map(board.mcu, channels))
+    right = [channel.motor for channel in channels if channel.kind == "right"]
+    tell(counts.finding(board, right))
     operator.say("the motors turn together, then the host falls silent, several times perhaps")
-    tell(watchdog.finding(bench, right))
+    tell(watchdog.finding(board, right))
     operator.say("broken lines go out; nothing may turn")
-    tell(damage.finding(bench, right))
-
-
-def _motors(
-    bench: Bench, operator: Operator, tell: Tell, comma_told: bool
-) -> tuple[list[Channel], list[int]]:
-    """What each motor did, and those whose encoder shows what they were told."""
-    if bench.rest() == "comma":
-        comma_told = True
-        tell(comma_needed(bench))
-    bench.armed = True
-    found = []
-    for channel, comma in channels(bench, operator):
-        found.append(channel)
-        tell(encoder_finding(bench.mcu, channel))
-        if comma is not None and not comma_told:
-            tell(comma)
-    return found, [channel.motor for channel in found if channel.kind == "right"]
+    tell(damage.finding(board, right))

@@ -30,7 +30,9 @@ from acsard.cli import (
     top,
     topics,
 )
-from acsard.host.exits import Exit, ExitError
+from acsard.cli.exits import code_of
+from acsard.host.errors import MendableError
+from acsard.host.exits import Exit
 
 VERBS = (
     run,
@@ -82,9 +84,9 @@ def main(argv: list[str] | None = None) -> int:
         try:
             args = parser.parse_args(words)
             return int(args.main(args))
-        except ExitError as error:
+        except MendableError as error:
             print(f"acsard: {error}", file=sys.stderr)
-            return int(error.code)
+            return int(code_of(error))
         finally:
             sys.stdout.flush()
     except OSError as error:

@@ -27,13 +27,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Call and print."""
     from acsard.client import connect
-    from acsard.host.exits import Exit, ExitError
+    from acsard.host.errors import UsageError
     from acsard.messages.encodings import encode
 
     wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
-        raise ExitError(Exit.USAGE, f"write: {form}")
+        raise UsageError(f"write: {form}")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))

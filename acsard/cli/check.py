@@ -27,6 +27,7 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.config.parsing import effective
     from acsard.config.rules import warnings
+    from acsard.config.writing import document
 
     where, config = load(args.config)
     plain = effective(config)
@@ -34,25 +35,7 @@ def main(args: argparse.Namespace) -> int:
         print(msgspec.json.encode(plain).decode())
     else:
         print(f"# effective configuration from {where}")
-        print("\n".join(toml(plain)))
+        print("\n".join(document(plain)))
     for text in warnings(config):
         print(f"{where}: warning: {text}", file=sys.stderr)
     return 0
-
-
-def toml(table: dict[str, object], path: str = "") -> list[str]:
-    """The lines of a TOML document: plain keys first, then tables, then lists of tables."""
-    from acsard.config.validation import write
-
-    lines: list[str] = []
-    tables: list[str] = []
-    for key, value in table.items():
-        where = f"{path}.{key}" if path else key
-        if isinstance(value, dict):
-            tables += ["", f"[{where}]", *toml(value, where)]
-        elif isinstance(value, list | tuple) and value and isinstance(value[0], dict):
-            for one in value:
-                tables += ["", f"[[{where}]]", *toml(one, where)]
-        else:
-            lines.append(f"{key} = {write(value)}")
-    return lines + tables

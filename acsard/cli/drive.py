@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
 from acsard.values import REST, Twist
+
+if TYPE_CHECKING:
+    from acsard.client import Client
 
 HOLD_S = 0.6
 """Longer than a keyboard's delay before its first repeat (0.25 to 0.5 s), or it would stutter."""
@@ -94,10 +98,10 @@ def main(args: argparse.Namespace) -> int:
     import tty
 
     from acsard.client import connect
-    from acsard.host.exits import Exit, ExitError
+    from acsard.host.errors import UsageError
 
     if not sys.stdin.isatty():
-        raise ExitError(Exit.USAGE, "drive reads keys and needs a terminal; use acsard.client")
+        raise UsageError("drive reads keys and needs a terminal; use acsard.client")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         print(HELP)
@@ -120,16 +124,14 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _loop(robot: object, teleop: Teleop) -> None:
+def _loop(robot: Client, teleop: Teleop) -> None:
     import os
     import select
     import time
 
-    from acsard.client import Client
     from acsard.messages.encodings import Decoder
     from acsard.messages.schema import RobotState
 
-    assert isinstance(robot, Client)
     decoder, states = Decoder(RobotState), robot.subscribe("state")
     shown, heard = "", time.monotonic()
     while True:
@@ -141,8 +143,6 @@ def _loop(robot: object, teleop: Teleop) -> None:
         if wish is not None:
             robot.send(wish.linear, wish.angular)
         while (sample := states.try_recv()) is not None:
-            if str(sample.key_expr) != robot.key("state"):
-                continue  # a stranger's put on a wildcard
             heard = time.monotonic()
             state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
             shown = f"x {state.x:7.2f}  y {state.y:7.2f}  yaw {state.yaw:6.2f}  {state.reason}"

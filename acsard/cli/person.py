@@ -1,9 +1,18 @@
-"""Who answers what a check asks: somebody at the terminal, or nobody."""
+"""Who answers for a check and what it asks: somebody at the terminal, or nobody; who ends it."""
 
 from __future__ import annotations
 
+import argparse
+import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+from acsard.host.exits import Exit, ExitError
+
+SIMULATOR = "sim"
 
 
 class Person:
@@ -41,3 +50,60 @@ class Nobody:
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """The confirmation; no wheel has been seen to turn."""
         return answers[0] if len(answers) == 1 else None
+
+
+def answering(args: argparse.Namespace, port: str) -> Person | Nobody:
+    """Who answers; raises unless that is a person here, or nothing real can move."""
+    if port == SIMULATOR and args.port != SIMULATOR:
+        raise ExitError(
+            Exit.USAGE,
+            "no port is configured, so there is no board to check (mcu.port is the simulator, "
+            '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
+            "DEVICE`; `--port sim` checks the built-in simulator",
+        )
+    if not args.yes:
+        if not sys.stdin.isatty():
+            raise ExitError(
+                Exit.USAGE,
+                "mcu check turns the wheels and asks a person who sees them: run it in a "
+                "terminal; `--yes` without one is for the simulator (--port sim)",
+            )
+        return Person()
+    if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
+        return Nobody(args.json)
+    from acsard.host.processes import master_of
+
+    master = master_of(port)
+    if master is None or master.name != "acsard":
+        what = f"a pty of {master.name}" if master else "no simulator of acsard's"
+        raise ExitError(
+            Exit.USAGE,
+            f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
+            "a question. Leave --yes out; or lift the wheels, stay with the robot, and add "
+            "--wheels-are-lifted",
+        )
+    return Nobody(args.json)
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Signals end the check by an exception, so that the zeros go out; a second one is too late."""
+    # Ctrl-Z too: a check that is suspended would leave a wheel turning.
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+    before = [signal.getsignal(number) for number in numbers]
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        print("\nstopping: zeros go out, then the port is closed", file=sys.stderr)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

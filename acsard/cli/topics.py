@@ -49,15 +49,15 @@ def ros_table(config: Config) -> Topics:
     from acsard.messages.schema import TopicInfo, Topics
     from acsard.messages.topics import by_key
     from acsard.ros.names import full_name
-    from acsard.ros.trees import PARAMETERS, left_out, ros_names
+    from acsard.ros.trees import left_out, ros_names
 
     ros = config.ros
     rows = []
     for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
-        note = "the configuration, read-only"
-        if not row.native.startswith(PARAMETERS):
-            note = f"as {row.native}" + (f": {native.note}" if native else "")
+        note = f"as {row.native}" + (f": {native.note}" if native else "")
+        if row.direction == "query":
+            note = "the configuration, read-only"
         name = full_name(ros.namespace, row.name)
         rows.append(TopicInfo(name, row.direction, row.type, native.rate if native else "", note))
     return Topics(rows)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from acsard.config.parsing import effective, parse
+from acsard.config.parsing import effective, from_builtins, parse
 from acsard.config.validation import write
 
 
@@ -31,7 +31,7 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
         changed = _changed(text, keys)
     except TOMLKitError as error:
         raise ValueError(str(error)) from None
-    if effective(parse(changed.encode())) != wanted:
+    if parse(changed.encode()) != from_builtins(wanted):
         raise ValueError("its tables are written in a way that cannot be changed safely")
     return changed
 

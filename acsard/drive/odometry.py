@@ -23,7 +23,7 @@ from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.values import REST, STILL, Pose, PoseCovariance, Sample, WheelSpeeds
+from acsard.values import REST, STILL, Estimate, Pose, PoseCovariance, WheelSpeeds
 
 MAX_LOST_S = 0.05
 """s of lines that could not be true, up to which the robot is held to have gone on as it did."""
@@ -70,7 +70,7 @@ class Odometry:
         else:
             self._lost_turned = _sum(self._lost_turned, feedback.turned)
 
-    def fold(self, feedback: Feedback) -> Sample:
+    def fold(self, feedback: Feedback) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances.
@@ -90,7 +90,7 @@ class Odometry:
             self._advance(twist.linear * dt, twist.angular * dt)
             self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
         self.twist, self.speeds = twist, speeds
-        return Sample(
+        return Estimate(
             feedback.at,
             self._pose,
             twist,

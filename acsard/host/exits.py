@@ -1,10 +1,13 @@
-"""Why acsard ends, as exit codes after sysexits.h, and the error that carries one."""
+"""Why acsard ends, as exit codes after sysexits.h, and the error of a verb that ends with one.
+
+What others may import raises the errors of `errors.py` instead; `cli/exits.py` has their codes.
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum
 
-from acsard.values import AcsardError
+from acsard.host.errors import MendableError
 
 
 class Exit(IntEnum):
@@ -18,7 +21,7 @@ class Exit(IntEnum):
     BAD_CONFIG = 78
 
 
-class ExitError(AcsardError):
+class ExitError(MendableError):
     """Ends the program with `code`; the text says what was wrong and what to do."""
 
     def __init__(self, code: Exit, text: str) -> None:

@@ -5,12 +5,19 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from acsard.config.editing import edited
-from acsard.config.parsing import ConfigError
+from acsard.config.parsing import ConfigError, parse
+from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
+
+NEW_MODE = 0o644
+"""A configuration has no secrets, and the service reads it as a user of its own."""
+
+Keys = Mapping[str, object]
+"""Values by dotted keys, as "mcu.port"."""
 
 
 def require_tomlkit() -> None:
@@ -25,13 +32,18 @@ def require_tomlkit() -> None:
         ) from None
 
 
-def change(file: Path, keys: Mapping[str, object]) -> None:
-    """Set dotted keys in an `acsard.toml`; raises `ExitError` and leaves it as it was if it
-    cannot be."""
+def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
+    """Set keys in an `acsard.toml`, given or made from what it says, and return them.
+
+    Raises `ExitError` and leaves it as it was when it cannot be done. `new`: it need not be there.
+    """
     try:
-        file = file.resolve(strict=True)
-        text = file.read_bytes().decode()  # not read_text: it would lose CRLF
-        replace(file, edited(text, keys))
+        file = file.resolve(strict=not new)
+        # Not read_text: it would lose CRLF.
+        text = "" if new and not file.exists() else file.read_bytes().decode()
+        given = keys(parse(text.encode())) if callable(keys) else keys
+        replace(file, edited(text, given))
+        return given
     except (OSError, ValueError, ConfigError) as error:
         raise ExitError(
             Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand"
@@ -40,15 +52,16 @@ def change(file: Path, keys: Mapping[str, object]) -> None:
 
 def replace(file: Path, text: str) -> None:
     """The file is the old one or the new one, never half of it; who may read it stays."""
-    before = file.stat()
+    before = file.stat() if file.exists() else None
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "w", encoding="utf-8", newline="") as new:
             new.write(text)
             new.flush()
-            os.fchmod(new.fileno(), stat.S_IMODE(before.st_mode))
+            os.fchmod(new.fileno(), stat.S_IMODE(before.st_mode) if before else NEW_MODE)
             try:
-                os.fchown(new.fileno(), before.st_uid, before.st_gid)
+                if before:
+                    os.fchown(new.fileno(), before.st_uid, before.st_gid)
             except PermissionError:
                 pass  # another's file in a directory of ours: it becomes ours
             os.fsync(new.fileno())

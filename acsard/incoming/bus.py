@@ -21,6 +21,16 @@ class BusInput(Struct, frozen=True):
     """Samples dropped because they came faster than they could be taken."""
 
 
+class Waker(Protocol):
+    """Whom the bus tells, from whatever thread, that something came in."""
+
+    def command(self) -> None:
+        """What may be a command."""
+
+    def stop(self) -> None:
+        """A stop."""
+
+
 class Bus(Protocol):
     """The bus as the loop sees it."""
 
@@ -35,10 +45,7 @@ class Bus(Protocol):
         """Send a message to its listeners."""
 
     def reply(self, reply: Reply) -> None:
-        """Answer a query; the last reply to its number."""
+        """Answer a query by its ticket."""
 
-    def done(self, number: int) -> None:
-        """No more replies to this query."""
-
-    def alert(self, on: bool) -> None:
-        """Wake the loop when a command or a stop comes in, or leave it to the next period."""
+    def retire(self, ticket: int) -> None:
+        """No more replies by this ticket."""

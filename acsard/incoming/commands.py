@@ -41,6 +41,7 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's own timestamp, when it is the sender's."""
     sender: str
+    """Whose that is; "" without one."""
     via: Via = "native"
     attachment: bytes = b""
 
@@ -82,7 +83,7 @@ class Receiver:
             raise DecodeError("not_a_put", "a DELETE is not a command")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
-        stamp_ns, sender = _stamp(arrival)
+        stamp_ns, clock = _stamp(arrival)
         if kind == "cmd":
             twist, header, cancelled = self._twist(arrival)
         else:
@@ -90,9 +91,9 @@ class Receiver:
         if header is not None and header.stamp.to_ns() > 0:
             # Another clock than the envelope's, which may be a router's for many: its own name.
             stamp_ns = header.stamp.to_ns()
-            sender = f"{sender}, header on {arrival.via}/{arrival.key}"
+            clock = f"{clock}, header on {arrival.via}/{arrival.key}"
         return Command(
-            source, twist, arrival.arrived_ns, stamp_ns, sender, voice(arrival), cancelled
+            source, twist, arrival.arrived_ns, stamp_ns, clock, sender(arrival), cancelled
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
@@ -130,11 +131,11 @@ class Receiver:
 
     @staticmethod
     def request(
-        verb: Verb, number: int, encoding: str, payload: bytes, asked_ns: int | None = None
+        verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """The request in a service query, to be answered as `number`; raises `DecodeError`."""
+        """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
         if verb != "set_pose":
-            return Request(verb, number, asked_ns=asked_ns)
+            return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
         got = _poses.decode(encoding, payload)
@@ -143,17 +144,17 @@ class Receiver:
             or max(abs(got.x), abs(got.y)) > 1e6
         ):
             raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
-        return Request(verb, number, Pose(got.x, got.y, got.yaw), asked_ns)
+        return Request(verb, ticket, Pose(got.x, got.y, got.yaw), asked_ns)
 
 
 def _stamp(arrival: Arrival) -> tuple[int | None, str]:
     """When it was sent by whose clock, as far as its envelope says; raises `DecodeError`."""
     if arrival.via == "rmw":
-        return unpack(arrival.attachment).stamp_ns, voice(arrival)
+        return unpack(arrival.attachment).stamp_ns, sender(arrival)
     return arrival.stamp_ns, arrival.sender or f"{arrival.via}/{arrival.key}"
 
 
-def voice(arrival: Arrival) -> str:
+def sender(arrival: Arrival) -> str:
     """Who sent it: the rmw publisher, the session that stamped it, or else just the source.
 
     A bridge says nothing of the ROS node behind it: all those of a source are one.

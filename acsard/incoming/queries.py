@@ -7,7 +7,6 @@ clear anything. Everything else may also be asked by wildcard.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import msgspec
 from msgspec import Struct
@@ -27,11 +26,11 @@ from acsard.messages.schema import (
     TopicInfo,
     Topics,
 )
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.messages.topics import PUBLISHED, TOPICS, VERBS, full_key
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.trees import PARAMETERS
-from acsard.values import Answer, Outputs, Request, Verb
+from acsard.values import Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
 
@@ -39,7 +38,8 @@ Current = Callable[[str], Message | None]
 class Query(Struct, frozen=True):
     """A query as the bus shell took it from Zenoh, keys below `acsard/<id>/`."""
 
-    number: int
+    ticket: int
+    """What it is answered by."""
     topic: str
     """The row of the topic table it reached."""
     asked: str
@@ -56,7 +56,8 @@ class Query(Struct, frozen=True):
 class Reply(Struct, frozen=True):
     """What goes back; `ok` False is an error reply."""
 
-    number: int
+    ticket: int
+    """Of the query it answers."""
     key: str
     payload: bytes
     encoding: str
@@ -89,14 +90,15 @@ class Queries:
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
         try:
             form = _format(query)
-            if query.topic.startswith("srv/"):
+            if query.topic in VERBS:
                 return self._service(query, form)
             return [
-                Reply(query.number, key, encode(value, form), encoding_name(form, name))
+                Reply(query.ticket, key, encode(value, form), encoding_name(form, name))
                 for key, name, value in self._values(query, current, outputs)
             ]
         except DecodeError as error:
-            return [self._error(query, str(error))]
+            words = str(error).encode()
+            return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
         """The reply that carries a robot's answer now; None when nobody waits for it."""
@@ -111,26 +113,25 @@ class Queries:
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
         """A std_srvs/Trigger, or one of the parameter services."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
-        if query.topic.startswith("srv/"):
-            verb = cast(Verb, query.topic.removeprefix("srv/"))
-            self._waiting[query.number] = (query.topic, "cdr", asked)
-            return Request(verb, query.number, asked_ns=query.arrived_ns)
+        verb = VERBS.get(query.topic)
+        if verb is not None:
+            self._waiting[query.ticket] = (query.topic, "cdr", asked)
+            return Request(verb, query.ticket, asked_ns=query.arrived_ns)
         try:
             service = query.topic.removeprefix(PARAMETERS)
             payload = self._parameters.answer(service, query.payload)
         except CdrError as error:
             raise DecodeError("malformed", str(error)) from None
         attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
-        return [Reply(query.number, query.topic, payload, encoding, attachment=attachment)]
+        return [Reply(query.ticket, query.topic, payload, encoding, attachment=attachment)]
 
     def _service(self, query: Query, form: Format) -> list[Reply] | Request:
-        verb = query.topic.removeprefix("srv/")
-        if query.asked != query.topic or verb not in SERVICES:
+        if query.asked != query.topic:
             return []
         try:
             request = Receiver.request(
-                cast(Verb, verb),
-                query.number,
+                VERBS[query.topic],
+                query.ticket,
                 query.encoding,
                 query.payload,
                 query.arrived_ns,
@@ -138,8 +139,8 @@ class Queries:
         except DecodeError as error:
             message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
-            return [Reply(query.number, query.topic, payload, name)]
-        self._waiting[query.number] = (query.topic, form, None)
+            return [Reply(query.ticket, query.topic, payload, name)]
+        self._waiting[query.ticket] = (query.topic, form, None)
         return request
 
     def _values(
@@ -158,10 +159,6 @@ class Queries:
         value = current(topic)
         return [] if value is None else [(topic, type(value).__name__, value)]
 
-    @staticmethod
-    def _error(query: Query, text: str) -> Reply:
-        return Reply(query.number, query.topic, text.encode(), "text/plain", ok=False)
-
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
     """What rmw_zenoh finds the caller of a reply by: the request's sequence and GID."""
@@ -177,7 +174,7 @@ def _format(query: Query) -> Format:
         raise DecodeError(
             "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
         )
-    if query.topic.startswith("srv/") and query.payload:
+    if query.topic in VERBS and query.payload:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:

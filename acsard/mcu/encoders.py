@@ -16,6 +16,7 @@ from msgspec import Struct
 from acsard.config.baud import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
+from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S
 
 SLACK_COUNTS = 4
@@ -29,12 +30,6 @@ LATEST_MS = 1000.0
 
 DRIFT = 0.01
 """By which share the two clocks may go apart; a ceramic resonator has half of it."""
-
-ENOUGH_TURNED = 60.0
-"""rad of all four wheels together, two to three turns of each: enough to compare."""
-
-DISAGREEMENT = 0.15
-"""Share by which counts and speeds may differ; a wrong gear or edge count is far more."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """Why a difference says nothing: nothing to compare with or too long ago, further than a motor can
@@ -61,8 +56,8 @@ class Encoders:
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
-        self._late_ms = 0.0
-        """How much later than the promptest one the last reading was read."""
+        self._promptest = Promptest(DRIFT, LATEST_MS)
+        """In ms: which reading was read soonest after it was made."""
 
     def forget(self) -> None:
         """The next reading is a first one: what came before is of another run or accounted for."""
@@ -79,10 +74,7 @@ class Encoders:
         before, before_ns = last
         host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
         mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
-        late_ms = self._late_ms + host_ms - mcu_ms
-        self._late_ms = min(max(0.0, late_ms - DRIFT * host_ms), LATEST_MS)
-        if late_ms < -self._early_ms:
-            self._late_ms = 0.0
+        if self._promptest.add(host_ms, mcu_ms) < -self._early_ms:
             return "restarted"
         if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
             return "unknown"
@@ -96,36 +88,6 @@ class Encoders:
     def _most(self, ms: float) -> float:
         """Counts that no wheel exceeds in so many milliseconds."""
         return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
-
-
-class Agreement:
-    """Do the counts say what the speeds say? Asked once, when the wheels have turned enough."""
-
-    def __init__(self, counts: int) -> None:
-        self._counts = counts
-        self._by_speeds = self._by_counts = 0.0
-        self._asked = False
-
-    def add(self, motors: Motors, speeds: Motors, dt: float) -> None:
-        """One step: how far the counts and how fast the line say the wheels turned."""
-        self._by_counts += sum(abs(angle) for angle in motors)
-        self._by_speeds += sum(abs(speed) for speed in speeds) * dt
-
-    def doubt(self) -> str:
-        """What is wrong with `mcu.encoder_counts`, told once; "" when nothing is, or not yet."""
-        if self._asked or self._by_speeds < ENOUGH_TURNED:
-            return ""
-        self._asked = True
-        ratio = self._by_counts / self._by_speeds
-        if abs(ratio - 1.0) <= DISAGREEMENT:
-            return ""
-        if ratio < 0.01:
-            return "the wheels turn but their counts stand: write mcu.encoder_counts = 0"
-        return (
-            f"the wheels turn {ratio:.2f} times as far by their counts as by their speeds: "
-            f"mcu.encoder_counts = {self._counts} looks like {self._counts * ratio:.0f}; "
-            "turn a wheel ten times by hand and count"
-        )
 
 
 def _signed(difference: int) -> int:

@@ -10,7 +10,7 @@ from msgspec import Struct
 from acsard.config.baud import wire_ns
 from acsard.config.settings import McuConfig
 from acsard.mcu.check import Reading
-from acsard.mcu.encoders import Agreement, Encoders, Turned
+from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.frames import Codec, Motors
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
@@ -39,7 +39,6 @@ class Timeline:
         """`wheel_speed` rad/s is the fastest a wheel can turn; `quiet_ns` makes a link stale."""
         self._codec, self._baud_rate = codec, mcu.baud_rate
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
-        self._agreement = Agreement(mcu.encoder_counts)
         self._counts = mcu.encoder_counts
         self._last: Instant | None = None
         self.leaps = 0
@@ -50,10 +49,6 @@ class Timeline:
     def forget(self) -> None:
         """The next line's counts have nothing to do with the last one's."""
         self._encoders.forget()
-
-    def doubt(self) -> str:
-        """What is wrong with the configured counts, told once; "" when nothing is, or not yet."""
-        return self._agreement.doubt()
 
     def place(
         self,
@@ -80,8 +75,6 @@ class Timeline:
         wheels = None
         if turned is not None:
             wheels = self._codec.wheels(turned.motors)
-            if not gap:
-                self._agreement.add(wheels, speeds.as_tuple(), turned.dt)
         since = (at.mono_ns - last.mono_ns) / NS_PER_S
         if gap or self.restarted:
             return Feedback(at, speeds, 0.0, gap=since, turned=wheels)

@@ -1,9 +1,12 @@
 """Which check is in force on this line: asked at every opening and after every gap, with stops.
 
     off      mcu.link_check says so: plain lines, nothing is asked
-    asking   only stops leave, some of them questions: stops with a suffix
-    plain    "auto" only: the MCU answered, but without the check; asked again after the next gap
+    waking   only stops leave. The MCU has said nothing yet: every other question is a plain stop,
+             for it may know no other, and silence is no answer
+    asking   only stops leave. The MCU is there, so silence is an answer too
+    plain    "auto" only: it answers, but without the check; asked again after the next gap
     checked  a right reply to a line of ours has come; from now on only such count
+    sampled  checked, and its replies bring the encoder counts they are asked for
 
 Knows sequences and questions, nothing of speeds. An MCU that has answered with the check once is
 never believed without it until the port is opened anew: noise must not talk us out of the check.
@@ -20,7 +23,51 @@ from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.mcu.frames import FrameError
 from acsard.values import NS_PER_S
 
-State = Literal["off", "asking", "plain", "checked"]
+State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
+Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
+"""What moves it: the link begins anew; a plain line while asking; a right answer to a question,
+without or with a sample; no answer to any question; replies that bring no samples any more."""
+
+TABLE: dict[tuple[State, Sign], State] = {
+    ("waking", "gap"): "waking",
+    ("waking", "heard"): "asking",
+    ("waking", "answer"): "checked",
+    ("waking", "sample"): "sampled",
+    ("asking", "gap"): "waking",
+    ("asking", "answer"): "checked",
+    ("asking", "sample"): "sampled",
+    ("asking", "refusal"): "plain",
+    ("plain", "gap"): "waking",
+    ("checked", "gap"): "waking",
+    ("sampled", "gap"): "waking",
+    ("sampled", "samples_end"): "checked",
+}
+"""Where a sign leads; without an entry it changes nothing."""
+
+IN_FORCE: dict[State, str] = {
+    "off": "plain",
+    "waking": "being asked for",
+    "asking": "being asked for",
+    "plain": "plain",
+    "checked": "checked",
+    "sampled": "checked with samples",
+}
+
+Trouble = Literal["", "echo", "forgotten", "unknown"]
+"""Why nothing drives however long it is asked: what is sent comes back; the MCU knew the check and
+does not answer with it now; it does not know it, and it is required."""
+
+MENDS: dict[Trouble, str] = {
+    "": "",
+    "echo": "what is sent comes back: transmit and receive are joined, or the adapter (RS-485) "
+    "repeats what it sends; mend that, then replug it",
+    "forgotten": "the microcontroller answered with a check before and now does not: its replies "
+    "are damaged on the way (look at cable and baud rate), or it has other firmware "
+    "(then replug it)",
+    "unknown": 'the microcontroller answers without a check, and mcu.link_check = "require" drives '
+    "only with one: give it firmware that has it, or write "
+    'mcu.link_check = "auto"',
+}
 
 TRIES = 3
 """Questions of a kind that go unanswered before the MCU is said not to know it."""
@@ -47,79 +94,91 @@ class Negotiation:
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
         """`stop` is the plain stop line."""
         self._stop, self._wanted = stop, mcu.link_check
-        self.state: State = "off" if mcu.link_check == "off" else "asking"
-        self.samples = False
-        """The MCU sends its encoder counts when asked, and is asked."""
-        self.refused = False
-        """It answers, but not as it must: asked on and on, and nothing drives meanwhile."""
+        self.state: State = "off" if mcu.link_check == "off" else "waking"
+        self.trouble: Trouble = ""
         self.settled_ns = 0
         """When asking last ended."""
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
         """The last one, if an echo of it can be told from an answer."""
-        self._echo = False
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
+        self._made: tuple[int, int] | None = None
+        """Sequence and time of the sealed line just made; what became of it is not known yet."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-        self._handed: int | None = None
-        self._asked_ns: int | None = None
-        self._awake = self._open = False
-        self._failed = self._without = 0
+        """Those of the lines that left and are not answered."""
         self._knows = False
-        self._plain_next = True
+        self._without = 0
+        self._begin(fresh=True)
+
+    @property
+    def asking(self) -> bool:
+        """Only `question` leaves."""
+        return self.state in ("waking", "asking")
+
+    @property
+    def checked(self) -> bool:
+        """Only replies with a right check count."""
+        return self.state in ("checked", "sampled")
+
+    @property
+    def in_force(self) -> str:
+        """The check in force, for people."""
+        return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
         """Ask from the start: nothing said before counts. `fresh` when the port has been opened."""
-        if self.state == "off":
-            return
-        self.state, self.samples = "asking", False
-        self._pending.clear()
-        self._failed, self._awake, self._open = 0, False, False
-        self._asked_ns = None
-        # The port makes the first line after an opening a plain stop, whatever it is given.
-        self._plain_next = fresh
+        self._sign("gap")
+        self._begin(fresh)
         if fresh:
-            self.refused = self._knows = self._echo = False
+            self.trouble, self._knows, self._question = "", False, b""
+
+    def _begin(self, fresh: bool) -> None:
+        self._pending.clear()
+        self._made = None
+        self._asked_ns: int | None = None
+        self._unanswered, self._open = 0, False
+        # The port makes the first line after an opening a plain stop, whatever it is given.
+        self._plain_turn = 0 if fresh else 1
+
+    def _sign(self, sign: Sign) -> None:
+        self.state = TABLE.get((self.state, sign), self.state)
 
     # what leaves
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
         """The line as it leaves under the check in force."""
-        if self.state != "checked":
+        if not self.checked:
             return line
-        return self._sealed(line, ASK_SAMPLE if self.samples else b"", now_ns)
+        return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """While asking: the stop that is due now, or None.
-
-        To an MCU that has said nothing yet every other one is plain: it may know no other.
-        """
-        wait_ns = self._answer_ns if self._awake else max(BLIND_PERIOD_NS, self._answer_ns)
+        """While asking: the stop that is due now, or None."""
+        waking = self.state == "waking"
+        wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if self._asked_ns is not None and now_ns - self._asked_ns < wait_ns:
             return None
         self._asked_ns = now_ns
-        plain = self._plain_next and not self._awake
-        self._plain_next = not plain
-        if plain:
+        self._plain_turn += 1
+        if waking and self._plain_turn % 2:
             return self._stop
-        self._open = True
-        letters = self._letters[self._failed]
+        letters = self._letters[self._unanswered]
         line = self._sealed(self._stop, letters, now_ns)
         self._question = line.removesuffix(b"\r\n") if letters else b""
         return line
 
-    def unsent(self) -> None:
-        """The last line did not go out: nobody can answer it."""
-        if self._pending and self._pending[-1][0] == self._handed:
-            self._pending.pop()
-            self._open = False
-        self._handed = None
+    def settle(self, went: bool) -> None:
+        """What became of the last line: nobody can answer one that did not go."""
+        if self._made is not None and went:
+            self._pending.append(self._made)
+            self._open = self.asking
+        self._made = None
 
     def _sealed(self, line: bytes, letters: bytes, now_ns: int) -> bytes:
-        self._handed = self._sequence = (self._sequence + 1) % SEQUENCES
-        self._pending.append((self._sequence, now_ns))
+        self._sequence = (self._sequence + 1) % SEQUENCES
+        self._made = (self._sequence, now_ns)
         return seal(line, self._sequence, letters)
 
     # what comes back
@@ -127,12 +186,12 @@ class Negotiation:
     def echoed(self, line: bytes) -> bool:
         """Is this our own question? Then nothing that comes back can be believed: it never is."""
         if self._question and line == self._question:
-            self._echo = self.refused = True
-        return self._echo
+            self.trouble = "echo"
+        return self.trouble == "echo"
 
     def heard_plain(self) -> None:
         """A whole plain line came while asking: the MCU is awake, so silence is an answer too."""
-        self._awake = True
+        self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
         """Take a right reply; when the line it answers was made.
@@ -144,65 +203,36 @@ class Negotiation:
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
         # Lines are answered in order: those before this one will not be any more.
-        sequence, asked_ns = self._pending.popleft()
+        sequence, made_ns = self._pending.popleft()
         while sequence != reply.sequence:
-            sequence, asked_ns = self._pending.popleft()
+            sequence, made_ns = self._pending.popleft()
         has_sample = reply.reading is not None
-        if self.state == "asking":
-            self.state, self.settled_ns = "checked", at_ns
-            self.samples, self._without = has_sample, 0
-            self._knows, self.refused = True, False
-        elif self.samples:
-            self._without = 0 if has_sample else self._without + 1
-            self.samples = self._without < FEW_SAMPLES
-        return asked_ns
+        if self.asking:
+            self.settled_ns, self._without = at_ns, 0
+            self.trouble, self._knows = "", True
+            self._sign("sample" if has_sample else "answer")
+            return made_ns
+        self._without = 0 if has_sample else self._without + 1
+        if self._without >= FEW_SAMPLES:
+            self._sign("samples_end")
+        return made_ns
 
     def judge(self, now_ns: int) -> None:
         """Count a question that goes unanswered; after the last one settle for what there is."""
-        asked_ns = self._asked_ns
-        if self.state != "asking" or not (self._awake and self._open) or asked_ns is None:
+        if self.state != "asking" or not self._open or self._asked_ns is None:
             return
-        if self._echo:
-            self._failed = 0  # it goes on asking, and nothing drives
+        if self.trouble == "echo":
+            self._unanswered = 0  # it goes on asking, and nothing drives
             return
-        if now_ns - asked_ns < self._answer_ns:
+        if now_ns - self._asked_ns < self._answer_ns:
             return
         self._open = False
-        self._failed += 1
-        if self._failed < len(self._letters):
+        self._unanswered += 1
+        if self._unanswered < len(self._letters):
             return
-        self._failed = 0
+        self._unanswered = 0
         if self._wanted == "auto" and not self._knows:
-            self.state, self.settled_ns = "plain", now_ns
+            self.settled_ns = now_ns
+            self._sign("refusal")
         else:
-            self.refused = True
-
-    # words
-
-    @property
-    def in_force(self) -> str:
-        """The check in force, for people."""
-        if self.state == "checked":
-            return "checked with samples" if self.samples else "checked"
-        return "plain" if self.state in ("off", "plain") else "being asked for"
-
-    def refusal(self) -> str:
-        """Why there is no driving, with the mend, when that is because of the check; else ""."""
-        if not self.refused:
-            return ""
-        if self._echo:
-            return (
-                "what is sent comes back: transmit and receive are joined, or the adapter (RS-485) "
-                "repeats what it sends; mend that, then replug it"
-            )
-        if self._knows:
-            return (
-                "the microcontroller answered with a check before and now does not: its replies "
-                "are damaged on the way (look at cable and baud rate), or it has other firmware "
-                "(then replug it)"
-            )
-        return (
-            'the microcontroller answers without a check, and mcu.link_check = "require" drives '
-            "only with one: give it firmware that has it, or write "
-            'mcu.link_check = "auto"'
-        )
+            self.trouble = "forgotten" if self._knows else "unknown"

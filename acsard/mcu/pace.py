@@ -16,13 +16,15 @@ more than this, and the command that counts still has a chance in each period to
 
 
 class Pace:
-    """Remembers the last line and whether it has already taken the next period's place."""
+    """Remembers whether a line has already taken the next period's place.
+
+    When the last line went is the port's to know; it is an argument here.
+    """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
         """Else the next period always comes before a line may go."""
-        self._last_ns = -self._gap_ns
         self._ahead = False
         """A line has gone in the place of the next period's."""
         self._tried = False
@@ -40,12 +42,12 @@ class Pace:
         self._idle = 0
         return missed > 0 or not ahead
 
-    def at_once(self, now_ns: int) -> bool:
+    def at_once(self, now_ns: int, sent_ns: int) -> bool:
         """May a line go now, beside the clock, if there is something new to say?"""
-        return self._possible and not self._tried and now_ns - self._last_ns >= self._gap_ns
+        return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
-    def note(self, tick: bool, due: bool, sent_ns: int | None, news: bool, heard: bool) -> None:
-        """After a step: was its line the clock's, was one `due`, when did it leave if it did?
+    def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
+        """After a step: was its line the clock's, was one `due`, did it go?
 
         `news` is what the next line has to say that the last did not; `heard` that the bus had
         something for this step.
@@ -53,17 +55,14 @@ class Pace:
         self._waiting = news and not due
         self._idle += heard and not news
         if due and not tick:
-            self._tried, self._ahead = True, sent_ns is not None
-        if sent_ns is not None:
-            self._last_ns = sent_ns
+            self._tried, self._ahead = True, went
 
     @property
     def listens(self) -> bool:
         """Worth waking for a command: none is in hand, and a line could go before the tick."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
-    @property
-    def retry_ns(self) -> int | None:
+    def retry_ns(self, sent_ns: int) -> int | None:
         """When the line for what is new may go, if that is before the tick; None for never."""
         ahead = self._waiting and self._possible and not self._tried
-        return self._last_ns + self._gap_ns if ahead else None
+        return sent_ns + self._gap_ns if ahead else None

@@ -1,21 +1,13 @@
-"""Is the MCU there and in step: link state, sample times and gaps.
+"""One serial port through opens, losses and silences: bytes in, feedback out, lines made.
 
 Takes what the port received, gives feedback with the time each line was complete, and puts the
-lines that leave into the form in force. Decides when the link may carry motion (`up`), nothing
-about motion itself.
-
-    down     the port is closed
-    booting  the port is open, or the MCU has restarted: fewer than GOOD_LINES good lines since
-    up       lines come in time, and right if they are checked
-    stale    it was up, then no good line for `quiet`, or BAD_LINES bad checked ones in a row
-
-What a good line is `negotiation.py` says; while it asks, the link is not up.
+lines that leave into the form in force. Decides nothing about motion itself: whether the link may
+carry any says `link.py`, what a good line is `negotiation.py`; while it asks, the link is not up.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Literal
 
 from msgspec.structs import replace
 
@@ -24,23 +16,10 @@ from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
-from acsard.mcu.negotiation import BLIND_PERIOD_NS, Negotiation
+from acsard.mcu.link import WORDS, Link
+from acsard.mcu.link import State as LinkState
+from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
 from acsard.values import NS_PER_S, STILL, Event, Instant, Received, WheelSpeeds
-
-Link = Literal["down", "booting", "up", "stale"]
-
-LINK_WORDS: dict[Link, str] = {
-    "down": "the serial port is closed; it is being reopened",
-    "booting": "the port is open; waiting for the microcontroller's first good lines",
-    "up": "linked",
-    "stale": "the microcontroller has fallen silent",
-}
-
-GOOD_LINES = 3
-"""Good lines before the link is trusted: a board that just reset prints anything for a while."""
-
-BAD_LINES = 5
-"""Bad lines in a row after which a checked link is asked anew."""
 
 LONG_GAP_NS = 1 * NS_PER_S
 """A feedback gap this long means the MCU may have been reset: commanders start over."""
@@ -50,7 +29,7 @@ IDENTITY = b"!acsard-mcu "
 
 
 class McuSession:
-    """Follows one serial port through opens, losses and silences."""
+    """Follows one serial port."""
 
     def __init__(
         self, mcu: McuConfig, rate_hz: float, wheel_speed: float = FeedbackConfig().wheel_speed
@@ -61,24 +40,25 @@ class McuSession:
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Silence after which the link is stale, ns."""
         self.check = Negotiation(mcu, self.codec.stop)
+        self._link = Link(self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns)
         self._wants_samples = mcu.wants_samples
-        self.link: Link = "down"
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
-        self.sparse_s = 0.0
-        """Time between the last two good lines when it was too long for the link, else 0."""
         self.restarted = False
         """The last `update` saw a new session with the MCU: reopened, it has started again, or it
         is back from a long gap."""
         self.events: list[Event] = []
         """What the last `update` found worth a log line."""
         self._starting_over = False
-        self._told = ("down", self.check.in_force, False)
+        self._announced: tuple[LinkState, str, bool] = ("down", self.check.in_force, False)
         self._opened = 0
-        self._good_in_row = self._bad_in_row = 0
-        self._heard_ns: int | None = None
         self._blind_ns = -BLIND_PERIOD_NS
+
+    @property
+    def link(self) -> LinkState:
+        """Whether there is a link, and whether it may carry motion (`up`)."""
+        return self._link.state
 
     def update(
         self,
@@ -94,14 +74,11 @@ class McuSession:
         the last line did not go out.
         """
         self.restarted, self._starting_over, self.events = False, False, []
-        if unsent:
-            self.check.unsent()
-        if not port_open or opened != self._opened:
-            self._begin(opened)
+        self.check.settle(went=not unsent)
         feedback = []
-        if not port_open:
-            self.link = "down"
-        else:
+        if not port_open or opened != self._opened:
+            self._begin(port_open, opened)
+        if port_open:
             for piece in received:
                 for line, following in self._lines.feed(piece.data):
                     got = self._line(line, piece.at, following)
@@ -111,7 +88,7 @@ class McuSession:
                 self.rejects["too_long"] = self._lines.too_long
                 self._bad()
             self._judge(now.mono_ns)
-        self._tell()
+        self._announce()
         return feedback
 
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
@@ -120,7 +97,7 @@ class McuSession:
         To an MCU that does not answer, and while the check is asked for, only stops leave: the
         first one at once, for it may be doing what it was told last.
         """
-        if self.check.state == "asking":
+        if self.check.asking:
             return self.check.question(now_ns)
         if self.silent(now_ns):
             if now_ns - self._blind_ns < BLIND_PERIOD_NS:
@@ -131,23 +108,24 @@ class McuSession:
 
     def silent(self, now_ns: int) -> bool:
         """No good line within `quiet`, or none at all in this session."""
-        return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
+        return self._link.silent(now_ns)
 
     def words(self, port_trouble: str = "") -> str:
         """How the link is, for people; `port_trouble` is why the port is closed."""
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.link in ("booting", "stale"):
-            if self.check.refused:
-                return self.check.refusal()
+            if self.check.trouble:
+                return MENDS[self.check.trouble]
             if self._damaged:
                 return "the microcontroller's replies come damaged; asking it for the check again"
-            if self.sparse_s:
+            if self._link.sparse_s:
+                apart = f"{self._link.sparse_s:.2f}"
                 return (
-                    f"the microcontroller's lines come {self.sparse_s:.2f} s apart; if it reports "
-                    f"by its own clock, set mcu.reply_period = {self.sparse_s:.2f}"
+                    f"the microcontroller's lines come {apart} s apart; if it reports "
+                    f"by its own clock, set mcu.reply_period = {apart}"
                 )
-        return LINK_WORDS[self.link]
+        return WORDS[self.link]
 
     @property
     def note(self) -> str:
@@ -157,18 +135,15 @@ class McuSession:
     @property
     def _damaged(self) -> bool:
         """The check is asked for because replies came damaged."""
-        return self._bad_in_row >= BAD_LINES and self.check.state == "asking"
+        return self._link.damaged and self.check.asking
 
-    # states
+    # sessions
 
-    def _begin(self, opened: int) -> None:
-        self._lines.clear()
-        self._good_in_row = self._bad_in_row = 0
-        self._heard_ns = None
-        self.sparse_s = 0.0
-        self.link = "booting"
+    def _begin(self, port_open: bool, opened: int) -> None:
+        self._link.sign("opened" if port_open else "closed")
         self.restarted = opened != self._opened
         self._opened = opened
+        self._lines.clear()
         self._timeline.forget()
         self.check.begin(fresh=True)
 
@@ -176,59 +151,44 @@ class McuSession:
         """The MCU has started again: its motors stand, and nobody may drive on as if they did."""
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
-            self.link = "booting"
-        self._good_in_row = 0
-        self._heard_ns = None
+        self._link.sign("restarted")
         self.restarted = self._starting_over = True
         self._timeline.forget()
         self.check.begin()
 
     def _judge(self, now_ns: int) -> None:
-        silent = self.silent(now_ns)
-        if self.link == "up" and silent:
-            self.link = "stale"
-            self._good_in_row = 0
-        elif self._good_in_row >= GOOD_LINES and not (silent or self._starting_over):
-            # Never in the update that saw a restart: who drives has to see the link go first.
-            self.link = "up"
-        settled = self.check.state in ("plain", "checked")
-        if settled and silent and now_ns - self.check.settled_ns > self.quiet_ns:
-            self.check.begin()
-        self.check.judge(now_ns)
-
-    def _miss(self) -> None:
-        """What came, or did not, is no reason to trust the link; a link that is up stays so."""
-        if self.link != "up":
-            self._good_in_row = 0
+        # Never up in the update that saw a restart: who drives has to see the link go first.
+        self._link.judge(now_ns, may_rise=not self._starting_over)
+        check = self.check
+        settled = check.state == "plain" or check.checked
+        if settled and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns:
+            check.begin()
+        check.judge(now_ns)
 
     def _bad(self) -> None:
         """A line came that is none; so many in a row that a check in force has to be asked anew."""
-        self._miss()
-        self._bad_in_row += 1
-        if self._bad_in_row == BAD_LINES and self.check.state == "checked":
-            if self.link == "up":
-                self.link = "stale"
-            self._good_in_row = 0
+        if self._link.bad() and self.check.checked:
+            self._link.sign("damaged")
             self.check.begin()
 
-    def _tell(self) -> None:
+    def _announce(self) -> None:
         """An event for the link and one for the check, when they have changed."""
         link, check = self.link, self.check
-        before, self._told = self._told, (link, check.in_force, check.refused)
+        before, self._announced = self._announced, (link, check.in_force, bool(check.trouble))
         if link != before[0]:
-            level: Literal["info", "warning"] = "info" if link in ("up", "booting") else "warning"
-            text = self.words() if self._damaged else LINK_WORDS[link]
-            self.events.append(Event(f"link_{link}", text, level))
-        if check.in_force != before[1] and check.state != "asking":
-            fallen = check.state == "plain" or (self._wants_samples and not check.samples)
+            text = self.words() if self._damaged else WORDS[link]
+            good = link in ("up", "booting")
+            self.events.append(Event(f"link_{link}", text, "info" if good else "warning"))
+        if check.in_force != before[1] and not check.asking:
+            fallen = check.state == "plain" or (self._wants_samples and check.state == "checked")
             text = f"the serial lines are {check.in_force}"
             if check.state == "plain":
                 text += ": the microcontroller answers without a check"
             elif fallen:
                 text += ": the microcontroller sends no counts"
             self.events.append(Event("link_check", text, "warning" if fallen else "info"))
-        if check.refused and not before[2]:
-            self.events.append(Event("link_check", check.refusal(), "error"))
+        if check.trouble and not before[2]:
+            self.events.append(Event("link_check", MENDS[check.trouble], "error"))
 
     # lines
 
@@ -236,15 +196,16 @@ class McuSession:
         if line.startswith(IDENTITY):
             self._restart(f"has started: {line.decode('ascii', 'replace')}")
             return None
-        if self.check.state == "asking" and self.check.echoed(line):
+        check = self.check
+        if check.asking and check.echoed(line):
             self.rejects["echo"] += 1
-            self._miss()
+            self._link.missed()
             return None
         try:
-            if self.check.state == "checked" or (self.check.state == "asking" and b"#" in line):
+            if check.checked or (check.asking and b"#" in line):
                 reply = unseal(line)
                 speeds = self.codec.decode(reply.plain)
-                asked_ns = self.check.answered(reply, read_at.mono_ns)
+                asked_ns = check.answered(reply, read_at.mono_ns)
                 feedback = self._good(speeds, reply.reading, read_at, following)
                 return replace(feedback, asked_ns=asked_ns)
             speeds = self.codec.decode(line)
@@ -252,33 +213,22 @@ class McuSession:
             self.rejects[error.reason] += 1
             self._bad()
             return None
-        if self.check.state == "asking":
-            self.check.heard_plain()
+        if check.asking:
+            check.heard_plain()
             return None
         return self._good(speeds, None, read_at, following)
 
     def _good(
         self, speeds: WheelSpeeds, reading: Reading | None, read_at: Instant, following: int
     ) -> Feedback:
-        if self.silent(read_at.mono_ns):
-            self._miss()
-            if self._heard_ns is not None:
-                self.sparse_s = (read_at.mono_ns - self._heard_ns) / NS_PER_S
-        else:
-            self.sparse_s = 0.0
         self.good_lines += 1
-        self._good_in_row += 1
-        self._bad_in_row = 0
-        heard, self._heard_ns = self._heard_ns, read_at.mono_ns
-        gap = heard is None or read_at.mono_ns - heard > self.quiet_ns
-        if heard is not None and read_at.mono_ns - heard >= LONG_GAP_NS:
+        since_ns = self._link.good(read_at.mono_ns)
+        if since_ns is not None and since_ns >= LONG_GAP_NS:
             self.restarted = True
+        gap = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, read_at, following, gap)
         if self._timeline.leaps:
             self.rejects["count_leap"] = self._timeline.leaps
         if self._timeline.restarted:
             self._restart("has started again: its clock went back")
-        doubt = self._timeline.doubt()
-        if doubt:
-            self.events.append(Event("encoder_counts", doubt, "warning"))
         return feedback

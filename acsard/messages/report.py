@@ -12,6 +12,8 @@ from msgspec.structs import asdict
 
 from acsard.config.baud import wire_use
 from acsard.config.settings import Config
+from acsard.drive.words import waiting
+from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -36,12 +38,9 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S, Instant, Outputs, Sample, Snapshot
+from acsard.values import NS_PER_S, Estimate, Instant, Outputs, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
-
-EXPIRY_DAYS = 30
-"""From when on a certificate that ends is a warning."""
 
 Look = Callable[[], Snapshot]
 
@@ -64,7 +63,7 @@ class _Rate:
 
 
 class Report:
-    """Builds messages from outputs; remembers only the last sample and the last outputs."""
+    """Builds messages from outputs; remembers only the last estimate and the last outputs."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
@@ -73,7 +72,7 @@ class Report:
         self._certificate_ends_ns = certificate_ends_ns
         self._names = list(config.joints.as_tuple())
         self._start = start
-        self._sample: Sample | None = None
+        self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
         self._twist_covariance = [0.0] * 36
@@ -87,23 +86,25 @@ class Report:
         One by one, feedback first: a `state` takes as long to build as ten of the others.
         """
         self._outputs = outputs
-        if outputs.samples:
-            self._sample = outputs.samples[-1]
+        if outputs.estimates:
+            self._estimate = outputs.estimates[-1]
         return self._due(outputs, wanted, look)
 
     def _due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
     ) -> Iterator[tuple[str, Message]]:
-        for sample in outputs.samples:
-            if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(sample.at.mono_ns):
+        for estimate in outputs.estimates:
+            if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(
+                estimate.at.mono_ns
+            ):
                 if "odom" in wanted:
-                    yield "odom", self._odom(sample)
+                    yield "odom", self._odom(estimate)
                 if "tf" in wanted and self._config.odometry.publish_tf:
-                    yield "tf", self._tf(sample)
-            if "wheel_states" in wanted and self._rates["wheel_states"].due(sample.at.mono_ns):
-                yield "wheel_states", self._wheel_states(sample)
+                    yield "tf", self._tf(estimate)
+            if "wheel_states" in wanted and self._rates["wheel_states"].due(estimate.at.mono_ns):
+                yield "wheel_states", self._wheel_states(estimate)
         now_ns = outputs.now.mono_ns
-        if outputs.tick and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
+        if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
@@ -111,16 +112,16 @@ class Report:
 
     def current(self, key: str, look: Look) -> Message | None:
         """The present value of a published key; None when there has been none yet."""
-        sample, outputs = self._sample, self._outputs
+        estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
                 return self.tf_static()
             case "odom":
-                return self._odom(sample) if sample else None
+                return self._odom(estimate) if estimate else None
             case "tf":
-                return self._tf(sample) if sample and self._config.odometry.publish_tf else None
+                return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
             case "wheel_states":
-                return self._wheel_states(sample) if sample else None
+                return self._wheel_states(estimate) if estimate else None
             case "cmd_vel_out":
                 return self._cmd_vel_out(outputs) if outputs else None
             case "state":
@@ -146,8 +147,8 @@ class Report:
             )
         return TFMessage(transforms)
 
-    def _odom(self, sample: Sample) -> Odometry:
-        frames, pose, p = self._config.odometry, sample.pose, sample.covariance
+    def _odom(self, estimate: Estimate) -> Odometry:
+        frames, pose, p = self._config.odometry, estimate.pose, estimate.covariance
         d = frames.pose_covariance_diagonal
         # fmt: off
         covariance = [
@@ -160,24 +161,24 @@ class Report:
         ]
         # fmt: on
         return Odometry(
-            Header(Time.from_ns(sample.at.wall_ns), frames.odom_frame),
+            Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,
             PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), covariance),
-            TwistWithCovariance(_twist(sample.twist), self._twist_covariance),
+            TwistWithCovariance(_twist(estimate.twist), self._twist_covariance),
         )
 
-    def _tf(self, sample: Sample) -> TFMessage:
-        frames, pose = self._config.odometry, sample.pose
-        header = Header(Time.from_ns(sample.at.wall_ns), frames.odom_frame)
+    def _tf(self, estimate: Estimate) -> TFMessage:
+        frames, pose = self._config.odometry, estimate.pose
+        header = Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame)
         where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
         return TFMessage([TransformStamped(header, frames.base_frame, where)])
 
-    def _wheel_states(self, sample: Sample) -> JointState:
+    def _wheel_states(self, estimate: Estimate) -> JointState:
         return JointState(
-            header=Header(Time.from_ns(sample.at.wall_ns)),
+            header=Header(Time.from_ns(estimate.at.wall_ns)),
             name=self._names,
-            position=list(sample.positions),
-            velocity=list(sample.speeds.as_tuple()),
+            position=list(estimate.positions),
+            velocity=list(estimate.speeds.as_tuple()),
         )
 
     def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
@@ -198,7 +199,8 @@ class Report:
             link=outputs.link,
             source=outputs.source,
             sources=[
-                SourceState(s.name, s.priority, s.age_s, s.waits_for) for s in snapshot.sources
+                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for))
+                for s in snapshot.sources
             ],
             refused=snapshot.refused,
             certificate=self._certificate(outputs.now)[1],
@@ -213,12 +215,7 @@ class Report:
         """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""
         if not self._config.bus.tls:
             return 0, ""
-        if self._certificate_ends_ns is None:
-            return 1, "unknown: the library to read it is missing (pip install 'acsard[lan]')"
-        days = (self._certificate_ends_ns - now.wall_ns) / NS_PER_S / 86400
-        if days < 0:
-            return 2, f"ended {-days:.0f} days ago: nobody can join any more"
-        return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"
+        return expiry(self._certificate_ends_ns, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures
@@ -252,7 +249,7 @@ class Report:
                 "commands",
                 ok,
                 f"commanded by {outputs.source}" if outputs.source else "no commands",
-                {s.name: s.waits_for or "driving" for s in snapshot.sources}
+                {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
             *([("certificate", *certificate, {})] if certificate[1] else []),

@@ -6,13 +6,15 @@ that is not here does not exist.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 from msgspec import Struct
 
 from acsard.values import ROOT, Verb
 
-Direction = Literal["out", "in", "query"]
+Direction = Literal["out", "in", "query", "service"]
+"""A query only asks and may be asked by wildcard; a service acts, and only by its exact key."""
 
 
 class Topic(Struct, frozen=True):
@@ -31,9 +33,9 @@ class Topic(Struct, frozen=True):
         return self.key.replace("<source>", "*").replace("<Type>", "*")
 
 
-SERVICES: tuple[str, ...] = get_args(Verb)
+SERVICES: tuple[Verb, ...] = get_args(Verb)
 
-_SERVICE_NOTES = {
+_SERVICE_NOTES: dict[Verb, str] = {
     "stop": "stop and stay stopped until clear",
     "clear": "release a stop or a fault",
     "activate": "switch on; commands count",
@@ -41,6 +43,15 @@ _SERVICE_NOTES = {
     "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
     "set_pose": "the pose becomes the payload {x, y, yaw}",
 }
+
+
+def service_key(verb: str) -> str:
+    """The key of a service."""
+    return f"srv/{verb}"
+
+
+VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
+"""What each service asks of the robot, by its key."""
 
 TOPICS: tuple[Topic, ...] = (
     Topic("odom", "out", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
@@ -53,7 +64,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
-    *(Topic(f"srv/{s}", "query", "ServiceReply", "", _SERVICE_NOTES[s]) for s in SERVICES),
+    *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
     Topic("info", "query", "Info", "", "who is this daemon"),
     Topic("config", "query", "configuration", "", "the configuration in force"),
     Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
@@ -71,6 +82,13 @@ PUBLISHED: tuple[Topic, ...] = tuple(
 def full_key(robot_id: str, key: str) -> str:
     """The key on the bus."""
     return f"{ROOT}/{robot_id}/{key}"
+
+
+def source_keys(sources: Iterable[str]) -> list[str]:
+    """The keys that these sources command on."""
+    templates = [topic.key for topic in TOPICS if "<source>" in topic.key]
+    names = list(sources)
+    return [key.replace("<source>", name) for key in templates for name in names]
 
 
 def by_key(key: str) -> Topic | None:

@@ -12,7 +12,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.config.settings import Config, RosConfig
-from acsard.messages.topics import Direction
+from acsard.messages.topics import Direction, service_key
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
 
@@ -25,6 +25,7 @@ class RosName(Struct, frozen=True):
     name: str
     native: str
     direction: Direction
+    """That of the native key; to ROS a query is a service too."""
     type: str
     qos: Qos = Qos()
 
@@ -42,6 +43,8 @@ class Endpoint(Struct, frozen=True):
     type: str
     """The ROS type its key names; by a bridge, where a name may take two, the first."""
 
+
+KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
 
 TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
 
@@ -97,7 +100,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
             "sensor_msgs/msg/JointState",
         ),
         *(
-            RosName(f"{ros.node}/{verb}", f"srv/{verb}", "query", "std_srvs/srv/Trigger")
+            RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
             for verb in TRIGGERS
         ),
         *(
@@ -137,10 +140,6 @@ def _node(ros: RosConfig, zid: str) -> Node:
     return Node(ros.domain, zid, ros.namespace, ros.node)
 
 
-def _kind(row: RosName) -> Kind:
-    return {"out": "MP", "in": "MS", "query": "SS"}[row.direction]  # type: ignore[return-value]
-
-
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
     """One key a name; a topic of two types cannot be announced, as a DDS reader has one."""
     for row in names:
@@ -150,7 +149,7 @@ def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[En
         name = full_name(ros.namespace, row.name)
         token = ""
         if ros.announce and len(twins) == 1:
-            token = bridge_token(zid, _kind(row), name, row.type, row.qos)
+            token = bridge_token(zid, KINDS[row.direction], name, row.type, row.qos)
         yield _endpoint("bridge", row, bridge_key(name), token)
 
 
@@ -158,7 +157,7 @@ def _rmw(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpo
     node = _node(ros, zid)
     for number, row in enumerate(names, start=1):
         name = full_name(ros.namespace, row.name)
-        token = node.endpoint_token(number, _kind(row), name, row.type, row.qos)
+        token = node.endpoint_token(number, KINDS[row.direction], name, row.type, row.qos)
         yield _endpoint("rmw", row, rmw_key(ros.domain, name, row.type), token)
 
 

@@ -1,6 +1,6 @@
-"""Collects inputs, calls `step`, carries the outputs. Decides nothing.
+"""Collects inputs, calls `Robot.step`, carries the outputs. Decides nothing.
 
-Synchronous on purpose: the daemon calls `wake` from one task, the tests call it in virtual time.
+Synchronous on purpose: the daemon calls `step` from one task, the tests call it in virtual time.
 """
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from acsard.config.baud import PLAIN_BYTES, wire_ns
+from acsard.config.baud import wire_ns
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.bus import Bus
-from acsard.incoming.commands import Receiver, voice
+from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.queries import Queries
 from acsard.mcu.pace import Pace
 from acsard.mcu.port import Port
-from acsard.mcu.roundtrip import RoundTrip
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
 from acsard.robot import Robot
-from acsard.runtime.figures import Figures
+from acsard.runtime.period import NO_PERIOD, Period
+from acsard.runtime.stopwatch import Stopwatch
 from acsard.values import (
     NS_PER_S,
     Command,
@@ -59,12 +59,12 @@ class ControlLoop:
     ) -> None:
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
-        self.figures = Figures()
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
+        stop = self.robot.session.codec.stop
         self._guard = Guard(
-            self.robot.session.codec.stop,
+            stop,
             config.limits.wheel_speed,
             config.commands.sources,
             require_check=config.mcu.link_check == "require",
@@ -72,15 +72,14 @@ class ControlLoop:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        self._superseded = False
-        self._trip = ""
+        self._last = stop
+        """The line that went last."""
+        self._superseded, self._trip = False, ""
+        """What became of the last line made; told to the robot with the next step."""
         # The longest line of either direction: answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
-        self._round_trip = RoundTrip(2 * wire_ns(PLAIN_BYTES, config.mcu.baud_rate))
-        self._prompted = not config.mcu.reply_period
-        self._line_ns = 0
-        """When the last line left."""
+        self._stopwatch = Stopwatch()
 
     @property
     def at_rest(self) -> bool:
@@ -90,21 +89,27 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """When to wake again for a command that came too soon after a line; None for no need."""
-        return self._pace.retry_ns
+        """When to step again for a command that came too soon after a line; None for no need."""
+        return self._pace.retry_ns(self._port.sent_ns)
 
-    def wake(self, now: Instant, tick: bool, missed: int = 0, late_ns: int = 0) -> Outputs:
-        """One step at `now`; `tick` with the period's lateness and how many were missed."""
-        if tick:
-            self.figures.add("period_lateness", now.mono_ns, late_ns)
-            if missed:
-                self.robot.counters["missed_periods"] += missed
+    @property
+    def listens(self) -> bool:
+        """Worth a step of its own: a command that comes in now. Else the next period has it."""
+        return self._pace.listens
+
+    def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
+        """One step at `now`, at the end of a period or between two."""
+        ended, missed = period.expired > 0, max(0, period.expired - 1)
+        if ended:
+            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns)
+        if missed:
+            self.robot.counters["missed_periods"] += missed
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self._pace
         inputs = Inputs(
             now=now,
-            tick=tick and pace.tick(missed),
-            at_once=pace.at_once(now.mono_ns),
+            tick=ended and pace.tick(missed),
+            at_once=pace.at_once(now.mono_ns, port.sent_ns),
             port_open=port.is_open,
             opened=port.opened,
             port_trouble=port.trouble,
@@ -116,14 +121,12 @@ class ControlLoop:
             superseded=self._superseded,
             leaving=self.leaving,
         )
-        self._trip = ""
         outputs = self.outputs = self.robot.step(inputs)
-        sent = self._send(outputs, now, inputs.tick)
+        went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
-        pace.note(inputs.tick, outputs.tick, port.sent_ns if sent else None, outputs.news, heard)
+        pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
-        self._bus.alert(pace.listens)
-        self.figures.add("step_time", now.mono_ns, self._mono_ns() - now.mono_ns)
+        self._stopwatch.step(now.mono_ns, self._mono_ns())
         return outputs
 
     def _from_bus(
@@ -149,7 +152,7 @@ class ControlLoop:
                         error.reason,
                         f"{arrival.key}: {error}",
                         arrival.key.partition("/")[2],
-                        voice(arrival),
+                        sender(arrival),
                         arrival.arrived_ns,
                     )
                 )
@@ -164,36 +167,27 @@ class ControlLoop:
                 continue
             for reply in served:
                 self._bus.reply(reply)
-            self._bus.done(query.number)
+            self._bus.retire(query.ticket)
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bool:
-        line = self._guard.check(outputs)
-        self._trip = self._guard.trip
+        """Offer the line; whether it went. What became of it the robot hears with the next step."""
+        line, self._trip = self._guard.check(outputs, self._last)
+        self._superseded = False
         if line is None:
-            self._superseded = self._superseded and not outputs.tick
             return False
+        before_ns = self._port.sent_ns
         offered = self._port.offer(line, now)
-        self._superseded = offered != "sent"
         if offered == "sent":
-            self._measure(outputs)
-            self._guard.note_sent()
+            self._last = line
+            self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
             self.robot.counters["lines_sent"] += 1
-        elif offered == "superseded" and tick:
+            return True
+        self._superseded = True
+        if offered == "superseded" and tick:
             # One that could not go at once has its period still before it.
             self.robot.counters["lines_superseded"] += 1
-        return offered == "sent"
-
-    def _measure(self, outputs: Outputs) -> None:
-        """A line went: how old is what it says?"""
-        sent_ns, command_ns = self._port.sent_ns, outputs.command_ns
-        if self._prompted:
-            self._round_trip.sent(sent_ns)
-        if command_ns is not None and outputs.mode == "driving":
-            self.figures.add("command_age", sent_ns, sent_ns - command_ns)
-            if command_ns > self._line_ns:  # else it waited for its turn, not for the wire
-                self.figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
-        self._line_ns = sent_ns
+        return False
 
     def _publish(self, outputs: Outputs) -> None:
         bus, told_ns = self._bus, None
@@ -201,19 +195,13 @@ class ControlLoop:
             bus.publish(key, message)
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
-        for sample in outputs.samples:
-            at_ns, asked_ns = sample.at.mono_ns, sample.asked_ns
-            guessed_ns = self._round_trip.replied(at_ns)
-            trip_ns = guessed_ns if asked_ns is None else at_ns - asked_ns
-            if trip_ns is not None:
-                self.figures.add("mcu_round_trip", at_ns, trip_ns)
-            if told_ns is not None:
-                self.figures.add("feedback_to_bus", told_ns, told_ns - at_ns)
+        for estimate in outputs.estimates:
+            self._stopwatch.feedback(estimate, told_ns)
         for answer in outputs.answers:
             reply = self._queries.answered(answer, outputs.now.wall_ns)
             if reply is not None:
                 bus.reply(reply)
-                bus.done(reply.number)
+                bus.retire(reply.ticket)
         for event in outputs.events:
             self._log(event)
 
@@ -223,4 +211,4 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        return replace(self.robot.snapshot(now_ns), figures=self.figures.measured(now_ns))
+        return replace(self.robot.snapshot(now_ns), figures=self._stopwatch.measured(now_ns))

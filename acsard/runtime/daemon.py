@@ -1,7 +1,7 @@
 """The daemon from start to end; reads top to bottom.
 
-Entering order is simulator, port, bus; leaving in reverse is the shutdown: ramp to zero, STOP,
-port closed, bus closed. A bug in any task ends the process the same way.
+Entering order is simulator, bus, port, control; leaving in reverse is the shutdown: ramp to zero,
+STOP, port closed, bus closed. A bug in any task ends the process the same way.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-import signal
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -28,15 +27,13 @@ from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.ros.trees import left_out
 from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.ticker import Alarm, Ticker
-from acsard.runtime.wakeup import Wakeup
+from acsard.runtime.departure import Departure
+from acsard.runtime.ticker import Ticker
+from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
 from acsard.serial.sim_pty import SimPty
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S
-
-EXIT_RAMP_S = 0.6
-"""Bound on the ramp to zero on the way down; then STOP whatever the speed."""
 
 SWITCH_INTERVAL_S = 0.0005
 """How long another Python thread may hold up the loop; by default 5 ms, half a period."""
@@ -47,51 +44,15 @@ LATCHED_PERIOD_S = 5.0
 SIMULATOR = "sim"
 
 
-class _Departure:
-    """Signals -> the way down: the first begins it, a second cuts the ramp."""
-
-    def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
-        self._log, self._wake, self._manager = log, wake, manager
-        self._starting = asyncio.current_task()
-        self.begun_ns: int | None = None
-        self.hurried = False
-
-    def watch(self) -> None:
-        """Take over the signals; those of a closed terminal must not leave the wheels turning."""
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-            loop.add_signal_handler(number, self._signal, number)
-
-    def started(self) -> None:
-        """From now on there is a robot to ramp down; until now a signal just ended the start."""
-        self._starting = None
-
-    def _signal(self, number: signal.Signals) -> None:
-        self.hurried = self.begun_ns is not None
-        if self.begun_ns is None:
-            self.begun_ns = clock.now().mono_ns
-            self._manager.stopping()
-        self._log.info("signal", signal=number.name, hurried=self.hurried)
-        if self._starting is not None:
-            self._starting.cancel()
-        self._wake()
-
-    def over(self, now_ns: int, at_rest: bool) -> bool:
-        """The ramp has ended, been cut, or had its time."""
-        if self.begun_ns is None:
-            return False
-        return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
-
-
 Announce = Callable[[str, str], None]
 """Called once when everything is up, with the serial device and what is wrong with it, if it is."""
 
 
 async def run(config: Config, log: Log, announce: Announce) -> None:
-    """Run until a signal; raises `ExitError` when it cannot start."""
+    """Run until a signal; raises a `MendableError` when it cannot start."""
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
-    departure = _Departure(log, wake, manager)
+    departure = Departure(log, wake, manager)
     departure.watch()
     log_from_environment()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -112,7 +73,7 @@ async def _run(
     config: Config,
     log: Log,
     announce: Announce,
-    departure: _Departure,
+    departure: Departure,
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
@@ -129,7 +90,7 @@ async def _run(
             config.robot.id,
             sources,
             access_control(config),
-            wake.from_thread,
+            wake,
         )
         port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
         if config.bus.tls:
@@ -159,7 +120,7 @@ async def _run(
 async def _control(
     config: Config,
     control: ControlLoop,
-    departure: _Departure,
+    departure: Departure,
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
@@ -167,17 +128,15 @@ async def _control(
     await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
     gc.collect()
     gc.freeze()  # what lives now lives to the end; later collections need not look at it
-    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker, Alarm(wake) as alarm:
+    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
 
-        def step() -> bool:
+        def step() -> Next | None:
             now = clock.now()
-            period = ticker.take()
             control.leaving = departure.begun_ns is not None
-            late_ns = now.mono_ns - period.due_ns
-            outputs = control.wake(now, period.expired > 0, max(0, period.expired - 1), late_ns)
-            manager.step(outputs)
-            alarm.set(control.retry_ns)
-            return departure.over(now.mono_ns, control.at_rest)
+            manager.step(control.step(now, ticker.take()))
+            if departure.over(now.mono_ns, control.at_rest):
+                return None
+            return Next(control.listens, control.retry_ns)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)

@@ -28,7 +28,8 @@ command_to_wire  from a command's arrival here to the line that first follows it
                  port; one that first waited for its source's turn is not counted
 feedback_to_bus  from the read of a feedback line's end to its messages handed to the bus; before
                  that it may have waited in the kernel, for no longer than the loop stood still
-mcu_round_trip   from a line to the end of its answer; see `mcu/roundtrip.py`
+mcu_round_trip   from a line to the end of its answer, where a checked reply tells which line it
+                 answers; lines are pipelined, and nothing else does
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)

@@ -7,16 +7,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from msgspec import Struct
-
 from acsard.host.timerfd import TimerFd
-
-
-class Period(Struct, frozen=True):
-    """`expired` periods ended since the last look (0: none), the first of them due at `due_ns`."""
-
-    expired: int
-    due_ns: int
+from acsard.runtime.period import Period
 
 
 class _Timer:

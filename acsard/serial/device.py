@@ -1,44 +1,29 @@
-"""The serial device itself: opened raw and locked, closed off the event loop, explained in words.
+"""The serial device itself: opened raw and locked, drained, closed; refusals in words.
 
 What lives here: system calls on a device and what their errors mean for a person. What must not:
-when to open, reopen or send (`port.py`).
+when to open, reopen or send (`port.py` for the daemon, `blocking.py` for the tools).
 """
 
 from __future__ import annotations
 
+import array
 import errno
 import fcntl
 import os
+import stat
 import termios
 import threading
-from pathlib import Path
+from collections.abc import Iterator
 
 import serial
-import serial_asyncio
 
+from acsard.host import clock
+from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
+from acsard.host.exits import Exit, ExitError
+from acsard.host.processes import holder_of
 
-def close_elsewhere(transport: serial_asyncio.SerialTransport) -> None:
-    """End the transport, but close the device in a thread: a driver may drain for 30 s first.
-
-    The transport itself would drain and close on the event loop, so it is given /dev/null to do
-    that to.
-    """
-    transport.pause_reading()
-    fd = transport.serial.fileno()
-    device, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
-    os.dup2(null, fd, inheritable=False)
-    os.close(null)
-    transport.abort()
-
-    def close() -> None:
-        try:
-            # A pty outlives us with this flag, and nobody else could open it.
-            fcntl.ioctl(device, termios.TIOCNXCL)
-        except OSError:
-            pass  # the device is gone
-        os.close(device)
-
-    threading.Thread(target=close, name="close port", daemon=True).start()
+DRAIN_STEP_S = 0.001
+"""Between two looks at what has not left yet: a tenth of a line's time."""
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
@@ -71,45 +56,85 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
     return device
 
 
-def port_owner(path: str) -> int | None:
-    """The process that holds the port's lock, else one that has it open, where we may see it."""
-    device, found = os.path.realpath(path), None
-    for entry in Path("/proc").glob("[0-9]*/fd/*"):
-        process = entry.parents[1]
+def unsent(fd: int) -> int:
+    """Bytes the driver has not sent yet; 0 where it cannot say (a pty)."""
+    waiting = array.array("i", [0])
+    try:
+        fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
+    except OSError:
+        return 0
+    return waiting[0]
+
+
+def draining(fd: int, deadline_ns: int) -> Iterator[float]:
+    """The pauses to make, s, until all bytes have left or the time is over."""
+    while unsent(fd) and clock.mono_ns() < deadline_ns:
+        yield DRAIN_STEP_S
+
+
+def unlock(fd: int) -> None:
+    """Let others open it: a pty outlives us with our mark, and nobody else could."""
+    try:
+        fcntl.ioctl(fd, termios.TIOCNXCL)
+    except OSError:
+        pass  # the device is gone
+
+
+def close(device: serial.Serial, *, lost: bool = False) -> threading.Thread:
+    """Throw away what is stuck, unlock, close in a thread: a driver may drain for 30 s first.
+
+    `device` is left with /dev/null, which its owner may drain and close in no time.
+    """
+    fd = device.fileno()
+    if lost or unsent(fd):
+        # Only what is stuck: on a pty a flush throws away a STOP that is already through.
         try:
-            if str(entry.readlink()) != device or process.name == str(os.getpid()):
-                continue
-            found = int(process.name)
-            if "lock:" in (process / "fdinfo" / entry.name).read_text():
-                return found
-        except OSError:
-            continue  # it has ended, or is not ours to look at
-    return found
+            device.reset_output_buffer()
+        except (OSError, termios.error):
+            pass  # the device is gone, and with it what was queued
+    real, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    os.dup2(null, fd, inheritable=False)
+    os.close(null)
+
+    def end() -> None:
+        unlock(real)
+        os.close(real)
+
+    thread = threading.Thread(target=end, name="close port", daemon=True)
+    thread.start()
+    return thread
 
 
-def in_use(path: str) -> str:
-    owner = port_owner(path)
-    who = f"process {owner}" if owner else "another process"
-    return f"{path} is in use by {who}; stop it first (`systemctl stop acsard` if that is it)"
-
-
-def no_permission(path: str) -> str:
-    return (
-        f"no permission to open {path}; add the user to the device's group "
-        "(`sudo usermod -aG dialout $USER`, then log in again; a service has dialout already: "
-        "is the device in another group, or of a kind its unit does not allow?)"
-    )
-
-
-def why_closed(path: str, error: OSError) -> str:
+def refusal(path: str, error: OSError) -> MendableError:
+    """Why the port cannot be opened: how a one-shot tool ends; the daemon may wait instead."""
     match error.errno:
-        case errno.ENOENT | errno.ENODEV | errno.ENXIO:
-            return f"{path} is not there; plug it in or correct mcu.port; waiting for it"
-        case errno.EACCES | errno.EPERM:
-            return no_permission(path) + "; retrying"
-        case errno.EBUSY | errno.EAGAIN:
-            return in_use(path) + "; retrying"
+        case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
+            return NoPortError(f"{path} is not there; plug it in, or name another ({_LISTED})")
         case errno.ENOTTY | errno.EISDIR:
-            return f"{path} is not a serial device; correct mcu.port"
+            return NoPortError(f"{path} is not a serial port; name another ({_LISTED})")
+        case errno.EACCES | errno.EPERM:
+            return NotPermittedError(f"no permission to open {path}; {_JOIN}")
+        case errno.EBUSY | errno.EAGAIN:
+            holder = holder_of(path)
+            who = f"process {holder.pid}" if holder else "another process"
+            return InUseError(f"{path} is in use by {who}; {_FREE}")
         case _:
-            return f"cannot open {path}: {error}; retrying"
+            return ExitError(Exit.FAILURE, f"cannot open {path}: {error}")
+
+
+_LISTED = "`acsard ports` lists what there is"
+_FREE = "stop it first (`systemctl stop acsard` if that is it)"
+_JOIN = (
+    "add the user to the device's group (`sudo usermod -aG dialout $USER`, then log in again; a "
+    "service has dialout already: is the device in another group, or of a kind its unit does not "
+    "allow?)"
+)
+
+
+def require(path: str) -> None:
+    """Raises `refusal` when it is no device: a daemon waits for its port, a tool must not."""
+    try:
+        if not stat.S_ISCHR(os.stat(path).st_mode):
+            raise OSError(errno.ENOTTY, "no character device")
+    except OSError as error:
+        raise refusal(path, error) from None

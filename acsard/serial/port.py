@@ -7,13 +7,10 @@ with a time limit, since drivers may block.
 
 from __future__ import annotations
 
-import array
 import asyncio
 import errno
-import fcntl
 import itertools
 import os
-import termios
 from collections.abc import Callable
 from types import TracebackType
 
@@ -21,17 +18,10 @@ import serial
 import serial_asyncio
 
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import in_thread
-from acsard.mcu.port import Offered
-from acsard.mcu.wire import LineGate
-from acsard.serial.device import (
-    close_elsewhere,
-    in_use,
-    no_permission,
-    open_raw,
-    why_closed,
-)
+from acsard.mcu.port import Gate, Offered
+from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
 
 OPEN_TIMEOUT_S = 5.0
@@ -42,10 +32,6 @@ BACK_OFF_S = (0.05, 0.1, 0.2)
 
 PERMISSION_PATIENCE_S = 2.0
 """How long a start waits for udev to grant access before it gives up."""
-
-STALE_NS = 10_000_000
-"""From the start of a step to its line: a period at the usual rate, a hundred times what it takes
-unless the process is stopped in between."""
 
 FAREWELL_S = 0.15
 """Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
@@ -67,17 +53,19 @@ class SerialPort:
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
         self._wake, self._log = wake, log
         self._received: list[Received] = []
-        self._gate = LineGate(baud_rate)
+        self._gate = Gate(baud_rate, stop)
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
-        self._waiting = array.array("i", [0])
-        self.sent_ns = 0
-        """When the last line had been handed to the kernel, monotonic."""
         self.trouble = ""
         """Why the port is closed, in words; "" while it is open."""
 
     # the control loop's view
+
+    @property
+    def sent_ns(self) -> int:
+        """When the last line had been handed to the kernel, monotonic."""
+        return self._gate.sent_ns
 
     def take(self) -> tuple[Received, ...]:
         """What was received since the last call."""
@@ -91,12 +79,9 @@ class SerialPort:
         """Send the line now, or say that it did not go; it is never kept."""
         if not self.is_open:
             return "down"
-        if not self._gate.may_send(now.mono_ns, self._kernel_bytes()):
+        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), unsent(self._fd))
+        if data is None:
             return "superseded"
-        if line != self._stop and clock.mono_ns() - now.mono_ns > STALE_NS:
-            return "superseded"  # we stood still in the middle of a step: what it says is old
-        instead = self._gate.first and line != self._stop
-        data = self._gate.prefix + (self._stop if instead else line)
         try:
             taken = os.write(self._fd, data)
         except BlockingIOError:
@@ -105,17 +90,7 @@ class SerialPort:
             self._leave(error)
             return "down"
         # From the moment it went, not from the start of the step that made it.
-        self.sent_ns = clock.now().mono_ns
-        self._gate.note_sent(self.sent_ns, len(data), taken)
-        return "sent" if taken == len(data) and not instead else "superseded"
-
-    def _kernel_bytes(self) -> int:
-        """Bytes the driver has not sent yet; 0 where it cannot say (a pty)."""
-        try:
-            fcntl.ioctl(self._fd, termios.TIOCOUTQ, self._waiting)
-        except OSError:
-            return 0
-        return self._waiting[0]
+        return self._gate.took(line, data, taken, clock.mono_ns())
 
     # opening and reopening
 
@@ -126,15 +101,14 @@ class SerialPort:
                 await self._open()
                 return self
             except OSError as error:
-                # serial.SerialException carries the errno but not OSError's subclasses.
-                if error.errno in (errno.EBUSY, errno.EAGAIN):
-                    raise ExitError(Exit.IN_USE, in_use(self._path)) from error
-                if error.errno not in (errno.EACCES, errno.EPERM):
-                    self._complain(error)
-                    return self
-                if clock.now().mono_ns > deadline_ns:
-                    raise ExitError(Exit.NO_PERMISSION, no_permission(self._path)) from error
-                await asyncio.sleep(BACK_OFF_S[-1])
+                refused = refusal(self._path, error)
+            denied = isinstance(refused, NotPermittedError)
+            if isinstance(refused, InUseError) or (denied and clock.mono_ns() > deadline_ns):
+                raise refused
+            if not denied:
+                self._complain(refused)
+                return self
+            await asyncio.sleep(BACK_OFF_S[-1])
 
     async def keep_open(self) -> None:
         """Reopen the port whenever it is lost, for ever."""
@@ -146,7 +120,7 @@ class SerialPort:
                     await self._open()
                     break
                 except OSError as error:
-                    self._complain(error)
+                    self._complain(refusal(self._path, error))
                     await asyncio.sleep(BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)])
 
     async def _open(self) -> None:
@@ -161,7 +135,7 @@ class SerialPort:
             raise OSError(errno.EIO, "the driver did not answer") from None
         self._lost.clear()
         self._fd = device.fileno()
-        self._gate = LineGate(baud_rate)
+        self._gate = Gate(baud_rate, self._stop)
         self._received.clear()
         loop = asyncio.get_running_loop()
         self._transport, _ = await serial_asyncio.connection_for_serial(
@@ -171,9 +145,9 @@ class SerialPort:
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
-    def _complain(self, error: OSError) -> None:
+    def _complain(self, refused: MendableError) -> None:
         """Say once why the port cannot be opened, not at every attempt."""
-        text = why_closed(self._path, error)
+        text = f"{refused}; retrying"
         if text != self.trouble:
             self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
@@ -191,13 +165,10 @@ class SerialPort:
         self.is_open = False
         transport, self._transport = self._transport, None
         if transport is not None and transport.serial is not None:
-            if error is not None or self._kernel_bytes():
-                # Only what is stuck: on a pty a flush throws away a STOP that is already through.
-                try:
-                    transport.serial.reset_output_buffer()
-                except (OSError, termios.error):
-                    pass  # the device is gone, and with it what was queued
-            close_elsewhere(transport)
+            # The transport would drain and close on the event loop: it gets /dev/null to do it to.
+            transport.pause_reading()
+            close(transport.serial, lost=error is not None)
+            transport.abort()
         if error is not None:
             self.trouble = f"the serial port {self._path} was lost ({error}); reopening it"
             self._log(Event("port_lost", self.trouble, "warning"))
@@ -218,8 +189,8 @@ class SerialPort:
             if clock.now().mono_ns > deadline_ns:
                 break
             await asyncio.sleep(0.001)
-        while self.is_open and self._kernel_bytes() and clock.now().mono_ns < deadline_ns:
-            await asyncio.sleep(0.001)
+        for pause in draining(self._fd, deadline_ns) if self.is_open else ():
+            await asyncio.sleep(pause)
         self._leave(None)
 
 

@@ -1,6 +1,6 @@
 """A serial line to the fake MCU in virtual time: no clock runs, waiting costs nothing.
 
-The side of `acsard mcu check` that is asked to listen (`checkup.bench.Wire`); a wrong baud rate
+The side of `acsard mcu check` that is asked to listen (`checkup.outside.Wire`); a wrong baud rate
 garbles both ways.
 """
 

@@ -12,11 +12,12 @@ from collections.abc import Collection
 
 import zenoh
 
-from acsard.client import QUEUED, Client
-from acsard.host.exits import Exit, ExitError
+from acsard.bus.subscription import QUEUED
+from acsard.client import Client
+from acsard.host.errors import MendableError, ReplyError
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState
-from acsard.top.view import SILENT_S, Seen
+from acsard.top.seen import SILENT_S, Seen
 
 SPAN_S = 1.0
 """Rates are taken over about this; over less they would jump."""
@@ -56,8 +57,8 @@ class Feed:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:
             self._undecodable += 1
-            raise ExitError(
-                Exit.FAILURE, f"cannot read the state ({error}); is the daemon of another version?"
+            raise ReplyError(
+                f"cannot read the state ({error}); is the daemon of another version?"
             ) from None
         # What came before the answer is older than it.
         come = self._newest()
@@ -106,8 +107,7 @@ class Feed:
             sample = self._samples.try_recv()
             if sample is None:
                 break
-            if str(sample.key_expr) == self._robot.key("state"):  # else a put on a wildcard
-                waiting.append(sample)
+            waiting.append(sample)
         for sample in reversed(waiting):
             try:
                 state = self._decoder.decode(str(sample.encoding), sample.payload.to_bytes())
@@ -128,7 +128,7 @@ class Feed:
     def _refresh_info(self) -> None:
         try:
             self._info = self._ask_info()
-        except ExitError:
+        except MendableError:
             self._info = None
 
 

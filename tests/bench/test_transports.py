@@ -168,6 +168,14 @@ def test_the_cost_of_more_robots() -> None:
 # what nobody listens to
 
 
+class Nobody:
+    """No loop to wake."""
+
+    def command(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
 def encoded(
     monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], one: Config, count: int
 ) -> Counter[str]:
@@ -189,7 +197,7 @@ def encoded(
             one.robot.id,
             sources,
             access_control(one),
-            lambda: None,
+            Nobody(),
         )
         async with bus:
             with listening(one, keys, 1 if keys else 0):

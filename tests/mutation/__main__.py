@@ -40,6 +40,7 @@ CORE = (
     "acsard/mcu/encoders.py",
     "acsard/mcu/frames.py",
     "acsard/mcu/negotiation.py",
+    "acsard/mcu/promptest.py",
     "acsard/robot.py",
 )
 ENOUGH = 0.95

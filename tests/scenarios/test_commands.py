@@ -264,7 +264,7 @@ def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
 
 
 class Person:
-    """One who commands `nav` by one of the three ways; two of them are two voices."""
+    """One who commands `nav` by one of the three ways; two of them are two senders."""
 
     def __init__(self, world: World, via: Via, name: str) -> None:
         self.world, self.via, self.name = world, via, name

@@ -36,8 +36,8 @@ def live(minutes: int) -> dict[str, object]:
         nonlocal trace
         if outputs.line is not None:
             trace = zlib.crc32(outputs.line, trace)
-        for sample in outputs.samples:
-            trace = zlib.crc32(b"%.6f" % sample.pose.x, trace)
+        for estimate in outputs.estimates:
+            trace = zlib.crc32(b"%.6f" % estimate.pose.x, trace)
 
     world.watch = watch
     for minute in range(minutes):

@@ -244,7 +244,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
                 world.send(0.0 if first else -0.5 if old else 0.5, stamp_ns=sent_ns + clock_ns)
                 first = False
                 if old and (slow or dice.random() < 0.5):  # one by one, or all in one step
-                    world.loop.wake(world.instant, tick=False)
+                    world.loop.step(world.instant)
                     accepted += counters["commands"] - obeyed
                 stale += old
             if world.now_ns >= end_ns and not queue and not drained_ns:
@@ -409,9 +409,9 @@ def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
 
     def watch(outputs: Outputs) -> None:
         nonlocal ticks
-        ticks += outputs.tick
-        for sample in outputs.samples:
-            told = (sample.at.mono_ns, msgspec.to_builtins(sample.pose), sample.positions)
+        ticks += outputs.due
+        for estimate in outputs.estimates:
+            told = (estimate.at.mono_ns, msgspec.to_builtins(estimate.pose), estimate.positions)
             trace[0] = zlib.crc32(repr(told).encode(), trace[0])
         if outputs.line is not None:
             trace[1] = zlib.crc32(b"%d %s" % (outputs.now.mono_ns, outputs.line), trace[1])

@@ -16,11 +16,11 @@ from acsard.incoming.bus import BusInput
 from acsard.incoming.commands import Arrival
 from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
-from acsard.mcu.port import Offered
-from acsard.mcu.wire import LineGate
+from acsard.mcu.port import Gate, Offered
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.topics import PUBLISHED
 from acsard.runtime.control_loop import ControlLoop
+from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
 
@@ -36,17 +36,20 @@ class VirtualPort:
         self.opened = 0
         self.blocked = False
         self.trouble = ""
-        self.sent_ns = 0
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._baud_rate = baud_rate
-        self._gate = LineGate(baud_rate)
+        self._gate = Gate(baud_rate, stop)
         self._received: list[Received] = []
+
+    @property
+    def sent_ns(self) -> int:
+        return self._gate.sent_ns
 
     def plug(self, mcu: FakeMcu) -> None:
         self.mcu, self.is_open = mcu, True
         self.opened += 1
-        self._gate = LineGate(self._baud_rate)
+        self._gate = Gate(self._baud_rate, self._stop)
 
     def unplug(self) -> None:
         self.mcu, self.is_open = None, False
@@ -63,16 +66,12 @@ class VirtualPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         if self.mcu is None:
             return "down"
-        if self.blocked or not self._gate.may_send(now.mono_ns, 0):
+        data = self._gate.prepare(line, now.mono_ns, now.mono_ns, int(self.blocked))
+        if data is None:
             return "superseded"
-        instead = self._gate.first and line != self._stop
-        line = self._stop if instead else line
-        data = self._gate.prefix + line
         self.mcu.receive(now.mono_ns, data)
-        self._gate.note_sent(now.mono_ns, len(data), len(data))
-        self.sent_ns = now.mono_ns
-        self.sent.append((now.mono_ns, line))
-        return "superseded" if instead else "sent"
+        self.sent.append((now.mono_ns, data.removeprefix(b"\r\n")))
+        return self._gate.took(line, data, len(data), now.mono_ns)
 
 
 class MemoryBus:
@@ -85,10 +84,6 @@ class MemoryBus:
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
         self.queries: list[Query] = []
-        self.alerted = False
-
-    def alert(self, on: bool) -> None:
-        self.alerted = on
 
     def take(self, queries: int) -> BusInput:
         got = BusInput(tuple(self.arrivals), tuple(self.queries[:queries]))
@@ -100,10 +95,10 @@ class MemoryBus:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
 
     def reply(self, reply: Reply) -> None:
-        self.replies.setdefault(reply.number, []).append(reply)
+        self.replies.setdefault(reply.ticket, []).append(reply)
 
-    def done(self, number: int) -> None:
-        self.finished.add(number)
+    def retire(self, ticket: int) -> None:
+        self.finished.add(ticket)
 
 
 class World:
@@ -141,7 +136,8 @@ class World:
         self._alarm_set_ns: int | None = None
         """As `runtime.ticker.Alarm` keeps them: when it rings, what it was last set to."""
         self._missed = 0
-        self._due_ns = self.now_ns
+        self._listens = False
+        """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
 
     @property
     def instant(self) -> Instant:
@@ -158,21 +154,22 @@ class World:
             if alarm_ns is not None and alarm_ns <= min(at_ns, end_ns):
                 self._alarm_ns = None
                 self.now_ns = max(self.now_ns, alarm_ns)
-                self._wake(tick=False)
+                self._step()
                 continue
             if at_ns > end_ns:
                 self.now_ns = max(self.now_ns, end_ns)
                 return
             self.now_ns = max(self.now_ns, at_ns)
             if tick:
-                self._due_ns = self.next_tick_ns - self._missed * self.period_ns
+                due_ns = self.next_tick_ns - self._missed * self.period_ns
                 self.next_tick_ns += self.period_ns
-                self._wake(tick=True)
+                self._step(Period(1 + self._missed, due_ns))
+                self._missed = 0
             elif self.port.mcu is not None:
                 data = self.port.mcu.advance(at_ns)
                 if data:
                     self.port.feed(Received(self.instant, data))
-                    self._wake(tick=False)
+                    self._step()
 
     def stall(self, seconds: float) -> None:
         """The loop does not run, the world goes on."""
@@ -184,11 +181,10 @@ class World:
         self._missed = max(0, (self.now_ns - self.next_tick_ns) // self.period_ns)
         self.next_tick_ns += self._missed * self.period_ns
 
-    def _wake(self, tick: bool) -> None:
-        missed = self._missed if tick else 0
-        self._missed -= missed
-        outputs = self.loop.wake(self.instant, tick, missed, self.now_ns - self._due_ns)
+    def _step(self, period: Period = NO_PERIOD) -> None:
+        outputs = self.loop.step(self.instant, period)
         self.steps += 1
+        self._listens = self.loop.listens
         retry_ns = self.loop.retry_ns
         if retry_ns is not None and retry_ns != self._alarm_set_ns:
             self._alarm_ns = retry_ns
@@ -208,9 +204,8 @@ class World:
         self.bus.arrivals.append(
             Arrival(key, put, payload, "", self.now_ns, stamp_ns, "peer" if stamp_ns else "")
         )
-        if self.bus.alerted or key == "stop":
-            self.bus.alerted = False
-            self._wake(tick=False)
+        if self._listens or key == "stop":
+            self._step()
 
     def drive(
         self,
@@ -247,7 +242,7 @@ class World:
         query = Query(self._queries, key, name, fmt, payload, "", self.now_ns)
         self.bus.queries.append(query)
         self.run(2 / self.config.rate_hz)
-        return self.bus.replies.get(query.number, [])
+        return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
         """A service's answer."""

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli.bench import bench_config, measure
+from acsard.bench.measure import measure
+from acsard.bench.setup import bench_config
 from acsard.config.settings import Config, ControlConfig
 from acsard.host.exits import Exit, ExitError
 from tests.system.harness import (
@@ -106,7 +107,7 @@ def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason()
     ("words", "who"),
     [
         ("acsard run", "the daemon"),
-        ("acsard.bench.wire", "the simulated microcontroller's process"),
+        ("acsard.bench.far_end", "the simulated microcontroller's process"),
     ],
 )
 def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str, who: str) -> None:

@@ -241,6 +241,15 @@ def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
         bus.comes_to("ready")
 
 
+def test_a_service_answers_on_its_ros_key_too(bus: Bus) -> None:
+    with restored(bus):
+        for verb, mode in (("deactivate", "inactive"), ("activate", "ready")):
+            (reply,) = bus.session.get(f"acsard/{verb}", payload=b"\0\1\0\0\0", timeout=5.0)
+            assert reply.ok is not None
+            assert reply.ok.payload.to_bytes()[4] == 1  # CDR of `success`
+            assert bus.state()["mode"] == mode
+
+
 def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> None:
     with restored(bus):
         assert bus.get("srv/set_pose", {"x": 1.5, "y": -2.0, "yaw": 0.5})["success"]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from acsard.client import AsyncClient, Client, connect, connect_async
-from acsard.host.exits import ExitError
+from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
 from acsard.messages import schema
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -174,9 +174,9 @@ def test_get_config_and_schema_give_dictionaries(shared: Daemon, fresh: Bus) -> 
 
 
 def test_get_of_a_key_that_is_not_there_says_so(shared: Daemon) -> None:
-    with connect(shared.endpoint) as robot, pytest.raises(ExitError) as error:
+    with connect(shared.endpoint) as robot, pytest.raises(NoAnswerError) as error:
         robot.get("odometry")
-    assert error.value.code == 69
+    assert isinstance(error.value, TimeoutError)
     assert "acsard topics" in str(error.value)
 
 
@@ -201,11 +201,11 @@ def test_messages_of_silence_ends_after_its_timeout(shared: Daemon) -> None:
         assert 0.25 < time.monotonic() - start < 1.5 + lost(start)
 
 
-def test_connecting_to_nobody_is_an_exit_error_with_69_and_the_mend() -> None:
+def test_connecting_to_nobody_is_a_connection_error_with_the_mend() -> None:
     endpoint = free_endpoint()
-    with pytest.raises(ExitError) as error, connect(endpoint):
+    with pytest.raises(UnreachableError) as error, connect(endpoint):
         pass
-    assert error.value.code == 69
+    assert isinstance(error.value, ConnectionError)
     assert endpoint in str(error.value)
     assert "acsard run" in str(error.value)
 
@@ -215,9 +215,42 @@ def test_connecting_async_to_nobody_is_the_same_error() -> None:
         async with connect_async(free_endpoint()):
             pass
 
-    with pytest.raises(ExitError) as error:
+    with pytest.raises(UnreachableError):
         asyncio.run(main())
-    assert error.value.code == 69
+
+
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", ""])
+def test_what_is_no_endpoint_is_a_value_error(endpoint: str) -> None:
+    with pytest.raises(UsageError, match="write it like") as error, connect(endpoint):
+        pass
+    assert isinstance(error.value, ValueError)
+
+
+def test_what_is_no_key_is_a_value_error_that_says_where_the_keys_are(shared: Daemon) -> None:
+    with connect(shared.endpoint) as robot:
+        for use in (robot.get, robot.subscribe, lambda name: next(robot.messages(name))):
+            with pytest.raises(UsageError, match="acsard topics"):
+                use("odom//x")
+
+
+def test_a_question_that_cannot_be_answered_raises_what_the_daemon_says(shared: Daemon) -> None:
+    with connect(shared.endpoint) as robot, pytest.raises(ReplyError, match="fmt=json"):
+        robot.get("odom?fmt=xml")
+
+
+def test_a_put_on_a_wildcard_is_no_message_of_the_robot(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        states = robot.subscribe("state")
+        raw = robot.samples("state", timeout=5.0)
+        next(raw)
+        robot.session.put("acsard/acsar/**", b"{}", encoding="application/json")
+        keys = iter(str(sample.key_expr) for sample in raw)
+        until(lambda: next(keys) == "acsard/acsar/**", 5.0, "the stranger's")
+        until(lambda: next(keys) == "acsard/acsar/state", 5.0, "one of the robot's after it")
+        heard = []
+        while (sample := states.try_recv()) is not None:
+            heard.append(str(sample.key_expr))
+    assert set(heard) == {"acsard/acsar/state"}
 
 
 def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:

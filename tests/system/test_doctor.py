@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from acsard.cli.certificates import Authority
+from acsard.lan.authority import Authority
 from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
 
 pytestmark = pytest.mark.network
@@ -129,7 +129,11 @@ def with_certificates(where: Path, days: float) -> str:
 
 @pytest.mark.parametrize(
     ("days", "level", "words"),
-    [(400, "ok", "valid for"), (10, "warning", "ends in"), (-3, "failure", "ended 3 days ago")],
+    [
+        (400, "ok", "valid for"),
+        (10, "warning", "valid for 10 days"),
+        (-3, "failure", "ended 3 days ago"),
+    ],
 )
 def test_certificates_are_told_by_how_long_they_last(
     tmp_path: Path, days: float, level: str, words: str

@@ -21,11 +21,11 @@ import zenoh
 import zenoh.ext
 from msgspec.structs import astuple
 
-from acsard.cli.certificates import Authority
 from acsard.config.parsing import parse
 from acsard.config.rules import warnings
 from acsard.config.settings import Config
 from acsard.host.exits import Exit
+from acsard.lan.authority import Authority
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
 from tests.system.harness import (
     ROOT,

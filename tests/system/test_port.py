@@ -8,7 +8,8 @@ import tty
 from collections.abc import Sequence
 
 from acsard.host import clock
-from acsard.serial.port import STALE_NS, SerialPort
+from acsard.mcu.port import STALE_NS
+from acsard.serial.port import SerialPort
 from acsard.values import Instant
 
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
+from acsard.host.ports import BOARDS
 from tests.system.harness import ROOT
 from tests.systemd.container import Container
 
@@ -14,9 +15,6 @@ pytestmark = pytest.mark.systemd
 RULES = "/etc/udev/rules.d/70-acsar.rules"
 
 USB = "/devices/pci0000:00/0000:00:14.0/usb1/1-1"
-
-BOARDS = ["2341:0042", "2341:0010", "2a03:0042", "1a86:7523", "1a86:55d4"]
-BOARDS += ["0403:6001", "0403:6015", "10c4:ea60"]
 
 OTHERS = ["2341:0043", "1a86:5523", "0403:6010", "1234:0042", "0042:2341"]
 

@@ -17,6 +17,7 @@ from acsard.config.settings import (
     McuConfig,
     Source,
 )
+from acsard.drive.words import waiting
 from acsard.mcu.frames import Codec
 from acsard.robot import Robot
 from acsard.values import (
@@ -189,10 +190,10 @@ def test_a_port_that_opens_and_a_link_that_comes_up_are_no_warnings() -> None:
     ]
 
 
-def test_every_feedback_line_is_a_sample_with_its_own_stamp() -> None:
+def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
     bench = Bench().linked()
     bench.reply = bench.codec.encode(ROLLING) * 2
-    first, second = bench.step(tick=False).samples
+    first, second = bench.step(tick=False).estimates
     assert second.at == bench.now
     assert first.at.mono_ns == bench.now_ns - 33 * 10 * NS_PER_S // 115200
     assert first.speeds == second.speeds == ROLLING
@@ -201,8 +202,8 @@ def test_every_feedback_line_is_a_sample_with_its_own_stamp() -> None:
 def test_a_step_without_a_tick_folds_feedback_and_sends_nothing() -> None:
     bench = Bench().driving()
     out = bench.step(GO, tick=False)
-    assert len(out.samples) == 1
-    assert (out.line, out.tick) == (None, False)
+    assert len(out.estimates) == 1
+    assert (out.line, out.due) == (None, False)
     assert out.mode == "driving"
 
 
@@ -211,30 +212,30 @@ def test_odometry_follows_the_wheels() -> None:
     bench.reply = bench.codec.encode(ROLLING)
     for _ in range(100):
         bench.step()
-    (sample,) = bench.out.samples
+    (estimate,) = bench.out.estimates
     # 0.5 m/s for 1 s
-    assert sample.pose.x == pytest.approx(0.5)
-    assert sample.twist == Twist(0.5, 0.0)
-    assert sample.positions == pytest.approx((10.0,) * 4)
-    assert sample.covariance.xx == pytest.approx(1e-6 + 0.5e-4)  # 1e-4 m2 per metre
+    assert estimate.pose.x == pytest.approx(0.5)
+    assert estimate.twist == Twist(0.5, 0.0)
+    assert estimate.positions == pytest.approx((10.0,) * 4)
+    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4)  # 1e-4 m2 per metre
     snapshot = bench.robot.snapshot(bench.now_ns)
-    assert (snapshot.pose, snapshot.measured) == (sample.pose, sample.twist)
+    assert (snapshot.pose, snapshot.measured) == (estimate.pose, estimate.twist)
     assert snapshot.speeds == ROLLING
 
 
 def test_a_robot_that_is_found_rolling_starts_at_the_pose_zero() -> None:
     bench = Bench()
     bench.reply = bench.codec.encode(ROLLING)
-    (sample,) = bench.step().samples
-    assert (sample.pose, sample.positions) == (Pose(), (0.0,) * 4)
+    (estimate,) = bench.step().estimates
+    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
 
 
 def test_the_pose_does_not_jump_over_a_lost_port() -> None:
     bench = Bench().linked()
     bench.reply = bench.codec.encode(ROLLING)
-    before = bench.step().samples[-1].pose
+    before = bench.step().estimates[-1].pose
     bench.unplug().step(ms=3000)
-    after = bench.replug().step(ms=3000).samples[-1].pose
+    after = bench.replug().step(ms=3000).estimates[-1].pose
     assert after == before
 
 
@@ -361,7 +362,7 @@ def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None
     bench.step(REST, source="teleop")
     assert bench.step(GO).source == "teleop"
     snapshot = bench.robot.snapshot(bench.now_ns)
-    waits = {source.name: source.waits_for for source in snapshot.sources}
+    waits = {source.name: waiting(source.waits_for) for source in snapshot.sources}
     assert waits["app"] == "teleop has the higher priority: until it is silent"
     assert waits["teleop"] == ""
 
@@ -396,7 +397,7 @@ def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there()
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # never yet
     bench.step(GO)
-    waits = {s.name: s.waits_for for s in bench.robot.snapshot(bench.now_ns).sources}
+    waits = {s.name: waiting(s.waits_for) for s in bench.robot.snapshot(bench.now_ns).sources}
     assert waits["app"] == ""
 
 
@@ -625,14 +626,14 @@ def test_set_pose_puts_the_robot_there() -> None:
     bench = Bench().linked()
     answer = bench.answer("set_pose", Pose(1.0, 2.0, 0.5))
     assert answer == Answer(7, True, "pose is x 1, y 2, yaw 0.5")
-    assert bench.step().samples[-1].pose == Pose(1.0, 2.0, 0.5)
+    assert bench.step().estimates[-1].pose == Pose(1.0, 2.0, 0.5)
 
 
 def test_reset_odometry_is_the_pose_zero() -> None:
     bench = Bench().linked()
     bench.step(ask="set_pose", pose=Pose(1.0, 2.0, 0.5))
     assert bench.answer("reset_odometry") == Answer(7, True, "pose is x 0, y 0, yaw 0")
-    assert bench.step().samples[-1].pose == Pose()
+    assert bench.step().estimates[-1].pose == Pose()
 
 
 def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:

@@ -30,6 +30,7 @@ from acsard.config.settings import (
     McuConfig,
     Source,
 )
+from acsard.drive.words import waiting
 from acsard.guard import Guard
 from acsard.robot import Robot
 from acsard.values import (
@@ -151,6 +152,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.guard = Guard(
             self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
         )
+        self.last = self.robot.session.codec.stop
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s, config.commands.neutral_first) for s in SOURCES}
@@ -467,9 +469,11 @@ class RobotMachine(RuleBasedStateMachine):
         self.check_mode(outputs, requests)
         self.check_odometry(outputs)
         snapshot = self.robot.snapshot(self.now_ns)
-        told = msgspec.to_builtins((outputs.samples, snapshot, outputs.applied, outputs.speeds))
+        told = msgspec.to_builtins((outputs.estimates, snapshot, outputs.applied, outputs.speeds))
         assert all(map(math.isfinite, numbers(told)))
-        assert all(source.waits_for or source.age_s is not None for source in snapshot.sources)
+        assert all(
+            waiting(source.waits_for) or source.age_s is not None for source in snapshot.sources
+        )
 
     def check_mode(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         done = {r.verb for r, a in zip(requests, outputs.answers, strict=True) if a.success}
@@ -482,7 +486,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert mode in (was, "fault")
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
             assert mode == "fault"
-        if mode == "ready" and outputs.tick:
+        if mode == "ready" and outputs.due:
             assert outputs.reason.startswith(("neutral first: ", "no commands: "))
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")
@@ -491,35 +495,34 @@ class RobotMachine(RuleBasedStateMachine):
     def check_odometry(self, outputs: Outputs) -> None:
         """No step is longer than its fastest wheel can make it, nor made up for long silences."""
         drive, feedback = self.config.drive, self.config.feedback
-        for sample in outputs.samples:
-            fastest = max(map(abs, sample.speeds.as_tuple())) * drive.wheel_radius
+        for estimate in outputs.estimates:
+            fastest = max(map(abs, estimate.speeds.as_tuple())) * drive.wheel_radius
             assert fastest <= feedback.wheel_speed * drive.wheel_radius
-            dt = (sample.at.mono_ns - self.sampled_ns) / NS_PER_S
+            dt = (estimate.at.mono_ns - self.sampled_ns) / NS_PER_S
             assert dt >= 0.0
             # What impossible lines cost may be made up for, but not more than `quiet` of it.
             dt = min(dt, 2 * self.quiet_ns / NS_PER_S)
-            x, y = sample.pose.x - self.pose.x, sample.pose.y - self.pose.y
+            x, y = estimate.pose.x - self.pose.x, estimate.pose.y - self.pose.y
             slack = 1e-9 * (1 + abs(self.pose.x) + abs(self.pose.y))
             assert math.hypot(x, y) <= fastest * dt + slack
-            turned = math.remainder(sample.pose.yaw - self.pose.yaw, math.tau)
+            turned = math.remainder(estimate.pose.yaw - self.pose.yaw, math.tau)
             assert abs(turned) <= fastest * 2 / drive.wheel_separation * dt + 1e-9
-            self.pose, self.sampled_ns = sample.pose, sample.at.mono_ns
+            self.pose, self.sampled_ns = estimate.pose, estimate.at.mono_ns
         self.pose = self.robot.snapshot(self.now_ns).pose
 
     def send(self, outputs: Outputs) -> None:
         """The rest of `ControlLoop._send`, with the wire watched."""
-        line = self.guard.check(outputs)
-        self.trip = self.guard.trip
+        line, self.trip = self.guard.check(outputs, self.last)
         assert self.trip == ""
         if line is None:
-            self.superseded = self.superseded and not outputs.tick
+            self.superseded = False
             return
-        assert outputs.tick
+        assert outputs.due
         wheels = self.check_line(line, outputs)
         self.superseded = self.blocked or not self.port_open
         if self.superseded:
             return
-        self.guard.note_sent()
+        self.last = line
         self.sent, self.sent_ns, self.sent_twist = wheels, self.now_ns, outputs.applied
         self.broken = False
         self.told = wheels

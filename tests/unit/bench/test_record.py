@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.bench.far_end import NumberedMcu
 from acsard.bench.matching import Fed, lines_of, staircase
 from acsard.bench.record import Record, Sample, Seen, Sent, command_waits, feedback_fates
-from acsard.bench.wire import NumberedMcu
 from acsard.config.settings import Config, McuConfig, WheelMap
 from acsard.mcu.frames import Codec
 from acsard.values import Instant, WheelSpeeds

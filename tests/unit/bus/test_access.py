@@ -204,7 +204,7 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
 def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
     """A wildcard that meets a service is not let through, so neither is one that includes it."""
     services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
-    services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction == "query"]
+    services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
     for rule in DEFAULT.rules_of(role):
         if "ingress" in rule["flows"] and "query" in rule["messages"]:
             for held in map(zenoh.KeyExpr, rule["key_exprs"]):
@@ -234,7 +234,7 @@ IDS = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
 def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> None:
     access = Access(robot=RobotConfig(id=one), ros=RosConfig(bridge=False, rmw=False))
     for topic in TOPICS:
-        message = {"out": "query", "in": "put", "query": "query"}[topic.direction]
+        message = "put" if topic.direction == "in" else "query"
         key = full_key(other, written(topic.key))
         if one != other:
             assert not any(access.lets(role, message, key) for role in ROLES)
@@ -274,7 +274,7 @@ def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, name
     ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
     access = Access(ros=ros)
     found = endpoints(ros, ZID)
-    assert {endpoint.direction for endpoint in found} == {"in", "out", "query"}
+    assert {endpoint.direction for endpoint in found} == {"in", "out", "query", "service"}
     for endpoint in found:
         key, native = endpoint.key, endpoint.native
         if endpoint.direction == "out":

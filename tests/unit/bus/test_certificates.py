@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from acsard.bus.certificates import check, ends_ns
-from acsard.cli.certificates import Authority
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import CertificateError, NotPermittedError
+from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
 
 DAY_NS = 86400 * NS_PER_S
@@ -44,9 +44,8 @@ BROKEN: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("how", BROKEN)
 def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
     BROKEN[how](made(tmp_path))
-    with pytest.raises(ExitError) as caught:
+    with pytest.raises(CertificateError) as caught:
         check(str(tmp_path))
-    assert caught.value.code is Exit.BAD_CONFIG
     assert str(tmp_path) in str(caught.value)
     assert "acsard lan" in str(caught.value)
 
@@ -54,9 +53,8 @@ def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
 def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
     (made(tmp_path) / "key.pem").chmod(0)
-    with pytest.raises(ExitError) as caught:
+    with pytest.raises(NotPermittedError):
         check(str(tmp_path))
-    assert caught.value.code is Exit.NO_PERMISSION
 
 
 @pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])

@@ -9,12 +9,11 @@ from typing import Any
 import msgspec
 
 from acsard.checkup import advice, procedure
-from acsard.checkup.bench import Bench
+from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.cli.sim import fault
 from acsard.config.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import ARGUMENTS
+from acsard.sim.named_faults import named
 from acsard.sim.virtual_wire import VirtualWire
 
 MS = 1_000_000
@@ -51,22 +50,18 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                name, values = fault(text)
-                kinds = ARGUMENTS.get(name, "")
-                given = [int(v) if v.is_integer() else v for v in values]
-                assert len(kinds) == len(given)
-                stack.enter_context(getattr(self.mcu, name)(*given))
+                stack.enter_context(named(text).on(self.mcu))
             yield
 
     @contextmanager
-    def bench(self, rest: bool = True) -> Iterator[Bench]:
-        """The bench alone, the line open and the motors known to stand, if they can say so."""
-        with self.faulty(), Bench(self, self.config.mcu, self.config.rate_hz) as bench:
-            bench.open(self.config.mcu.baud_rate)
+    def board(self, rest: bool = True) -> Iterator[Board]:
+        """The board alone, the line open and the motors known to stand, if they can say so."""
+        with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
+            board.open(self.config.mcu.baud_rate)
             if rest:
-                bench.rest()
-                bench.armed = True
-            yield bench
+                board.rest()
+                board.armed = True
+            yield board
 
     def later(self) -> list[float]:
         """What the motors are told to do once all that was sent has arrived."""

@@ -57,3 +57,11 @@ def test_what_is_in_use_is_not_taken_away() -> None:
 
 def test_a_value_that_no_key_takes_is_seen() -> None:
     assert advice.applied({"mcu.baud_rate": 300}, Config()) is None
+
+
+def test_a_port_is_written_that_a_board_answered_at() -> None:
+    assert advice.changes(found(trailing_comma=True), Config(), "/dev/one") == {
+        "mcu.trailing_comma": True
+    }
+    answered = [Finding("baud rate", "PASS", keys={"mcu.baud_rate": 115200})]
+    assert advice.changes(answered, Config(), "/dev/one") == {"mcu.port": "/dev/one"}

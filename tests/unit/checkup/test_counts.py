@@ -20,7 +20,7 @@ def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Rep
     for n in range(100):
         turned = round(n * 0.02 * speed / math.tau * per_turn)
         reading = Reading((65500 + 20 * n) % 65536, ((start + turned) % 65536, 0, 0, 0))
-        found.append(Reply(n, (speed, 0.0, 0.0, 0.0), b"", reading))
+        found.append(Reply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
     return found
 
 
@@ -51,38 +51,58 @@ def test_too_little_turned_says_nothing() -> None:
 def test_what_is_said_of_the_configured_counts(
     configured: int, identified: bool, verdict: str, keys: dict[str, object]
 ) -> None:
-    with Robot(link_check="auto", encoder_counts=configured).bench() as bench:
-        check(bench)
+    with Robot(link_check="auto", encoder_counts=configured).board() as board:
+        check(board)
         if identified:
-            identity(bench)
+            identity(board)
         for motor in range(4):
-            turn(bench, motor, 3.0)
-            bench.rest()
-        finding = counts.finding(bench, [0, 1, 2, 3])
+            turn(board, motor, 3.0)
+            board.rest()
+        finding = counts.finding(board, [0, 1, 2, 3])
     assert (finding.verdict, finding.keys) == (verdict, keys)
 
 
 def test_counts_that_are_not_as_identified_are_a_fault() -> None:
-    with Robot(config=Config(sim=SimConfig(encoder_counts=2000))).bench() as bench:
-        check(bench)
-        bench.identity = {"counts": "3200"}
-        turn(bench, 0, 3.0)
-        turn(bench, 0, 3.0)
-        finding = counts.finding(bench, [0])
+    with Robot(config=Config(sim=SimConfig(encoder_counts=2000))).board() as board:
+        check(board)
+        board.identity = {"counts": "3200"}
+        turn(board, 0, 3.0)
+        turn(board, 0, 3.0)
+        finding = counts.finding(board, [0])
     assert finding.verdict == "FAIL"
     assert not finding.keys
 
 
 def test_counts_against_the_speeds_are_a_fault() -> None:
     robot = Robot()
-    with robot.bench() as bench:
-        bench.sampled = True
-        bench.replies = [Reply(r.at_ns, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
+    with robot.board() as board:
+        board.sampled = True
+        board.replies = [Reply(r.at_s, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
                          for r in replies(3200)]  # fmt: skip
-        assert "against" in counts.finding(bench, [0]).text
+        assert "against" in counts.finding(board, [0]).text
 
 
 def test_more_counts_than_the_host_takes_are_a_warning() -> None:
-    with Robot().bench() as bench:
-        bench.sampled, bench.identity = True, {"counts": "400000"}
-        assert counts.finding(bench, []).verdict == "WARN"
+    with Robot().board() as board:
+        board.sampled, board.identity = True, {"counts": "400000"}
+        assert counts.finding(board, []).verdict == "WARN"
+
+
+@pytest.mark.parametrize("configured", [1600, 2700, 3700, 12800])
+def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) -> None:
+    with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
+        board.sampled = True
+        board.replies = replies(3200)
+        finding = counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
+    assert finding.figure == f"3200, not {configured}"
+    assert "every distance would be off by" in finding.text
+
+
+def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None:
+    with Robot(encoder_counts=3200).board() as board:
+        board.sampled = True
+        board.replies = [Reply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
+                         for n, r in enumerate(replies(3200))]  # fmt: skip
+        finding = counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})

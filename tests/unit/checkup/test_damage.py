@@ -38,10 +38,10 @@ def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
 )
 def test_firmware_that_takes_parts_is_told(fault: str, verdict: str) -> None:
     robot = Robot(fault, "no_watchdog", trailing_comma=True)
-    with robot.bench() as bench:
-        dialect.check(bench)
-        assert damage.finding(bench, [0, 1, 2, 3]).verdict == verdict
-        assert bench.turning() == []
+    with robot.board() as board:
+        dialect.check(board)
+        assert damage.finding(board, [0, 1, 2, 3]).verdict == verdict
+        assert board.turning() == []
     assert robot.later() == [0.0] * 4
 
 
@@ -52,9 +52,9 @@ def test_firmware_that_reads_a_last_number_that_is_cut_is_told() -> None:
         return got and protocol.Command({m: float(got[m + 1]) for m in range(4)})
 
     robot = Robot()
-    with robot.bench() as bench:
+    with robot.board() as board:
         robot.mcu.understand = scanned
-        finding = damage.finding(bench, [0, 1, 2, 3])
+        finding = damage.finding(board, [0, 1, 2, 3])
     assert finding.verdict == "FAIL"
     assert finding.text.count("cut inside the last number") == 1
 
@@ -63,5 +63,5 @@ def test_motors_that_do_not_turn_as_told_are_left_out() -> None:
     lines = damage.broken_lines(False, False, [1])
     assert all(b"ap03" not in broken.line for broken in lines)
     assert any(b"bp03" in broken.line for broken in lines)
-    with Robot().bench() as bench:
-        assert damage.finding(bench, []).verdict == "SKIPPED"
+    with Robot().board() as board:
+        assert damage.finding(board, []).verdict == "SKIPPED"

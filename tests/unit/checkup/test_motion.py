@@ -10,8 +10,6 @@ from acsard.checkup import motion
 from acsard.checkup.motion import Reply
 from acsard.mcu.check import Reading
 
-MS = 1_000_000
-
 
 def course(
     speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
@@ -22,7 +20,7 @@ def course(
         counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)
         seen = (counts - before) / per_turn * math.tau / period_ms * 1000
         reading = Reading(n * period_ms, (0, counts % 65536, 0, 0)) if sampled else None
-        found.append(Reply(n * period_ms * MS, (0.0, seen, 0.0, 0.0), b"", reading))
+        found.append(Reply(n * period_ms / 1000, (0.0, seen, 0.0, 0.0), b"", reading))
         before = counts
     return found
 
@@ -50,7 +48,7 @@ def test_counts_tell_a_runaway_before_the_mean_does() -> None:
     for n in range(1, 7):
         counts = last.reading.counts[1] + 200 * n
         reading = Reading(last.reading.mcu_ms + 20 * n, (0, counts, 0, 0))
-        replies.append(Reply(last.at_ns + 20 * n * MS, (0.0, 19.6, 0.0, 0.0), b"", reading))
+        replies.append(Reply(last.at_s + 0.02 * n, (0.0, 19.6, 0.0, 0.0), b"", reading))
     assert motion.fastest(replies, 18.0, 0) is None
     assert motion.fastest(replies, 18.0, 3200) is not None
 
@@ -65,12 +63,12 @@ def test_no_replies_say_nothing() -> None:
 def test_the_angle_covered_is_the_speeds_over_time(per_turn: int) -> None:
     replies = course(3.0, per_turn)
     assert motion.covered(replies, 0)[1] == pytest.approx(2.94, abs=math.tau / per_turn)
-    assert motion.covered(replies, 500 * MS)[1] == pytest.approx(1.44, abs=2 * math.tau / per_turn)
+    assert motion.covered(replies, 0.5)[1] == pytest.approx(1.44, abs=2 * math.tau / per_turn)
 
 
 def test_a_trend_is_the_share_of_the_speed_before() -> None:
     speeds = [3.0 * 0.99**n for n in range(100)]
-    replies = [Reply(n * 20 * MS, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
-    a, b, c, d = motion.trend(replies, replies[-1].at_ns, 0.02)
+    replies = [Reply(n * 0.02, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
+    a, b, c, d = motion.trend(replies, replies[-1].at_s, 0.02)
     assert (a, c, d) == (1.0, 1.0, 1.0)
     assert b == pytest.approx(0.99**25, rel=0.01)

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from acsard.checkup import procedure
-from acsard.checkup.bench import FAREWELL, SPEED
+from acsard.checkup.board import FAREWELL
 from acsard.checkup.findings import Finding, WireLostError
+from acsard.checkup.limits import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.frames import Codec
 from acsard.sim import protocol
@@ -404,8 +405,8 @@ def test_after_a_runaway_zeros_go_out_once_and_then_nothing() -> None:
 
 def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it() -> None:
     robot = Regulates("reversed_encoder=b", lag=0.05)
-    with robot.bench() as bench:
-        bench.drive((0.0, SPEED, 0.0, 0.0), 0.05)
+    with robot.board() as board:
+        board.drive((0.0, SPEED, 0.0, 0.0), 0.05)
     assert 1 <= zeros_after(robot.sent) < FAREWELL
     assert not any(robot.later())
 
@@ -474,3 +475,20 @@ def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> No
         if not moving:
             turning_since.clear()
         assert at_ns - since < 4000 * MS
+
+
+def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_turns() -> None:
+    def obeys(line: bytes) -> protocol.Command | None:
+        """Plain lines; a zero for motor d needs a comma after it."""
+        command = None if b"#" in line else protocol.whole(line)
+        if command and not command.values[3] and not line.endswith(b",\r\n"):
+            command.values.pop(3)
+        return command
+
+    robot = Robot()
+    robot.mcu.understand = obeys
+    checked = Checked(robot)
+    finding = checked["trailing comma"]
+    assert (finding.verdict, finding.figure) == ("FAIL", "needed")
+    assert "still turns after zeros" in finding.text
+    assert checked.changes["mcu.trailing_comma"] is True

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import dialect
+from acsard.checkup import dialect, pace
+from acsard.checkup.findings import StoppedError
 from acsard.checkup.silence import UNKNOWN, Silence, measured
 from acsard.checkup.turning import turn
+from acsard.sim import protocol
 from tests.unit.checkup.robots import Robot
 
 ALL = (0, 1, 2, 3)
@@ -15,14 +17,14 @@ SLACK_S = 0.02
 
 
 def silence(robot: Robot) -> Silence:
-    with robot.bench() as bench:
-        list(dialect.pace(bench))
-        dialect.check(bench)
+    with robot.board() as board:
+        pace.rate(board)
+        dialect.check(board)
         for motor in ALL:
-            turn(bench, motor, 3.0)
-            bench.rest()
-        found = measured(bench, ALL)
-        assert bench.turning() == []
+            turn(board, motor, 3.0)
+            board.rest()
+        found = measured(board, ALL)
+        assert board.turning() == []
     return found
 
 
@@ -39,3 +41,20 @@ def test_the_true_time_lies_between_what_is_told(kind: tuple[str, ...], time_s: 
 @pytest.mark.parametrize("kind", ["plain_only", "no_sample", "unprompted"])
 def test_motors_that_never_stop_have_no_time(kind: str) -> None:
     assert silence(Robot(kind, "no_watchdog")).most == UNKNOWN
+
+
+def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
+    def gives_in(line: bytes) -> protocol.Command | None:
+        command = protocol.whole(line)
+        if command and sum(map(bool, command.values.values())) > 1:
+            return protocol.Command(dict.fromkeys(command.values, 0.0))
+        return command
+
+    robot = Robot("plain_only")
+    with robot.board() as board:
+        robot.mcu.understand = gives_in
+        assert turn(board, 0, 3.0)[0] == pytest.approx(3.0, abs=0.1)
+        board.rest()
+        with pytest.raises(StoppedError) as end:
+            measured(board, ALL)
+    assert "not together" in end.value.finding.text

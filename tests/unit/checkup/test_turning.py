@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.checkup import turning
-from acsard.checkup.bench import SPEED
+from acsard.checkup.limits import GLANCE_S, PATIENCE_S, SPEED
 from acsard.checkup.wheels import Channel
 from acsard.config.settings import Config, SimConfig
 from tests.unit.checkup.robots import Nobody, Robot
@@ -14,17 +14,17 @@ from tests.unit.checkup.robots import Nobody, Robot
 @pytest.mark.parametrize("motor", range(4))
 def test_one_motor_turns_and_no_other(motor: int) -> None:
     robot = Robot("plain_only")
-    with robot.bench() as bench:
-        means = turning.turn(bench, motor, -SPEED)
+    with robot.board() as board:
+        means = turning.turn(board, motor, -SPEED)
         assert means[motor] == pytest.approx(-SPEED, abs=0.1)
         assert [m for m in range(4) if means[m]] == [motor]
 
 
 def test_the_speed_is_ramped() -> None:
     robot = Robot("plain_only")
-    with robot.bench() as bench:
+    with robot.board() as board:
         before = len(robot.sent)
-        turning.run_up(bench, turning.one(0, SPEED))
+        turning.run_up(board, turning.one(0, SPEED))
         told = [float(line[2:7]) for line in robot.sent[before:]]
     assert told[:9] == sorted(told[:9])
     assert told[0] <= SPEED / 5
@@ -33,9 +33,9 @@ def test_the_speed_is_ramped() -> None:
 
 def test_a_motor_that_shows_nothing_is_not_held_for_long() -> None:
     robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
-    with robot.bench() as bench:
+    with robot.board() as board:
         began = robot.now_ns()
-        turning.run_up(bench, turning.one(1, SPEED))
+        turning.run_up(board, turning.one(1, SPEED))
         assert robot.now_ns() - began < 1e9
 
 
@@ -50,8 +50,8 @@ def test_a_host_that_stalled_measures_again() -> None:
             return super().listen(until_ns)
 
     robot = Stalls("plain_only")
-    with robot.bench() as bench:
-        assert turning.turn(bench, 0, SPEED)[0] == pytest.approx(SPEED, abs=0.1)
+    with robot.board() as board:
+        assert turning.turn(board, 0, SPEED)[0] == pytest.approx(SPEED, abs=0.1)
     assert robot.stalls == 1
 
 
@@ -62,22 +62,24 @@ def test_every_motor_is_announced_before_it_turns() -> None:
         def say(self, text: str) -> None:
             said.append(text)
 
-    with Robot("plain_only").bench() as bench:
-        found = list(turning.channels(bench, Listener()))
+    with Robot("plain_only").board() as board:
+        found = list(turning.channels(board, Listener()))
+        comma = turning.comma(board, found[-1])
     assert [text.split()[1] for text in said] == list("abcd")
-    assert [comma is not None for _, comma in found] == [False, False, False, True]
+    assert [channel.kind for channel in found] == ["right"] * 4
+    assert (comma.verdict, comma.figure) == ("PASS", "not needed")
 
 
 def test_a_probe_is_short_and_slow_and_no_dead_motor_is_told_more() -> None:
     robot = Robot("plain_only", "dead_motor=b")
-    with robot.bench() as bench:
+    with robot.board() as board:
         began, before = robot.now_ns(), len(robot.sent)
-        assert turning.probe(bench, 1) == (0.0, 0.0, 0.0, 0.0)
+        assert turning.probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
         told = [line for line in robot.sent[before:] if b"bp00.00" not in line]
         assert {line[8:15] for line in told} == {b"bp01.50", b"bp03.00"}
-        assert len(told) <= 2 * (turning.PROBE_S / bench.period_s + 1)
+        assert len(told) <= 2 * (GLANCE_S / board.period_s + 1)
         assert robot.now_ns() - began < 3e9
-        assert turning.probe(bench, 0) is None
+        assert turning.probe(board, 0) is None
 
 
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 3200])
@@ -86,8 +88,8 @@ def test_a_probe_finds_what_follows_and_what_is_reversed(per_turn: int, lag: flo
     config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
     for fault, follows in ((), True), (("reversed_encoder=c",), False):
         robot = Robot("plain_only", *fault, config=config)
-        with robot.bench() as bench:
-            seen = turning.probe(bench, 2)
+        with robot.board() as board:
+            seen = turning.probe(board, 2)
             assert (seen is None) is follows
             if seen is not None:
                 channel = Channel(2, seen, (0.0, 0.0, 0.0, 0.0), probed=True)
@@ -97,7 +99,7 @@ def test_a_probe_finds_what_follows_and_what_is_reversed(per_turn: int, lag: flo
 def test_a_motor_that_still_speeds_up_is_held_on_but_not_for_ever() -> None:
     for lag, speed in ((1.0, 2.7), (2.0, 2.0)):
         robot = Robot("plain_only", config=Config(sim=SimConfig(motor_time_constant=lag)))
-        with robot.bench() as bench:
+        with robot.board() as board:
             began = robot.now_ns()
-            assert turning.run_up(bench, turning.one(0, SPEED))[0] > speed
-            assert robot.now_ns() - began < 1.2e9 * turning.LONGEST_HOLD_S
+            assert turning.run_up(board, turning.one(0, SPEED))[0] > speed
+            assert robot.now_ns() - began < 1.2e9 * PATIENCE_S

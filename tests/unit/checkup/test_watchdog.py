@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import dialect, watchdog
-from acsard.checkup.bench import SPEED
+from acsard.checkup import dialect, pace, watchdog
+from acsard.checkup.limits import SPEED
 from acsard.checkup.turning import turn
 from acsard.config.settings import Config, SimConfig
 from acsard.sim import protocol
@@ -23,14 +23,14 @@ class ByItsOwnClock(Robot):
 
 
 def measured(robot: Robot, *motors: int) -> tuple[str, str]:
-    with robot.bench() as bench:
-        list(dialect.pace(bench))
-        dialect.check(bench)
+    with robot.board() as board:
+        pace.rate(board)
+        dialect.check(board)
         for motor in range(4):
-            turn(bench, motor, 3.0)
-            bench.rest()
-        finding = watchdog.finding(bench, motors or ALL)
-        assert bench.turning() == []
+            turn(board, motor, 3.0)
+            board.rest()
+        finding = watchdog.finding(board, motors or ALL)
+        assert board.turning() == []
     assert robot.later() == [0.0] * 4
     return finding.verdict, finding.figure
 
@@ -77,8 +77,8 @@ def test_one_too_short_for_any_host_is_a_warning() -> None:
 
 
 def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
-    with Robot().bench() as bench:
-        assert watchdog.finding(bench, []).verdict == "SKIPPED"
+    with Robot().board() as board:
+        assert watchdog.finding(board, []).verdict == "SKIPPED"
 
 
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
@@ -94,8 +94,8 @@ def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], la
 
 def test_broken_lines_are_never_taken_for_more_than_was_told() -> None:
     robot = Robot("comma_latched", trailing_comma=True)
-    with robot.bench() as bench:
-        assert watchdog.finding(bench, ALL).figure.endswith("fed by broken lines")
+    with robot.board() as board:
+        assert watchdog.finding(board, ALL).figure.endswith("fed by broken lines")
     told = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
     assert max(abs(value) for values in told for value in values) == SPEED
 

@@ -349,7 +349,7 @@ def test_add_with_a_broken_authority_says_so(
 
 AS_NOBODY = """\
 import os, sys
-import acsard.cli.certificates
+import acsard.lan.authority
 from acsard.cli import main
 try:
     main(["lan", "init", "--help"])  # nobody may not be let read what is imported late
@@ -404,6 +404,20 @@ def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
     assert config.bus.listen == ("tcp/127.0.0.1:9", "tls/0.0.0.0:7449")
     assert config.bus.tls == str(directory)
     assert str(file) in capsys.readouterr().out
+
+
+def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) -> None:
+    real, link = tmp_path / "real.toml", tmp_path / "acsard.toml"
+    real.write_bytes(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
+    real.chmod(0o640)
+    link.symlink_to("real.toml")
+    assert lan("init", "--directory", str(tmp_path / "tls"), "--write", str(link)) == 0
+    text = real.read_bytes()
+    assert link.is_symlink()
+    assert real.stat().st_mode & 0o777 == 0o640
+    assert text.startswith(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
+    assert text.count(b"\r\n") == text.count(b"\n")
+    assert parse(text).bus.tls == str(tmp_path / "tls")
 
 
 def test_init_writes_a_configuration_where_there_is_none(tmp_path: Path) -> None:

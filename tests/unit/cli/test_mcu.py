@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from acsard.checkup.findings import Finding
 from acsard.cli import mcu
-from acsard.cli.person import Person
+from acsard.cli.exits import code_of
+from acsard.cli.person import Person, ended_by_signals
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
+from acsard.host.errors import NoPortError
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
@@ -146,7 +147,7 @@ def test_the_port_that_was_named_is_written_with_the_rate_it_has(
 def test_a_port_without_an_answer_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(ExitError):
+    with pytest.raises(NoPortError):
         called(tmp_path, "--port", str(tmp_path / "none"), "--yes", "--write", "--json")
     found = json.loads(capsys.readouterr().out)
     assert (found["passed"], found["changes"]) == (False, {})
@@ -168,9 +169,9 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("words", [["--yes"], ["--yes", "--wheels-are-lifted"]])
 def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> None:
-    with pytest.raises(ExitError, match="acsard ports") as end:
+    with pytest.raises(NoPortError, match="acsard ports") as end:
         called(tmp_path, *words, "--port", str(tmp_path / "none"))
-    assert int(end.value.code) == 66
+    assert code_of(end.value) == 66
 
 
 def test_a_person_is_asked_until_the_answer_is_one(
@@ -205,7 +206,7 @@ def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
     reached = []
 
     def signalled() -> None:
-        with mcu.ended_by_signals():
+        with ended_by_signals():
             try:
                 os.kill(os.getpid(), number)
             finally:
@@ -216,12 +217,3 @@ def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
         signalled()
     assert reached == [True]
     assert signal.getsignal(number) is before
-
-
-def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
-    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
-    head, *rest = mcu.row(finding, colours=False)
-    assert head == "FAIL    watchdog               none"
-    assert all(line.startswith("        ") and len(line) <= 100 for line in rest)
-    assert rest[-1] == "        -> give it one"
-    assert "\033[31m" in mcu.row(finding, colours=True)[0]

@@ -14,8 +14,8 @@ from acsard.host.exits import Exit, ExitError
 def test_without_its_library_it_says_which_extra_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.delitem(sys.modules, "acsard.top.view")
-    monkeypatch.delattr("acsard.top.view")
+    monkeypatch.delitem(sys.modules, "acsard.top.terminal", raising=False)
+    monkeypatch.delattr("acsard.top.terminal", raising=False)
     monkeypatch.setitem(sys.modules, "rich.console", None)  # as if it were not installed
     with pytest.raises(ExitError, match=r"pip install 'acsard\[top\]'") as told:
         top.main(argparse.Namespace())

@@ -55,6 +55,15 @@ def test_what_would_not_check_is_not_written(text: str, keys: dict[str, object])
         edited(text, keys)
 
 
+@pytest.mark.parametrize(
+    "text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n']
+)
+def test_a_list_is_set_as_any_other_value(text: str) -> None:
+    endpoints = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
+    after = edited(text, {"bus.listen": endpoints, "bus.tls": "/etc/acsard/tls"})
+    assert parse(after.encode()).bus.listen == tuple(endpoints)
+
+
 def test_windows_line_ends_stay() -> None:
     before = "# mine\r\n[mcu]\r\nport = 'sim' # here\r\n"
     after = edited(before, KEYS)

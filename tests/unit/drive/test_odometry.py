@@ -13,7 +13,7 @@ from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
 from acsard.mcu.feedback import Feedback
-from acsard.values import Instant, Pose, PoseCovariance, Sample, Twist, WheelSpeeds
+from acsard.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.vectors.drive import (
     PATHS,
     SEED_STEP,
@@ -70,13 +70,13 @@ def test_a_path_ends_where_geometry_says_in_however_many_steps(
 
 
 def test_a_step_gives_the_twist_of_the_seed_equations() -> None:
-    sample = odometry().fold(feedback(*SEED_STEP))
-    assert (sample.twist.linear, sample.twist.angular) == pytest.approx(SEED_STEP_TWIST)
+    estimate = odometry().fold(feedback(*SEED_STEP))
+    assert (estimate.twist.linear, estimate.twist.angular) == pytest.approx(SEED_STEP_TWIST)
 
 
 def test_a_step_ends_on_the_arc() -> None:
-    sample = odometry().fold(feedback(*SEED_STEP))
-    assert same_pose(sample.pose, SEED_STEP_ARC, tolerance=1e-10)
+    estimate = odometry().fold(feedback(*SEED_STEP))
+    assert same_pose(estimate.pose, SEED_STEP_ARC, tolerance=1e-10)
 
 
 def test_the_seed_equations_end_less_than_a_millimetre_beside_the_arc() -> None:
@@ -138,8 +138,8 @@ def test_there_and_back_the_same_way_ends_where_it_began(
 def test_yaw_is_wrapped_however_many_turns_one_step_makes(turns: int) -> None:
     # in place: 3 rad/s are 1 rad/s of yaw
     wheel = 3.0 * (1.0 + turns * math.tau)
-    sample = odometry().fold(feedback(-wheel, wheel, 1.0))
-    assert sample.pose.yaw == pytest.approx(1.0, abs=1e-9)
+    estimate = odometry().fold(feedback(-wheel, wheel, 1.0))
+    assert estimate.pose.yaw == pytest.approx(1.0, abs=1e-9)
 
 
 @given(turns=st.lists(st.floats(-10.0, 10.0), max_size=50))
@@ -150,40 +150,44 @@ def test_yaw_stays_within_half_a_turn(turns: list[float]) -> None:
     assert same_pose(robot.pose, (0.0, 0.0, sum(turns)))
 
 
-# the sample
+# the estimate
 
 
 def test_a_sample_has_the_stamp_the_speeds_and_the_twist_of_its_line() -> None:
     speeds = WheelSpeeds(4.0, 1.0, 3.0, 8.0)
-    sample = odometry().fold(Feedback(AT, speeds, 0.01))
-    assert (sample.at, sample.speeds) == (AT, speeds)
-    assert (sample.twist.linear, sample.twist.angular) == pytest.approx((0.2, 2 / 3))
+    estimate = odometry().fold(Feedback(AT, speeds, 0.01))
+    assert (estimate.at, estimate.speeds) == (AT, speeds)
+    assert (estimate.twist.linear, estimate.twist.angular) == pytest.approx((0.2, 2 / 3))
 
 
 def test_each_wheel_turns_by_its_own_speed() -> None:
     robot = odometry()
     robot.fold(Feedback(AT, WheelSpeeds(1.0, 2.0, -3.0, 4.0), 0.5))
-    sample = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.25))
-    assert sample.positions == (0.75, 1.0, -1.75, 2.0)
+    estimate = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.25))
+    assert estimate.positions == (0.75, 1.0, -1.75, 2.0)
 
 
 def test_wheel_angles_are_continuous_past_a_turn() -> None:
     robot = odometry()
-    sample = robot.fold(feedback(10.0, 10.0, 100.0))
-    assert sample.positions == (1000.0,) * 4
+    estimate = robot.fold(feedback(10.0, 10.0, 100.0))
+    assert estimate.positions == (1000.0,) * 4
 
 
 def test_the_last_twist_and_speeds_can_be_asked_for() -> None:
     robot = odometry()
     assert (robot.twist, robot.speeds) == (Twist(), WheelSpeeds())
-    sample = robot.fold(feedback(3.0, 9.0, 0.01))
-    assert (robot.twist, robot.speeds, robot.pose) == (sample.twist, sample.speeds, sample.pose)
+    estimate = robot.fold(feedback(3.0, 9.0, 0.01))
+    assert (robot.twist, robot.speeds, robot.pose) == (
+        estimate.twist,
+        estimate.speeds,
+        estimate.pose,
+    )
 
 
 def test_the_first_line_moves_nothing() -> None:
-    sample = odometry().fold(feedback(10.0, 10.0, 0.0))
-    assert (sample.pose, sample.positions) == (Pose(), (0.0,) * 4)
-    assert sample.covariance == START
+    estimate = odometry().fold(feedback(10.0, 10.0, 0.0))
+    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
+    assert estimate.covariance == START
 
 
 def test_a_gap_moves_neither_pose_nor_wheels() -> None:
@@ -198,9 +202,9 @@ def test_setting_the_pose_moves_the_robot_and_leaves_the_wheels() -> None:
     robot = odometry()
     wheels = robot.fold(feedback(4.5, 7.5, 1.0)).positions
     robot.set_pose(Pose(1.0, 2.0, math.pi / 2))
-    sample = robot.fold(feedback(10.0, 10.0, 1.0))
-    assert same_pose(sample.pose, (1.0, 2.5, math.pi / 2))
-    assert sample.positions[0] == wheels[0] + 10.0
+    estimate = robot.fold(feedback(10.0, 10.0, 1.0))
+    assert same_pose(estimate.pose, (1.0, 2.5, math.pi / 2))
+    assert estimate.positions[0] == wheels[0] + 10.0
 
 
 def test_setting_the_pose_wraps_its_yaw() -> None:
@@ -278,8 +282,8 @@ def test_an_arc_noises_along_its_chord() -> None:
 def test_standing_adds_no_uncertainty() -> None:
     robot = odometry()
     for _ in range(100):
-        sample = robot.fold(feedback(0.0, 0.0, 0.01))
-    assert sample.covariance == START
+        estimate = robot.fold(feedback(0.0, 0.0, 0.01))
+    assert estimate.covariance == START
 
 
 def test_a_gap_adds_what_the_robot_could_have_driven_in_it() -> None:
@@ -304,7 +308,7 @@ def test_a_gap_of_a_standing_robot_adds_nothing() -> None:
     assert robot.fold(feedback(10.0, 10.0, 0.0, gap=2.0)).covariance == START
 
 
-def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Sample]:
+def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Estimate]:
     """Each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
     return [
         robot.fold(
@@ -316,8 +320,8 @@ def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Sa
 
 @given(path=st.lists(moves, min_size=1, max_size=50))
 def test_the_covariance_is_always_positive(path: list[tuple[float, float, float]]) -> None:
-    for sample in fold_all(odometry(), path):
-        eigenvalues = np.linalg.eigvalsh(matrix(sample.covariance))
+    for estimate in fold_all(odometry(), path):
+        eigenvalues = np.linalg.eigvalsh(matrix(estimate.covariance))
         assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
 
 
@@ -326,11 +330,11 @@ def test_moving_never_makes_the_pose_more_certain(
     path: list[tuple[float, float, float]],
 ) -> None:
     yaw, volume = START.yawyaw, float(np.linalg.det(matrix(START)))
-    for sample in fold_all(odometry(), path):
-        grown = float(np.linalg.det(matrix(sample.covariance)))
-        assert sample.covariance.yawyaw >= yaw
+    for estimate in fold_all(odometry(), path):
+        grown = float(np.linalg.det(matrix(estimate.covariance)))
+        assert estimate.covariance.yawyaw >= yaw
         assert grown >= volume * (1 - 1e-6)
-        yaw, volume = sample.covariance.yawyaw, grown
+        yaw, volume = estimate.covariance.yawyaw, grown
 
 
 def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
@@ -370,9 +374,9 @@ def test_the_covariance_stays_finite_for_years(gap: float) -> None:
         )
     )
     for _ in range(20_000):
-        sample = robot.fold(feedback(40.0, 40.0, 0.0 if gap else 100.0, gap))
+        estimate = robot.fold(feedback(40.0, 40.0, 0.0 if gap else 100.0, gap))
         robot.fold(feedback(40.0, 40.0, 1.0))
-    values = matrix(sample.covariance)
+    values = matrix(estimate.covariance)
     assert np.isfinite(values).all()
     assert np.diag(values).max() >= MAX_VARIANCE
     assert np.abs(values).max() < 1e15
@@ -388,10 +392,10 @@ def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0
 
 
 def test_counts_move_the_robot_and_its_wheels_by_what_they_say() -> None:
-    sample = odometry().fold(counted(2.0, dt=99.0, speed=50.0))
-    assert same_pose(sample.pose, (0.1, 0.0, 0.0))
-    assert sample.positions == (2.0, 2.0, 2.0, 2.0)
-    assert sample.twist.linear == pytest.approx(2.5)
+    estimate = odometry().fold(counted(2.0, dt=99.0, speed=50.0))
+    assert same_pose(estimate.pose, (0.1, 0.0, 0.0))
+    assert estimate.positions == (2.0, 2.0, 2.0, 2.0)
+    assert estimate.twist.linear == pytest.approx(2.5)
 
 
 @given(path=st.lists(moves, max_size=30))
@@ -418,8 +422,8 @@ def test_counts_bridge_a_gap_without_a_doubt_of_their_own() -> None:
 def test_a_skipped_line_leaves_its_time_to_the_next() -> None:
     robot = odometry()
     robot.skip(feedback(90.0, 90.0, 0.01))
-    sample = robot.fold(feedback(10.0, 10.0, 0.01))
-    assert sample.pose.x == pytest.approx(0.01)
+    estimate = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert estimate.pose.x == pytest.approx(0.01)
     assert robot.fold(feedback(10.0, 10.0, 0.01)).pose.x == pytest.approx(0.015)
 
 
@@ -428,9 +432,9 @@ def test_more_than_50_ms_of_skipped_lines_are_a_gap() -> None:
     robot.fold(feedback(10.0, 10.0, 0.0))
     for _ in range(6):
         robot.skip(feedback(90.0, 90.0, 0.01))
-    sample = robot.fold(feedback(10.0, 10.0, 0.01))
-    assert sample.pose.x == pytest.approx(0.005)
-    assert sample.covariance.xx > 0.03**2
+    estimate = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert estimate.pose.x == pytest.approx(0.005)
+    assert estimate.covariance.xx > 0.03**2
 
 
 @pytest.mark.parametrize("after", [counted(1.0), feedback(20.0, 20.0, 0.05)])

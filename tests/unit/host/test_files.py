@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from tomlkit.exceptions import NonExistentKey
 
+from acsard.config.parsing import parse
 from acsard.host.exits import ExitError
 from acsard.host.files import change
 
@@ -90,3 +91,18 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(ExitError):
         change(tmp_path / "none.toml", KEYS)
+
+
+def test_a_new_file_is_made_only_where_that_is_meant(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    assert change(file, KEYS, new=True) == KEYS
+    assert parse(file.read_bytes()).mcu.baud_rate == 57600
+    assert file.stat().st_mode & 0o777 == 0o644
+    assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+def test_keys_may_be_made_from_what_the_file_says(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
+    change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})
+    assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"

@@ -67,12 +67,12 @@ def outputs(
 ) -> Outputs:
     return Outputs(
         now=Instant(at_ns, at_ns),
-        tick=True,
+        due=True,
         line=None,
         speeds=WheelSpeeds(0.0, 0.0, 0.0, 0.0),
         applied=applied,
         linked=True,
-        samples=(),
+        estimates=(),
         mode=mode,
         reason=reason,
         link="up",

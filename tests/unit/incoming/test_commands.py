@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from acsard.config.settings import CommandsConfig, DriveConfig, JointsConfig
 from acsard.drive.arbiter import Arbiter
 from acsard.drive.kinematics import Kinematics
-from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, voice
+from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, sender
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.messages.schema import JointState, TwistStamped
 from acsard.messages.schema import Twist as TwistMessage
@@ -498,9 +498,9 @@ def test_wheel_commands_are_stamped_the_same_way() -> None:
     assert wheels(body, stamp_ns=5).stamp_ns == 5
 
 
-def test_the_sender_is_the_one_of_the_arrival_else_the_key() -> None:
-    assert command(twist(), sender="z1").sender == "z1"
-    assert command(twist(), sender="").sender == "native/cmd/app"
+def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
+    assert command(twist(), sender="z1").clock == "z1"
+    assert command(twist(), sender="").clock == "native/cmd/app"
 
 
 def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
@@ -668,7 +668,7 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
 
 def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
     command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
-    assert (command.stamp_ns, command.sender) == (
+    assert (command.stamp_ns, command.clock) == (
         12_000_000_034,
         f"{GID.hex()}, header on rmw/cmd/nav",
     )
@@ -693,10 +693,10 @@ def test_by_a_bridge_any_attachment_is_ignored() -> None:
     assert command.stamp_ns is None
 
 
-def test_by_a_bridge_the_sender_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/cmd/nav"
+def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
+    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/cmd/nav"
     seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
-    assert (seen.stamp_ns, seen.sender) == (SENT_NS, "router")
+    assert (seen.stamp_ns, seen.clock) == (SENT_NS, "router")
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
@@ -739,29 +739,29 @@ def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_sen
 # who speaks
 
 
-def test_the_voice_over_rmw_is_the_publisher() -> None:
+def test_the_sender_over_rmw_is_the_publisher() -> None:
     other = Attachment(1, SENT_NS, bytes(16)).pack()
-    assert RECEIVER.command(by_ros("rmw", twist(), sender="router")).voice == GID.hex()
-    assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).voice == bytes(16).hex()
+    assert RECEIVER.command(by_ros("rmw", twist(), sender="router")).sender == GID.hex()
+    assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender == bytes(16).hex()
 
 
-def test_the_voice_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
-    assert command(twist(), sender="z1", stamp_ns=5).voice == "z1"
-    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).voice == "z2"
+def test_the_sender_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
+    assert command(twist(), sender="z1", stamp_ns=5).sender == "z1"
+    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).sender == "z2"
 
 
-def test_the_voice_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
-    assert command(twist()).voice == wheels(joints(1.0, 1.0, 1.0, 1.0)).voice == "native/app"
-    assert RECEIVER.command(by_ros("bridge", twist())).voice == "bridge/nav"
+def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
+    assert command(twist()).sender == wheels(joints(1.0, 1.0, 1.0, 1.0)).sender == "native/app"
+    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/nav"
 
 
-def test_a_header_s_stamp_changes_no_voice() -> None:
-    assert command(stamped(12)).voice == "native/app"
-    assert RECEIVER.command(by_ros("rmw", stamped(12))).voice == GID.hex()
+def test_a_header_s_stamp_changes_no_sender() -> None:
+    assert command(stamped(12)).sender == "native/app"
+    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == GID.hex()
 
 
-def test_one_who_sends_what_cannot_be_read_has_the_same_voice_as_before() -> None:
+def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
     good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
-    assert voice(replace(good, payload=b"hello")) == RECEIVER.command(good).voice
+    assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
     ros = by_ros("rmw", twist())
-    assert voice(replace(ros, payload=b"")) == RECEIVER.command(ros).voice
+    assert sender(replace(ros, payload=b"")) == RECEIVER.command(ros).sender

@@ -49,7 +49,7 @@ def nothing(_: str) -> Message | None:
 
 
 def query(topic: str, asked: str | None = None, fmt: str = "", **changes: Any) -> Query:
-    given: dict[str, Any] = {"number": 7, "payload": b"", "encoding": ""} | changes
+    given: dict[str, Any] = {"ticket": 7, "payload": b"", "encoding": ""} | changes
     return Query(topic=topic, asked=topic if asked is None else asked, fmt=fmt, **given)
 
 
@@ -83,7 +83,7 @@ def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -
 @pytest.mark.parametrize("topic", [t for t in PUBLISHED if t.key in NATIVE], ids=lambda t: t.key)
 def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
     reply = answer(query(topic.key, fmt="cdr"))
-    assert (reply.number, reply.key, reply.ok) == (7, topic.key, True)
+    assert (reply.ticket, reply.key, reply.ok) == (7, topic.key, True)
     assert reply.encoding == f"application/cdr;acsard.{topic.type}.v1"
     assert reply.payload[:4] == b"\x00\x01\x00\x00"
     told = Cdr(MESSAGES[topic.type]).decode(reply.payload)
@@ -182,7 +182,7 @@ def test_a_key_that_is_not_in_the_table_has_no_answer() -> None:
 def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str) -> None:
     reply = answer(query(key, fmt=fmt))
     assert not reply.ok
-    assert reply.number == 7
+    assert reply.ticket == 7
     assert reply.payload.decode().startswith(f"fmt={fmt}: ")
     assert reply.encoding == "text/plain"
 
@@ -274,8 +274,8 @@ def test_a_service_that_does_not_exist_does_nothing() -> None:
 @pytest.mark.parametrize("success", [True, False])
 def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
     made = queries()
-    made.serve(query("srv/clear", number=12), nothing, None)
-    made.serve(query("srv/stop", number=13), nothing, None)
+    made.serve(query("srv/clear", ticket=12), nothing, None)
+    made.serve(query("srv/stop", ticket=13), nothing, None)
     reply = made.answered(Answer(13, success, "because"), WALL_NS)
     assert reply == Reply(
         13,
@@ -361,7 +361,7 @@ def test_a_pose_that_is_none_is_answered_in_words_and_asks_nothing_of_the_robot(
     assert isinstance(got, list)
     (reply,) = got
     assert reply.ok
-    assert (reply.number, reply.key) == (7, "srv/set_pose")
+    assert (reply.ticket, reply.key) == (7, "srv/set_pose")
     said = msgspec.json.decode(reply.payload, type=ServiceReply)
     assert not said.success
     assert words in said.message

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from acsard.mcu.check import Reading
 from acsard.mcu.encoders import (
-    ENOUGH_TURNED,
-    Agreement,
     Encoders,
     Turned,
     Unknown,
@@ -185,41 +183,3 @@ def test_after_forgetting_the_next_reading_is_a_first_one(bench: Bench) -> None:
     bench.encoders.forget()
     assert bench.read(10, (50, 50, 50, 50)) == "unknown"
     assert bench.read(10, (50, 50, 50, 50)) == turned(50, 50, 50, 50)
-
-
-# are they the right counts
-
-
-def doubts(ratio: float, turned: float = ENOUGH_TURNED + 1.0) -> list[str]:
-    """All that is told while the four wheels turn so far together, 2 rad/s back and forth."""
-    agreement, told = Agreement(COUNTS), []
-    for step in range(int(turned / 0.08)):
-        way = 1.0 if step % 2 else -1.0
-        agreement.add((0.02 * ratio * way,) * 4, (2.0 * way,) * 4, 0.01)
-        told += [text] if (text := agreement.doubt()) else []
-    return told
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.86, 1.14])
-def test_counts_that_agree_with_the_speeds_are_not_doubted(ratio: float) -> None:
-    assert doubts(ratio, 10 * ENOUGH_TURNED) == []
-
-
-@pytest.mark.parametrize(
-    ("ratio", "looks_like"), [(0.5, 1600), (2.0, 6400), (4.0, 12800), (0.84, 2688), (1.16, 3712)]
-)
-def test_counts_that_do_not_are_doubted_once_and_with_what_they_look_like(
-    ratio: float, looks_like: int
-) -> None:
-    (text,) = doubts(ratio, 10 * ENOUGH_TURNED)
-    assert f"mcu.encoder_counts = {COUNTS} looks like {looks_like};" in text
-    assert f"{ratio:.2f} times as far" in text
-
-
-def test_counts_that_stand_while_the_wheels_turn_are_switched_off() -> None:
-    (text,) = doubts(0.0)
-    assert "write mcu.encoder_counts = 0" in text
-
-
-def test_a_few_turns_are_needed_for_a_doubt() -> None:
-    assert doubts(2.0, ENOUGH_TURNED - 1.0) == []

@@ -13,6 +13,8 @@ from acsard.mcu.negotiation import (
     BLIND_PERIOD_NS,
     FEW_SAMPLES,
     LATE_NS,
+    MENDS,
+    TABLE,
     TRIES,
     WINDOW,
     Negotiation,
@@ -29,7 +31,7 @@ REQUIRE = McuConfig(link_check="require")
 
 
 class Bench:
-    """A negotiation and its time."""
+    """A negotiation and its time; a line went unless `settle(False)` says otherwise."""
 
     def __init__(self, mcu: McuConfig = AUTO) -> None:
         self.check = Negotiation(mcu, STOP)
@@ -39,14 +41,16 @@ class Bench:
         """The questions that leave within so many periods of 10 ms, unanswered."""
         asked = []
         for _ in range(int(ms / 10) + 1):
+            self.check.settle(True)
             self.check.judge(self.now_ns)
-            if self.check.state == "asking":
+            if self.check.asking:
                 line = self.check.question(self.now_ns)
                 asked += [] if line is None else [line]
             self.now_ns += 10 * MS
         return asked
 
     def reply(self, sequence: int, reading: Reading | None = None) -> None:
+        self.check.settle(True)
         self.check.answered(Checked(STOP[:-2], sequence, reading), self.now_ns)
 
     def stale(self, sequence: int) -> bool:
@@ -58,14 +62,17 @@ class Bench:
 
     def drive(self, count: int = 1) -> list[int]:
         """The sequences of so many lines."""
-        lines = [self.check.seal(GO, self.now_ns) for _ in range(count)]
-        return [sequence_of(line) for line in lines]
+        sequences = []
+        for _ in range(count):
+            self.check.settle(True)
+            sequences.append(sequence_of(self.check.seal(GO, self.now_ns)))
+        return sequences
 
     def checked(self, reading: Reading | None = None) -> Bench:
         """Asked and answered."""
         (_, question) = self.ask(110)
         self.reply(sequence_of(question), reading)
-        assert self.check.state == "checked"
+        assert self.check.checked
         return self
 
 
@@ -100,7 +107,7 @@ def test_an_mcu_that_says_nothing_is_asked_in_turn_plainly_and_with_a_check_at_1
     asked = bench.ask(2000)
     assert [kind(line) for line in asked[:4]] == ["plain", "checked", "plain", "checked"]
     assert len(asked) == 21
-    assert bench.check.state == "asking"
+    assert bench.check.asking
 
 
 def test_after_a_gap_the_first_question_is_one() -> None:
@@ -120,14 +127,14 @@ def test_a_right_reply_to_a_sequence_that_was_not_sent_confirms_nothing() -> Non
     (_, question) = bench.ask(110)
     for sequence in set(range(256)) - {sequence_of(question)}:
         assert bench.stale(sequence)
-    assert bench.check.state == "asking"
+    assert bench.check.asking
 
 
 def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
     bench = Bench()
-    (_, question) = bench.ask(110)
-    bench.check.unsent()
-    bench.check.unsent()
+    (_, question) = bench.ask(100)
+    bench.check.settle(False)
+    bench.check.settle(True)  # told once: later news is of another line
     assert bench.stale(sequence_of(question))
 
 
@@ -155,8 +162,8 @@ def test_questions_that_did_not_leave_are_not_counted() -> None:
     bench.check.heard_plain()
     for _ in range(300):
         if bench.ask():
-            bench.check.unsent()
-    assert bench.check.state == "asking"
+            bench.check.settle(False)
+    assert bench.check.asking
 
 
 def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
@@ -166,14 +173,14 @@ def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
     for _ in range(100):
         bench.now_ns += 10 * MS
         bench.check.judge(bench.now_ns)
-    assert bench.check.state == "asking"
+    assert bench.check.asking
 
 
 def test_silence_is_no_refusal_however_long() -> None:
     bench = Bench(SAMPLES)
     bench.ask(60_000)
-    assert bench.check.state == "asking"
-    assert not bench.check.refused
+    assert bench.check.asking
+    assert not bench.check.trouble
 
 
 def test_a_slow_wire_is_given_time_to_answer() -> None:
@@ -189,12 +196,12 @@ def test_required_and_refused_it_is_asked_for_ever_and_says_why() -> None:
     bench = Bench(REQUIRE)
     bench.check.heard_plain()
     assert len(bench.ask(5000)) > 50
-    assert (bench.check.state, bench.check.refused) == ("asking", True)
-    assert 'mcu.link_check = "require"' in bench.check.refusal()
-    assert 'mcu.link_check = "auto"' in bench.check.refusal()
+    assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
+    assert 'mcu.link_check = "require"' in MENDS[bench.check.trouble]
+    assert 'mcu.link_check = "auto"' in MENDS[bench.check.trouble]
     (question,) = bench.ask(40)
     bench.reply(sequence_of(question))
-    assert (bench.check.state, bench.check.refusal()) == ("checked", "")
+    assert (bench.check.state, bench.check.trouble) == ("checked", "")
 
 
 def test_who_has_answered_with_a_check_is_not_believed_without() -> None:
@@ -202,8 +209,8 @@ def test_who_has_answered_with_a_check_is_not_believed_without() -> None:
     bench.check.begin()
     bench.check.heard_plain()
     bench.ask(5000)
-    assert bench.check.state == "asking"
-    assert "damaged" in bench.check.refusal()
+    assert bench.check.asking
+    assert "damaged" in MENDS[bench.check.trouble]
 
 
 def test_a_new_opening_forgets_who_was_there() -> None:
@@ -212,6 +219,18 @@ def test_a_new_opening_forgets_who_was_there() -> None:
     bench.check.heard_plain()
     bench.ask(1000)
     assert bench.check.state == "plain"
+
+
+def test_a_plain_question_that_did_not_leave_says_nothing_of_the_one_before() -> None:
+    bench = Bench()
+    plain, question, again = bench.ask(200)
+    assert [kind(line) for line in (plain, question, again)] == ["plain", "checked", "plain"]
+    bench.check.settle(False)
+    bench.reply(sequence_of(question))
+
+
+def test_no_sign_leads_out_of_off() -> None:
+    assert "off" not in {state for state, _ in TABLE} | set(TABLE.values())
 
 
 # sequences
@@ -226,8 +245,8 @@ def test_sequences_count_up_and_start_over_after_255() -> None:
 def test_only_the_last_line_can_be_one_that_did_not_leave() -> None:
     bench = Bench().checked()
     first, second = bench.drive(2)
-    bench.check.unsent()
-    bench.check.unsent()
+    bench.check.settle(False)
+    bench.check.settle(False)
     assert bench.stale(second)
     bench.reply(first)
 
@@ -347,10 +366,10 @@ def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None
         for _ in range(50):
             for line in bench.ask():
                 assert bench.check.echoed(line[:-2])
-        assert (bench.check.state, bench.check.refused) == ("asking", True)
-        assert "what is sent comes back" in bench.check.refusal()
+        assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
+        assert "what is sent comes back" in MENDS[bench.check.trouble]
         bench.check.begin(fresh=True)
-        assert not bench.check.refused
+        assert not bench.check.trouble
 
 
 def test_an_answer_is_no_echo() -> None:

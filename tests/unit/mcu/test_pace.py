@@ -20,18 +20,29 @@ class Paced:
 
     def __init__(self, period_ns: int = PERIOD_NS) -> None:
         self.pace = Pace(WIRE_NS, period_ns)
+        self.sent_ns = -GAP_NS
+        """When the last line went, as the port remembers it."""
 
     def ticks(self, at_ns: int, missed: int = 0) -> bool:
         """A period without news; whether its line went."""
         due = self.pace.tick(missed)
-        self.pace.note(due, due, at_ns if due else None, False, False)
+        self.pace.note(due, due, due, False, False)
+        self.sent_ns = at_ns if due else self.sent_ns
         return due
 
     def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
         """A command between two periods; whether a line for it was tried."""
-        due = news and self.pace.at_once(at_ns)
-        self.pace.note(False, due, at_ns if due and goes else None, news, True)
+        due = news and self.at_once(at_ns)
+        self.pace.note(False, due, due and goes, news, True)
+        self.sent_ns = at_ns if due and goes else self.sent_ns
         return due
+
+    def at_once(self, at_ns: int) -> bool:
+        return self.pace.at_once(at_ns, self.sent_ns)
+
+    @property
+    def retry_ns(self) -> int | None:
+        return self.pace.retry_ns(self.sent_ns)
 
 
 def ticked() -> Paced:
@@ -48,16 +59,17 @@ def test_every_period_has_its_line() -> None:
 
 def test_a_line_at_once_keeps_the_gap() -> None:
     paced = ticked()
-    assert not paced.pace.at_once(GAP_NS - 1)
-    assert paced.pace.at_once(GAP_NS)
+    assert not paced.at_once(GAP_NS - 1)
+    assert paced.at_once(GAP_NS)
 
 
 def test_the_gap_counts_from_when_the_line_left() -> None:
     paced = Paced()
     paced.pace.tick(0)
-    paced.pace.note(True, True, 2 * MS, False, False)
-    assert not paced.pace.at_once(2 * MS + GAP_NS - 1)
-    assert paced.pace.at_once(2 * MS + GAP_NS)
+    paced.pace.note(True, True, True, False, False)
+    paced.sent_ns = 2 * MS
+    assert not paced.at_once(2 * MS + GAP_NS - 1)
+    assert paced.at_once(2 * MS + GAP_NS)
 
 
 def test_a_line_at_once_takes_the_next_periods_place() -> None:
@@ -78,7 +90,7 @@ def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
     paced = ticked()
     assert paced.hears(6 * MS, goes=False)
     assert not paced.hears(7 * MS), "one try a period"
-    assert paced.pace.retry_ns is None
+    assert paced.retry_ns is None
     assert not paced.pace.listens
     assert paced.ticks(10 * MS)
     assert paced.pace.listens
@@ -87,16 +99,16 @@ def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
 def test_what_comes_too_soon_is_sent_as_soon_as_the_gap_has_passed() -> None:
     paced = ticked()
     assert not paced.hears(1 * MS)
-    assert paced.pace.retry_ns == GAP_NS
+    assert paced.retry_ns == GAP_NS
     assert not paced.pace.listens, "it is awake for the newest command anyway"
     assert paced.hears(GAP_NS)
-    assert paced.pace.retry_ns is None
+    assert paced.retry_ns is None
 
 
 def test_there_is_nothing_to_retry_without_news() -> None:
     paced = ticked()
     paced.hears(1 * MS, news=False)
-    assert paced.pace.retry_ns is None
+    assert paced.retry_ns is None
     assert paced.pace.listens
 
 
@@ -112,7 +124,7 @@ def test_a_stranger_wakes_it_only_so_often_a_period() -> None:
 
 
 def test_the_line_before_the_first_is_long_ago() -> None:
-    assert Paced().pace.at_once(0)
+    assert Paced().at_once(0)
 
 
 def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken() -> None:
@@ -120,7 +132,7 @@ def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken()
     paced.ticks(0)
     assert not paced.pace.listens
     assert not paced.hears(GAP_NS)
-    assert paced.pace.retry_ns is None
+    assert paced.retry_ns is None
 
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))
@@ -135,11 +147,12 @@ def test_no_traffic_makes_more_lines_than_the_clock_or_closer_ones(
         due_ns += expired * PERIOD_NS
         periods += expired
         tick = expired > 0 and pace.tick(expired - 1)
-        due = tick or (news and pace.at_once(now_ns))
+        sent_ns = lines[-1] if lines else -GAP_NS
+        due = tick or (news and pace.at_once(now_ns, sent_ns))
         sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)
-        pace.note(tick, due, now_ns if sent else None, news, news)
+        pace.note(tick, due, sent, news, news)
         lines += [now_ns] * sent
-        retry_ns = pace.retry_ns
+        retry_ns = pace.retry_ns(lines[-1] if lines else -GAP_NS)
         assert retry_ns is None or retry_ns > now_ns
     assert len(lines) <= periods + 1
     assert all(after - before >= WIRE_NS for before, after in pairwise(lines))

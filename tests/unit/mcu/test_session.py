@@ -12,7 +12,8 @@ from acsard.config.baud import wire_ns
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.check import seal
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.session import BAD_LINES, GOOD_LINES, LONG_GAP_NS, McuSession
+from acsard.mcu.link import BAD_LINES, GOOD_LINES
+from acsard.mcu.session import LONG_GAP_NS, McuSession
 from acsard.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
 
@@ -486,7 +487,7 @@ def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() 
 def test_the_link_is_up_with_the_third_right_reply() -> None:
     bench = Bench(AUTO).open()
     bench.wait(10)
-    while bench.session.check.state == "asking":
+    while bench.session.check.asking:
         bench.talk()
     assert (bench.link(), bench.session.good_lines) == ("booting", 1)
     bench.talk(count=2)
@@ -544,7 +545,7 @@ def test_five_bad_replies_in_a_row_are_no_link_and_the_check_is_asked_for_again(
     bench.wait(1, BAD * (BAD_LINES - 1))
     assert bench.link() == "up"
     bench.wait(1, BAD)
-    assert (bench.link(), bench.session.check.state) == ("stale", "asking")
+    assert (bench.link(), bench.session.check.asking) == ("stale", True)
     assert "damaged" in bench.session.words()
     line = bench.line()
     assert line is not None
@@ -568,7 +569,7 @@ def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
         bench.wait(30, GOOD)
     assert bench.link() == "up"
     bench.wait(11, GOOD)
-    assert (bench.link(), bench.session.check.state) == ("stale", "asking")
+    assert (bench.link(), bench.session.check.asking) == ("stale", True)
 
 
 def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
@@ -577,7 +578,7 @@ def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
         bench.wait(10, GOOD)
         line = bench.line()
         assert line is None or line.startswith(ZERO) or bench.link() == "up"
-    assert bench.session.check.state == "asking"
+    assert bench.session.check.asking
     assert "before and now does not" in bench.session.words()
 
 

@@ -7,22 +7,23 @@ from typing import Any
 from msgspec.structs import replace
 
 from acsard.values import (
+    Estimate,
     Instant,
     Measured,
     Outputs,
     Pose,
     PoseCovariance,
-    Sample,
     Snapshot,
     SourceStatus,
     Spread,
     Twist,
+    Wait,
     WheelSpeeds,
 )
 
 START = Instant(100_000_000_000, 1_700_000_000_000_000_000)
 
-SAMPLE = Sample(
+ESTIMATE = Estimate(
     at=Instant(104_000_000_000, 1_700_000_003_250_000_001),
     pose=Pose(1.5, -2.5, 0.5),
     twist=Twist(0.25, -0.75),
@@ -33,12 +34,12 @@ SAMPLE = Sample(
 
 OUTPUTS = Outputs(
     now=Instant(104_004_000_000, 1_700_000_003_254_000_002),
-    tick=True,
+    due=True,
     line=None,
     speeds=WheelSpeeds(5.0, 6.0, 7.0, 8.0),
     applied=Twist(0.3, 0.9),
     linked=True,
-    samples=(SAMPLE,),
+    estimates=(ESTIMATE,),
     mode="driving",
     reason="driving: commanded by app",
     link="up",
@@ -52,8 +53,8 @@ SNAPSHOT = Snapshot(
     measured=Twist(0.26, -0.76),
     speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
     sources=(
-        SourceStatus("app", 50, 0.01, ""),
-        SourceStatus("nav", 10, None, "a command"),
+        SourceStatus("app", 50, 0.01, Wait("nothing")),
+        SourceStatus("nav", 10, None, Wait("command")),
     ),
     counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
     refused="source nav: held up",
@@ -64,9 +65,9 @@ SNAPSHOT = Snapshot(
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:
-    """The outputs of a tick at another time, with one sample of that time."""
-    sample = replace(SAMPLE, at=instant)
-    return replace(OUTPUTS, now=instant, **({"samples": (sample,)} | changes))
+    """The outputs of a tick at another time, with one estimate of that time."""
+    estimate = replace(ESTIMATE, at=instant)
+    return replace(OUTPUTS, now=instant, **({"estimates": (estimate,)} | changes))
 
 
 def later(seconds: float) -> Instant:

@@ -41,8 +41,8 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.messages.topics import PUBLISHED
-from acsard.values import Instant, Outputs, Sample, Snapshot
-from tests.unit.messages.examples import OUTPUTS, SAMPLE, SNAPSHOT, START, at, later
+from acsard.values import Estimate, Instant, Outputs, Snapshot
+from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED}
 FRAMES = OdometryConfig(
@@ -431,22 +431,22 @@ def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
 def test_nobody_looks_at_the_robot_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), ALL, look))
-    assert not list(report.due(at(later(0.01), samples=()), {"state", "diagnostics"}, never))
+    assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
 
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:
-    samples: list[Sample] = [replace(SAMPLE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
-    found = Report(CONFIG, START).due(replace(OUTPUTS, samples=tuple(samples)), {"odom"}, look)
+    estimates: list[Estimate] = [replace(ESTIMATE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
+    found = Report(CONFIG, START).due(replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, look)
     stamps = [m.header.stamp.nanosec for _, m in found if isinstance(m, Odometry)]
     assert stamps == [1_000, 2_000, 3_000]
 
 
 def test_a_step_without_feedback_publishes_no_odometry() -> None:
-    assert set(published(replace(OUTPUTS, samples=()))) == {"cmd_vel_out", "state", "diagnostics"}
+    assert set(published(replace(OUTPUTS, estimates=()))) == {"cmd_vel_out", "state", "diagnostics"}
 
 
 def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
-    assert "cmd_vel_out" not in published(replace(OUTPUTS, tick=False))
+    assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
 
 
 # how often
@@ -551,7 +551,7 @@ def test_the_present_value_is_what_was_or_would_have_been_published(key: str) ->
 def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
-    report.due(at(later(9), samples=()), set(), never)
+    report.due(at(later(9), estimates=()), set(), never)
     odom: Message | None = report.current("odom", never)
     assert odom == published()["odom"]
 

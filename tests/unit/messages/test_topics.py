@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, by_key, full_key
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, VERBS, by_key, full_key, source_keys
 
 PROMISED = [
     ("odom", "out", "Odometry"),
@@ -18,12 +18,12 @@ PROMISED = [
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
     ("stop", "in", "anything"),
-    ("srv/stop", "query", "ServiceReply"),
-    ("srv/clear", "query", "ServiceReply"),
-    ("srv/activate", "query", "ServiceReply"),
-    ("srv/deactivate", "query", "ServiceReply"),
-    ("srv/reset_odometry", "query", "ServiceReply"),
-    ("srv/set_pose", "query", "ServiceReply"),
+    ("srv/stop", "service", "ServiceReply"),
+    ("srv/clear", "service", "ServiceReply"),
+    ("srv/activate", "service", "ServiceReply"),
+    ("srv/deactivate", "service", "ServiceReply"),
+    ("srv/reset_odometry", "service", "ServiceReply"),
+    ("srv/set_pose", "service", "ServiceReply"),
     ("info", "query", "Info"),
     ("config", "query", "configuration"),
     ("interfaces", "query", "Interfaces"),
@@ -60,7 +60,8 @@ def test_only_the_static_transforms_wait_for_late_joiners() -> None:
 def test_every_service_has_a_row(service: str) -> None:
     row = by_key(f"srv/{service}")
     assert row is not None
-    assert row.direction == "query"
+    assert row.direction == "service"
+    assert VERBS[row.key] == service
 
 
 def test_a_full_key_has_the_robot_in_it() -> None:
@@ -76,6 +77,11 @@ def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
     row = by_key(key)
     assert row is not None
     assert row.pattern == pattern
+
+
+def test_a_source_commands_by_twist_or_by_wheels() -> None:
+    keys = ["cmd/app", "cmd/nav", "wheel_cmd/app", "wheel_cmd/nav"]
+    assert source_keys(["app", "nav"]) == keys
 
 
 def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:

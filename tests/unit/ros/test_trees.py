@@ -127,7 +127,7 @@ def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
     assert len(set(tokens)) == len(tokens)
     numbers = [int(token.split("/")[4]) for token in tokens]
     assert numbers == list(range(1, len(tokens) + 1))
-    kinds = {"out": "MP", "in": "MS", "query": "SS"}
+    kinds = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
     for endpoint in found(RosConfig()):
         if endpoint.transport == "rmw":
             assert endpoint.token.split("/")[5] == kinds[endpoint.direction]

@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
-from acsard.client import Client
-from acsard.host.exits import Exit, ExitError
+from acsard.client import Client, Subscription
+from acsard.host.errors import ReplyError
 from acsard.messages.encodings import DecodeError, encode, encoding_name
 from acsard.messages.schema import Info, RobotState, Time
 from acsard.top import feed as top_feed
@@ -38,9 +38,9 @@ class Robot:
             raise self.state
         return self.state
 
-    def subscribe(self, name: str) -> Robot:
+    def subscribe(self, name: str) -> Subscription:
         assert name == "state"
-        return self
+        return Subscription(self, KEY)
 
     def try_recv(self) -> Any:
         return self.queue.popleft() if self.queue else None
@@ -112,9 +112,8 @@ def test_a_put_on_a_wildcard_is_no_state(robot: Robot) -> None:
 def test_a_state_of_another_version_is_told_as_that(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = DecodeError("bad", "unknown field")
-    with pytest.raises(ExitError, match="another version") as told:
+    with pytest.raises(ReplyError, match="another version"):
         feed.ask()
-    assert told.value.code == Exit.FAILURE
     assert feed.seen().undecodable == 1
 
 

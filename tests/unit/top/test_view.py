@@ -15,7 +15,9 @@ from rich.console import Console
 from acsard.drive.modes import Mode
 from acsard.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
 from acsard.runtime.figures import NAMES
-from acsard.top.view import FIGURES, MODES, Seen, screen
+from acsard.top.sections import FIGURES
+from acsard.top.seen import Seen
+from acsard.top.view import MODES, screen
 
 MEASURED = Figure(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
 UNMEASURED = Figure(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))

@@ -1,61 +1,64 @@
-"""The bench: what goes out, what counts as an answer, and when it ends a check."""
+"""The board: what goes out, what counts as an answer, and when it ends a check."""
 
 from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.bench import REST_S, SLOWEST_S, SPEED, ZERO, Bench
+from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
+from acsard.checkup.limits import MOTOR_S, PATIENCE_S, SPEED
+from acsard.checkup.motion import ZERO
 from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Robot
 
 
-def test_a_bench_that_never_opened_its_line_sends_nothing_when_left() -> None:
+def test_a_board_that_never_opened_its_line_sends_nothing_when_left() -> None:
     robot = Robot()
-    with Bench(robot, McuConfig(), 100.0):
+    with Board(robot, McuConfig(), 100.0):
         pass
     assert robot.sent == []
 
 
 def test_a_line_speaks_of_motors_whatever_the_wheels_are() -> None:
     robot = Robot()
-    with robot.bench() as bench:
-        assert bench.line((1.0, -2.0, 0.0, 3.0)) == b"ap01.00,bn02.00,cp00.00,dp03.00\r\n"
-        assert bench.line((1.0, -2.0, 0.0, 3.0), True).endswith(b"dp03.00,\r\n")
-        bench.sealed = bench.sampled = True
-        assert bench.line(ZERO).startswith(b"ap00.00,bp00.00,cp00.00,dp00.00#01S*")
+    with robot.board() as board:
+        assert board.line((1.0, -2.0, 0.0, 3.0)) == b"ap01.00,bn02.00,cp00.00,dp03.00\r\n"
+        assert board.line((1.0, -2.0, 0.0, 3.0), True).endswith(b"dp03.00,\r\n")
+        board.sealed = board.sampled = True
+        assert board.line(ZERO).startswith(b"ap00.00,bp00.00,cp00.00,dp00.00#01S*")
 
 
 def test_driving_gives_an_answer_to_every_line_and_the_speeds_it_says() -> None:
     robot = Robot()
-    with robot.bench() as bench:
+    with robot.board() as board:
         before = len(robot.sent)
-        replies = bench.drive((SPEED, 0.0, 0.0, 0.0), 0.5)
+        replies = board.drive((SPEED, 0.0, 0.0, 0.0), 0.5)
         assert len(replies) >= len(robot.sent) - before - 2 >= 20
         assert replies[-1].motors[0] == pytest.approx(SPEED, abs=0.2)
         assert replies[-1].motors[1:] == (0.0, 0.0, 0.0)
-        assert bench.turning() == [0]
-        assert bench.rest() == "rest"
-        assert bench.turning() == []
+        assert board.turning() == [0]
+        board.rest()
+        assert board.turning() == []
 
 
 def test_answers_come_at_the_time_they_were_complete() -> None:
     robot = Robot()
-    with robot.bench() as bench:
-        replies = bench.drive(ZERO, 0.3)
-        times = [reply.at_ns for reply in replies]
+    with robot.board() as board:
+        replies = board.drive(ZERO, 0.3)
+        times = [reply.at_s for reply in replies]
         assert times == sorted(times)
-        assert times[-1] <= robot.now_ns()
+        assert times[-1] <= board.now_s
 
 
 @pytest.mark.parametrize("sent", [False, True])
 def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: bool) -> None:
     robot = Robot("comma_latched", trailing_comma=sent)
-    with robot.bench() as bench:
-        bench.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
-        assert bench.rest() == ("rest" if sent else "comma")
-        assert bench.comma
+    with robot.board() as board:
+        board.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
+        board.rest()
+        assert board.latched is not sent
+        assert board.comma
     assert robot.later() == [0.0] * 4
 
 
@@ -67,15 +70,17 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
                 self.mcu.understand = lambda line: None
 
     robot = Deaf("no_watchdog", "unprompted")
-    with robot.bench() as bench:
-        bench.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
+    with robot.board() as board:
+        board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
         with pytest.raises(StoppedError) as end:
-            bench.rest()
+            board.rest()
+        sent = len(robot.sent)
     assert end.value.finding.name == "stop"
-    assert f"{2 * REST_S:g} s" in end.value.finding.figure
+    assert f"{2 * MOTOR_S:g} s" in end.value.finding.figure
     assert "motor a (front right)" in end.value.finding.text
     assert robot.sent[-1].startswith(b"\r\n")  # once, then silence
     assert not robot.sent[-2].startswith(b"\r\n")
+    assert len(robot.sent) == sent
 
 
 def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
@@ -84,9 +89,9 @@ def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
     still = wild.replace(b"80", b"00")
 
     def answered(*lines: bytes) -> None:
-        bench = Bench(robot, McuConfig(), 100.0)
-        bench.open(115200)
-        bench.armed = True
+        board = Board(robot, McuConfig(), 100.0)
+        board.open(115200)
+        board.armed = True
         queue = list(lines)
 
         def listen(until_ns: int) -> list[tuple[int, bytes]]:
@@ -95,7 +100,7 @@ def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
 
         robot.listen = listen  # type: ignore[method-assign]
         for _ in lines:
-            bench.listen(0.02)
+            board.listen(0.02)
 
     quiet = [still] * 9
     answered(*quiet, wild, *quiet)
@@ -105,11 +110,11 @@ def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
 
 def test_silence_ends_it_only_while_somebody_drives() -> None:
     robot = Robot("plain_only")
-    with robot.bench() as bench:
-        bench.listen(5.0)
-        bench.drive(ZERO, 0.2)
+    with robot.board() as board:
+        board.listen(5.0)
+        board.drive(ZERO, 0.2)
         with robot.mcu.mute(), pytest.raises(StoppedError) as end:
-            bench.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
+            board.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
     assert end.value.finding.name == "link"
     assert robot.later() == [0.0] * 4
 
@@ -118,19 +123,21 @@ def test_silence_ends_it_only_while_somebody_drives() -> None:
 def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool) -> None:
     config = Config(sim=SimConfig(motor_time_constant=1.5))
     robot = Robot("plain_only", config=config, trailing_comma=sent)
-    with robot.bench() as bench:
-        bench.drive((0.0, 0.0, 0.0, SPEED), 3.0)
-        assert bench.rest() == "rest"
-        assert bench.comma is sent
-        assert REST_S < bench.slowest_rest_s < SLOWEST_S
+    with robot.board() as board:
+        board.drive((0.0, 0.0, 0.0, SPEED), 3.0)
+        board.rest()
+        assert not board.latched
+        assert board.comma is sent
+        assert MOTOR_S < board.slowest_rest_s < PATIENCE_S
 
 
 def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
     config = Config(sim=SimConfig(motor_time_constant=5.0))
     robot = Robot("plain_only", config=config)
-    with robot.bench() as bench:
-        bench.drive((0.0, 0.0, 0.0, SPEED), 4.0)
+    with robot.board() as board:
+        board.drive((0.0, 0.0, 0.0, SPEED), 4.0)
         began = robot.now_ns()
-        assert bench.rest() == "rest"  # by the second wait
-        assert SLOWEST_S * 1e9 < robot.now_ns() - began < 2 * SLOWEST_S * 1e9
-        assert not bench.comma
+        board.rest()  # by the second wait
+        assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
+        assert not board.latched
+        assert not board.comma

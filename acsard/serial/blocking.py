@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
 import select
 import termios
-import threading
+import time
 
 import serial
 
 from acsard.checkup.findings import WireLostError
 from acsard.host import clock
-from acsard.host.exits import Exit, ExitError
-from acsard.serial.device import in_use, no_permission, open_raw
+from acsard.serial.device import close, draining, open_raw, refusal
 from acsard.values import NS_PER_S
 
 SEND_S = 0.5
@@ -27,7 +24,7 @@ CLOSE_S = 1.0
 """How long a close is waited for; some drivers drain for 30 s."""
 
 
-class SerialWire:
+class BlockingPort:
     """One device, opened with the first `open`; see `checkup.outside.Wire`."""
 
     def __init__(self, path: str) -> None:
@@ -37,7 +34,10 @@ class SerialWire:
     def open(self, baud_rate: int) -> None:
         """Open and lock the port, or go on at another rate."""
         if self._device is None:
-            self._device = self._open(baud_rate)
+            try:
+                self._device = open_raw(self._path, baud_rate)
+            except OSError as error:
+                raise refusal(self._path, error) from error
             return
         fd = self._device.fileno()
         try:
@@ -48,49 +48,15 @@ class SerialWire:
         except (OSError, termios.error) as error:
             raise WireLostError(f"{self._path}: {error}") from error
 
-    def _open(self, baud_rate: int) -> serial.Serial:
-        path = self._path
-        try:
-            return open_raw(path, baud_rate)
-        except OSError as error:
-            match error.errno:
-                case errno.EBUSY | errno.EAGAIN:
-                    raise ExitError(Exit.IN_USE, in_use(path)) from error
-                case errno.EACCES | errno.EPERM:
-                    raise ExitError(Exit.NO_PERMISSION, no_permission(path)) from error
-                case errno.ENOTTY | errno.EISDIR:
-                    text = f"{path} is not a serial device; `acsard ports` lists those there are"
-                    raise ExitError(Exit.NO_PORT, text) from error
-                case errno.ENOENT | errno.ENODEV | errno.ENXIO:
-                    text = f"{path} is not there; plug it in; `acsard ports` lists what there is"
-                    raise ExitError(Exit.NO_PORT, text) from error
-                case _:
-                    text = f"cannot open {path}: {error}"
-                    raise ExitError(Exit.FAILURE, text) from error
-
     def close(self) -> None:
         """Let the last bytes out, unlock and close; nothing can hold it up for long."""
         device, self._device = self._device, None
         if device is None:
             return
-        fd = device.fileno()
-        waiting = bytearray(4)
-        deadline_ns = clock.mono_ns() + int(DRAIN_S * NS_PER_S)
-        try:
-            while clock.mono_ns() < deadline_ns:
-                fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
-                if not any(waiting):
-                    break
-                select.select([], [], [], 0.005)
-            else:
-                device.reset_output_buffer()  # what is stuck must not go out later
-            # A pty outlives us with this flag, and nobody else could open it.
-            fcntl.ioctl(fd, termios.TIOCNXCL)
-        except (OSError, termios.error):
-            pass  # the device is gone
-        closer = threading.Thread(target=device.close, name="close port", daemon=True)
-        closer.start()
-        closer.join(CLOSE_S)
+        for pause in draining(device.fileno(), clock.mono_ns() + int(DRAIN_S * NS_PER_S)):
+            time.sleep(pause)
+        close(device).join(CLOSE_S)
+        device.close()
 
     def now_ns(self) -> int:
         """The monotonic clock."""

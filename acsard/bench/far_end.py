@@ -7,14 +7,10 @@ line of output is the device; when its input ends it writes all it saw and ends.
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import os
-import pty
 import select
 import sys
-import termios
-import tty
 from pathlib import Path
 
 import msgspec
@@ -26,6 +22,7 @@ from acsard.config.parsing import from_builtins
 from acsard.config.settings import Config
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
+from acsard.serial.pty_end import PtyEnd
 from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80
@@ -64,23 +61,20 @@ class FarEnd:
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()
         self._mcu = mcu
-        self._master, self._slave = pty.openpty()
-        # Held open here, or the master would see a hang-up whenever no host is connected.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self._pty = PtyEnd()
+        self.path = self._pty.path
         self._timer = TimerFd()
 
     def play(self, until_fd: int) -> None:
         """Until `until_fd` has something to say."""
         poll = select.poll()
-        for fd in (self._master, self._timer.fileno(), until_fd):
+        for fd in (self._pty.fileno(), self._timer.fileno(), until_fd):
             poll.register(fd, select.POLLIN)
         self._advance()
         while True:
             ready = [fd for fd, _ in poll.poll()]
             now_ns = clock.mono_ns()
-            if self._master in ready:
+            if self._pty.fileno() in ready:
                 self._hear(now_ns)
             if self._timer.fileno() in ready:
                 self._timer.expirations()
@@ -89,24 +83,17 @@ class FarEnd:
                 return
 
     def _hear(self, now_ns: int) -> None:
-        try:
-            data = os.read(self._master, 4096)
-        except OSError:
-            return  # nobody has it open
-        self.seen.heard.append((now_ns, data))
-        # A host that was killed leaves its exclusive mark on the pty, as no real port would.
-        fcntl.ioctl(self._slave, termios.TIOCNXCL)
-        self._mcu.receive(now_ns, data)
+        data = self._pty.read()
+        if data:
+            self.seen.heard.append((now_ns, data))
+            self._mcu.receive(now_ns, data)
 
     def _advance(self) -> None:
         data = self._mcu.advance(clock.mono_ns())
         if data:
             at_ns = clock.mono_ns()
-            try:
-                os.write(self._master, data)
+            if self._pty.write(data):
                 self.seen.said.append((at_ns, data))
-            except BlockingIOError:
-                pass  # nobody reads; a real wire would lose the bytes too
         due_ns = self._mcu.next_ns()
         if due_ns is not None:
             self._timer.set(due_ns)

@@ -1,0 +1,89 @@
+"""One benchmark from beginning to end: a rig is run, its record becomes the figures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from acsard.bench.child import resident_mb
+from acsard.bench.matching import Summary, lines_of, staircase, summary
+from acsard.bench.record import command_waits, feedback_fates
+from acsard.bench.rig import Rig
+from acsard.bench.setup import write
+from acsard.bench.table import Result, this_machine
+from acsard.config.settings import Config
+from acsard.host.exits import Exit, ExitError
+from acsard.messages.schema import RobotState
+
+
+def measure(config: Config, port: str, seconds: float) -> Result:
+    """A quarter of the time only followed, then commanded as well."""
+    with TemporaryDirectory(prefix="acsard-bench-") as where:
+        file = write(config, Path(where))
+        with Rig(config, file, port=port) as rig:
+            followed = rig.follow(seconds / 4)
+            commanded = rig.command(seconds * 3 / 4, (lambda _: 0.0) if port else staircase)
+            return _result(config, port, seconds, rig, (followed, commanded))
+
+
+def _own(state: RobotState) -> dict[str, Summary]:
+    spreads = {name: figure.since_start for name, figure in state.figures.items()}
+    return {
+        name: Summary(s.count, round(s.p50, 1), round(s.p99, 1), round(s.max, 1))
+        for name, s in spreads.items()
+    }
+
+
+def _nothing_seen(sent: int, state: RobotState) -> ExitError:
+    return ExitError(
+        Exit.FAILURE,
+        f"none of the {sent} commands came out on the wire, so nothing was measured; the daemon "
+        f"says: {state.reason}",
+    )
+
+
+def _result(
+    config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
+) -> Result:
+    state, pid = rig.state(), rig.process.pid
+    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+    realtime = policy in (os.SCHED_FIFO, os.SCHED_RR)
+    resident = resident_mb(pid)
+    record = rig.end()
+    read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]
+    outside = {"read_to_odometry": summary(read)}
+    seen = lines_said = lines_waiting = start_up = None
+    lines_told = len(record.samples)
+    if record.seen is not None:
+        heard = lines_of(record.seen.heard)
+        waits, fed = command_waits(record), feedback_fates(config, record)
+        outside["command_to_wire"] = summary(waits)
+        outside["feedback_to_odometry"] = summary([one.delay_ns for one in fed])
+        seen, lines_said, lines_told = len(waits), len(record.said), len(fed)
+        if record.sent and not seen:
+            raise _nothing_seen(len(record.sent), state)
+        lines_waiting = max((one.waiting for one in fed), default=0)
+        start_up = round((heard[0][0] - record.began_ns) / 1e6, 1)
+    return Result(
+        machine=this_machine(),
+        port=port or "simulator",
+        simulated=not port,
+        rate_hz=config.rate_hz,
+        baud_rate=config.mcu.baud_rate,
+        seconds=seconds,
+        realtime=realtime,
+        outside=outside,
+        own=_own(state),
+        commands_sent=len(record.sent),
+        commands_seen=seen,
+        lines_said=lines_said,
+        lines_told=lines_told,
+        lines_waiting_max=lines_waiting,
+        lines_sent=state.counters.get("lines_sent", 0),
+        missed_periods=state.counters.get("missed_periods", 0),
+        cpu_percent_following=round(100 * shares[0], 2),
+        cpu_percent_commanded=round(100 * shares[1], 2),
+        resident_mb=round(resident, 1),
+        start_up_ms=start_up,
+    )

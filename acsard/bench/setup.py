@@ -1,0 +1,74 @@
+"""What a benchmark's daemon runs with: a configuration beside the user's, as a file of its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from acsard.config.parsing import effective
+from acsard.config.settings import (
+    BusConfig,
+    CommandsConfig,
+    Config,
+    DriveConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    LogConfig,
+    RatesConfig,
+    RobotConfig,
+    SimConfig,
+    Source,
+)
+from acsard.config.writing import document
+
+
+def bench_config(config: Config, *, simulated: bool) -> Config:
+    """The configuration to measure with: a name, a bus and a commander of its own.
+
+    On the simulator nothing may hide a command or doubt a made-up feedback: it goes into the next
+    line whole, and feedback that has nothing to do with it is no fault. Lines are plain there: a
+    checked one has a number of its own and is not recognised by the speed it says.
+    """
+    own = replace(
+        config,
+        robot=RobotConfig(f"bench-{os.getpid()}"),
+        bus=BusConfig(listen=(free_endpoint(),)),
+        commands=CommandsConfig(sources=(Source("bench", 100),)),
+        rates=RatesConfig(),
+        log=LogConfig(),
+    )
+    if not simulated:
+        return own
+    return replace(
+        own,
+        mcu=replace(own.mcu, link_check="off", encoder_counts=0),
+        control=replace(own.control, auto_activate=True),
+        drive=DriveConfig(),
+        feedback=FeedbackConfig(fault_time=0.0),
+        limits=LimitsConfig(
+            linear_acceleration=100.0,
+            linear_deceleration=100.0,
+            linear_stop_deceleration=100.0,
+            angular_acceleration=500.0,
+            angular_deceleration=500.0,
+            angular_stop_deceleration=500.0,
+        ),
+        sim=SimConfig(),
+    )
+
+
+def free_endpoint() -> str:
+    """A loopback address nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def write(config: Config, where: Path) -> Path:
+    """The configuration as a file."""
+    file = where / "acsard.toml"
+    file.write_text("\n".join(document(effective(config))) + "\n", encoding="utf-8")
+    return file

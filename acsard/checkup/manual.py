@@ -1,0 +1,244 @@
+"""All that the check can say, as it is printed: what each outcome of a step means, and its mend.
+
+A step looks, and names the outcome with the figures that belong to it; the words are here.
+"""
+
+from __future__ import annotations
+
+import re
+
+from msgspec import Struct, convert
+
+from acsard.checkup.findings import Finding, Verdict
+
+# VERDICT step: outcome | figure
+#     what it means
+#     -> the mend
+OUTCOMES = """
+PASS baud rate: right | {rate} baud
+FAIL baud rate: other | {rate}, not {configured} baud
+    {heard} at the configured {configured} baud; good lines at {rate}
+    -> write mcu.baud_rate = {rate}; the check goes on with it
+FAIL baud rate: none | {heard} at {configured} baud
+    no good line at any baud rate
+    -> is it the right port (`acsard ports`), is the board powered, does the firmware answer, are
+    TX and RX crossed?
+
+PASS identification: named | {short}
+    {text}
+PASS identification: none | none
+    it does not name itself, and need not
+FAIL identification: echo | an echo
+    what comes back is what was sent: no microcontroller speaks here
+    -> are TX and RX joined? is the firmware one that echoes its input?
+
+PASS reply form: right | as documented
+WARN reply form: other | {forms}
+    replies look like {line!r}: read all the same
+    -> nothing to do; `ap00.00,bp00.00,cp00.00,dp00.00` is shorter on the wire, and certain
+
+PASS reply rate: right | {rate:.0f} Hz, {way}
+    longest gap {longest:.0f} ms
+WARN reply rate: lossy | {rate:.0f} Hz, {way}
+    only {answered:.0%} of the lines were answered
+    -> odometry is as fine as this
+FAIL reply rate: slow | {rate:.0f} Hz, {way}
+    one reply in {gap:.0f} ms: the host takes {quiet:.0f} ms of silence for a lost link
+    -> write mcu.reply_period = {period:g}, or have every line answered
+FAIL reply rate: none | too few replies
+    lines go unanswered
+    -> the firmware must answer every line, or by its clock
+
+PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
+WARN round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
+    news of the wheels come late
+    -> an FTDI chip holds bytes back for 16 ms unless its latency_timer is 1 (`doctor`)
+SKIPPED round trip: own clock
+    it answers by its own clock: a reply says nothing of the line before it
+SKIPPED round trip: none
+    no line by itself was answered
+
+PASS checked link: in use | {figure}
+PASS checked link: off | {figure}
+    supported, and not in use: the lines below switch it on
+SKIPPED checked link: plain | plain
+    the firmware answers plain: a damaged line can say a wrong speed
+FAIL checked link: required | none
+    the firmware answers plain: a damaged line can say a wrong speed
+    -> write mcu.link_check = "auto", or give the board firmware that knows the check
+
+PASS motor: right | {figure}
+FAIL motor: dead, not seen | {figure}
+    encoder {here} shows nothing: a dead encoder, or a motor that does not turn
+    -> look whether the wheel turns: if it does, the encoder's supply and leads; if not, the
+    driver, fuse and leads of motor {here}
+FAIL motor: dead, still | {figure}
+    motor {here} does not turn
+    -> driver, fuse, enable and leads of motor {here}
+FAIL motor: dead, turns | {figure}
+    the wheel turns, and encoder {here} shows nothing: a dead encoder
+    -> supply, plug and A and B of encoder {here}
+FAIL motor: reversed, not seen | {figure}
+    encoder {here} counts against motor {here}; no configuration mends that
+    -> swap the two leads of motor {here} if the wheel turns the wrong way, else A and B of
+    encoder {here}
+FAIL motor: reversed, encoder | {figure}
+    encoder {here} counts against motor {here}; no configuration mends that
+    -> the motor is right: swap A and B of encoder {here}
+FAIL motor: reversed, motor | {figure}
+    encoder {here} counts against motor {here}; no configuration mends that
+    -> the motor is reversed: swap the two leads of motor {here}
+FAIL motor: other, not seen | {shown}
+    motor {here} moves encoder {there}: two motors or two encoders are swapped{reversed}
+    -> look which wheel turns: if the {wheel} one, swap encoders {here} and {there}, else motors
+    {here} and {there}
+FAIL motor: other, encoder | {shown}
+    motor {here} moves encoder {there}: two motors or two encoders are swapped{reversed}
+    -> the motor is right: swap the plugs of encoders {here} and {there}
+FAIL motor: other, motor | {shown}
+    motor {here} moves encoder {there}: two motors or two encoders are swapped{reversed}
+    -> the encoder is right: swap the leads of motors {here} and {there}
+FAIL motor: several | {shown}
+    more encoders than {here}'s move, or not the same ones each way
+    -> are wheels coupled, or leads of two motors or encoders crossed?
+FAIL motor: one way | {figure}
+    motor {here} shows movement one way only
+    -> look at the direction output of {here}'s driver, and at A and B of its encoder
+FAIL motor: size | {figure}
+    encoder {here} is more than {tolerance:.0%} off the {speed:g} rad/s it was told: every distance
+    would be off as much
+    -> counts per turn and gear ratio in the firmware; does it control the speed at all?
+
+PASS trailing comma: sent | sent, as configured
+PASS trailing comma: not sent | not needed
+SKIPPED trailing comma: dead
+    motor d shows nothing either way: it cannot be told
+FAIL trailing comma: refused | {figure}
+    it answers lines {form} a comma at their end only
+    -> write mcu.trailing_comma = {comma}; the check goes on with it
+FAIL trailing comma: disobeyed | {figure}
+    {last} obeys only lines {form} a comma at their end
+    -> write mcu.trailing_comma = {comma}; the check goes on with it
+FAIL trailing comma: latched | {figure}
+    {last} still turns after zeros: the firmware takes a value only when a comma follows it, so
+    without the last one this wheel keeps its old speed
+    -> write mcu.trailing_comma = {comma}; the check goes on with it
+
+SKIPPED wheel map: not seen
+    not seen by a person: which wheel each motor turns, and which way, is as configured
+PASS wheel map: right | {map}
+FAIL wheel map: other | {map}
+    not as configured: {wheels}
+    -> write the [mcu.wheels] lines below
+FAIL wheel map: twice
+    two motors turn the {wheel} wheel by what was seen
+    -> mend the motors above, and check again
+
+SKIPPED encoder counts: none
+    the firmware sends no counts
+SKIPPED encoder counts: not turned
+    too little was turned to measure them
+FAIL encoder counts: backward | {measured:.0f} per turn
+    counts run against the speeds, or stand: the pose would run backward
+    -> the firmware must count up when a motor turns in its p direction
+FAIL encoder counts: misnamed | {measured:.0f}
+    it names {named} per turn, but by its speeds there are {measured:.0f}
+    -> the firmware's counts per turn or speeds
+WARN encoder counts: many | {counts} per turn
+    more than the {most} the host takes: count fewer edges
+PASS encoder counts: right | {counts} per turn
+    {how}
+FAIL encoder counts: wrong | {counts}, not {configured}
+    {how}: every distance would be off by {off:.1%}
+    -> write mcu.encoder_counts = {counts}
+
+SKIPPED watchdog: untested
+    no motor turns as told, so none can show it
+FAIL watchdog: weak
+    motors {letters} turned one by one, but not together: does the supply give in?
+    -> measure the supply under load
+FAIL watchdog: none | none within {seconds:.1f} s
+    the motors run on when the host falls silent: a pulled cable or a hung computer leaves the
+    robot driving
+    -> the firmware must stop the motors 300 ms after the last valid line
+FAIL watchdog: late | {figure}
+    the robot drives on for {seconds:.1f} s after a pulled cable: at 1 m/s as many metres
+    -> set the firmware's watchdog to 300 ms
+WARN watchdog: early | {figure}
+    so short that a host that is late once stops the robot
+    -> set the firmware's watchdog to 300 ms
+WARN watchdog: unclear | {figure}
+    it stops the motors, but whether within 500 ms cannot be told this coarsely
+    -> look it up in the firmware: 300 ms is right
+FAIL watchdog: fed | {figure}, but fed by broken lines
+    it stops the motors when the line is silent, but not when it brings only lines that are none: a
+    robot on a half-broken cable drives on
+    -> only a whole valid line may feed the firmware's watchdog
+PASS watchdog: right | {figure}
+    contract 300 ms
+
+SKIPPED damaged lines: untested
+    no motor turns as told, so none can show it
+PASS damaged lines: right | {lines} lines, none moved
+WARN damaged lines: lenient | {took} of {kinds} kinds moved
+    motors turned on lines that are none: {which}
+    -> the firmware should take a line whole or not at all
+FAIL damaged lines: taken | {took} of {kinds} kinds moved
+    motors turned on lines that are none: {which}; on a noisy cable that drives the robot
+    -> the firmware must take a line whole or not at all; deploy/firmware does
+
+FAIL wheels: not lifted
+    not confirmed to be lifted
+
+FAIL runaway: along | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
+    the encoder of {motor} says more than {most:g} rad/s
+    -> counts per turn in the firmware too low, or its control loop unstable
+FAIL runaway: against | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
+    the encoder of {motor} says more than {most:g} rad/s, against the command: the firmware's
+    control loop drives it away
+    -> swap this motor's two leads, or A and B of its encoder
+
+FAIL stop: turns | turns {seconds:g} s after zeros
+    {motors} turns on, by its encoder, whatever zeros are sent
+    -> cut the motors' power; does the firmware take `p00.00` for a stop?
+
+FAIL link: silent | silent for {seconds:.1f} s
+    the microcontroller fell silent while {motors} was to turn
+    -> does its supply dip when a motor starts, and it restarts? a loose cable?
+
+FAIL serial line: lost | lost
+    {error}
+    -> a loose plug? `dmesg | tail`
+"""
+
+
+class Outcome(Struct, frozen=True):
+    """One entry: `figure`, `text` and `mend` take what was seen in braces."""
+
+    verdict: Verdict
+    figure: str
+    text: str
+    mend: str
+
+
+def _read(manual: str) -> dict[str, Outcome]:
+    found = {}
+    for entry in re.split(r"\n+(?! )", manual.strip()):
+        head, *rest = entry.splitlines()
+        verdict, _, head = head.partition(" ")
+        outcome, _, figure = head.partition(" | ")
+        text, _, mend = " ".join(line.strip() for line in rest).partition("-> ")
+        parts = {"verdict": verdict, "figure": figure, "text": text.strip(), "mend": mend}
+        found[outcome] = convert(parts, Outcome)
+    return found
+
+
+MANUAL = _read(OUTCOMES)
+
+
+def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
+    """The finding of this outcome, with what was seen; it bears the name of the step, or `name`."""
+    entry = MANUAL[outcome]
+    name = str(seen.get("name", outcome.partition(":")[0]))
+    figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
+    return Finding(name, entry.verdict, figure, text, mend, keys or {})

@@ -1,0 +1,32 @@
+"""**The** table of what an error means to the shell that started us."""
+
+from __future__ import annotations
+
+from acsard.host.errors import (
+    CertificateError,
+    InUseError,
+    MendableError,
+    NoAnswerError,
+    NoPortError,
+    NotPermittedError,
+    ReplyError,
+    UnreachableError,
+    UsageError,
+)
+from acsard.host.exits import Exit, ExitError
+
+CODES: dict[type[MendableError], Exit] = {
+    ReplyError: Exit.FAILURE,
+    UsageError: Exit.USAGE,
+    NoPortError: Exit.NO_PORT,
+    UnreachableError: Exit.UNREACHABLE,
+    NoAnswerError: Exit.UNREACHABLE,
+    InUseError: Exit.IN_USE,
+    NotPermittedError: Exit.NO_PERMISSION,
+    CertificateError: Exit.BAD_CONFIG,
+}
+
+
+def code_of(error: MendableError) -> Exit:
+    """What the program ends with for this error."""
+    return error.code if isinstance(error, ExitError) else CODES[type(error)]

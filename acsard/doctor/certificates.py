@@ -1,0 +1,40 @@
+"""The files of bus.tls: are they there, private and in date?"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from acsard.bus.certificates import check, ends_ns
+from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.config.settings import Config
+from acsard.doctor.finding import LEVELS, Finding
+from acsard.host.clock import now
+from acsard.host.errors import MendableError
+from acsard.messages.expiry import expiry
+
+
+def certificates(config: Config) -> Iterator[Finding]:
+    """Are the files of bus.tls there, private and in date?"""
+    if not config.bus.tls:
+        return
+    directory = Path(config.bus.tls)
+    for name in (CA, CERTIFICATE, KEY):
+        file = directory / name
+        if not os.access(file, os.R_OK):
+            text = f"{file} is missing or not yours to read"
+            yield Finding("certificates", "failure", text, "`sudo acsard lan init`, or sudo doctor")
+        elif name == KEY and file.stat().st_mode & 0o077:
+            yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
+    try:
+        check(config.bus.tls)
+    except MendableError as error:
+        yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
+        return
+    ends = ends_ns(config.bus.tls)
+    level, words = expiry(ends, now().wall_ns)
+    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
+    if ends is None:
+        mend = "pip install 'acsard[lan]' to have it read"
+    yield Finding("certificates", LEVELS[level], words, mend if level else "")

@@ -1,0 +1,43 @@
+"""The machine: programs that meddle, a clock that was set, real-time scheduling."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from acsard.doctor.finding import Finding
+from acsard.host import clock
+from acsard.host.processes import running
+from acsard.values import NS_PER_S
+
+LEAST_YEAR = 2026
+"""A clock before this was never set: boards without a battery start in the past."""
+
+
+def meddlers() -> Iterator[Finding]:
+    """Programs that take serial ports for something else."""
+    if running("brltty"):
+        mend = "sudo apt remove brltty, unless you read Braille: it takes CH340 and FTDI ports"
+        yield Finding("brltty", "failure", "runs", mend)
+    if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
+        mend = "install deploy/udev/70-acsar.rules (`acsard service install` does)"
+        yield Finding("ModemManager", "warning", "runs, and talks to new serial ports", mend)
+
+
+def clock_and_scheduling() -> Iterator[Finding]:
+    """Stamps need a clock that was set; the loop likes to be real-time."""
+    year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
+    if year < LEAST_YEAR:
+        mend = "set it (timedatectl), or let chrony do; odometry stamps are wall-clock times"
+        yield Finding("clock", "warning", f"stands in {year}", mend)
+    else:
+        yield Finding("clock", "ok", f"stands in {year}")
+    allowed, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if os.geteuid() == 0 or allowed != 0:
+        yield Finding("real time", "ok", "may be asked for")
+    else:
+        mend = "run it as the service (deploy/systemd), which has it; without, load adds lateness"
+        yield Finding("real time", "warning", "is not allowed for you", mend)

@@ -1,0 +1,42 @@
+"""What the arbiter decides, in words for people: `state`, `diagnostics`, the log."""
+
+from __future__ import annotations
+
+from acsard.drive.arbiter import MAX_SENDERS, Choice
+from acsard.values import Wait
+
+REFUSED = {
+    "unknown_source": "not one of commands.sources",
+    "not_finite": "NaN or infinity",
+    "crowded": f"{MAX_SENDERS} other senders of this source are live",
+    "stale": "held up on the way for longer than the source's timeout (or the sender's clock was "
+    "set back: let it pause for 10 s, then send on)",
+}
+"""What a command is refused for."""
+
+
+def chosen(choice: Choice) -> str:
+    """Whose command is followed, or why nobody's is."""
+    if not choice.source:
+        return "no commands: no source has sent one within its timeout"
+    return waiting(choice.wait) or f"commanded by {choice.source}"
+
+
+def waiting(wait: Wait) -> str:
+    """What a source waits for; "" for nothing."""
+    match wait.what:
+        case "nothing":
+            return ""
+        case "command":
+            return "a command"
+        case "neutral":
+            return (
+                f"neutral first: {wait.source} must send a zero, or pause for "
+                f"{wait.timeout:g} s, before it can drive"
+            )
+        case "higher":
+            return f"{wait.source} has the higher priority: until it is silent"
+        case "equal":
+            return f"{wait.source}, of the same priority, came first: until it is silent"
+        case "senders":
+            return f"{wait.senders} more of its senders: the first until it is silent"

@@ -1,0 +1,78 @@
+"""The serial ports of this machine: which boards they are, who holds them.
+
+Read from sysfs and procfs; nothing is opened, so a running robot is not disturbed.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from msgspec import Struct
+from serial.tools import list_ports
+
+from acsard.host.processes import Holder, holders
+
+BOARDS: dict[str, str] = {
+    "2341:0010": "Arduino Mega 2560",
+    "2341:0042": "Arduino Mega 2560 R3",
+    "2a03:0042": "Arduino Mega 2560 (arduino.org)",
+    "1a86:7523": "CH340, on most Mega 2560 clones",
+    "1a86:55d4": "CH9102",
+    "0403:6001": "FTDI FT232R",
+    "0403:6015": "FTDI FT-X",
+    "10c4:ea60": "Silicon Labs CP210x",
+}
+"""USB ids a robot's microcontroller is found behind; a test holds deploy/udev/70-acsar.rules to
+them."""
+
+BY_ID = Path("/dev/serial/by-id")
+
+
+class SerialDevice(Struct, frozen=True):
+    """One serial port of this machine."""
+
+    device: str
+    names: list[str]
+    """Stable names for it: by-id links and /dev/acsar."""
+    driver: str
+    usb_id: str
+    """`vid:pid` in hex, "" when it is not on USB."""
+    description: str
+    board: str
+    """Which usual microcontroller board it looks like, "" for none."""
+    holders: list[Holder]
+
+
+def serial_devices() -> list[SerialDevice]:
+    """The serial ports that are plugged in; those without hardware behind them are left out."""
+    links = _links()
+    found = []
+    for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):
+        usb = port.vid is not None and port.pid is not None
+        usb_id = f"{port.vid:04x}:{port.pid:04x}" if usb else ""
+        found.append(
+            SerialDevice(
+                device=port.device,
+                names=links.get(os.path.realpath(port.device), []),
+                driver=_driver(Path(port.device).name),
+                usb_id=usb_id,
+                description=port.description if port.description != "n/a" else "",
+                board=BOARDS.get(usb_id, ""),
+                holders=list(holders(port.device)),
+            )
+        )
+    return found
+
+
+def _links() -> dict[str, list[str]]:
+    names: dict[str, list[str]] = {}
+    candidates = [Path("/dev/acsar"), *(sorted(BY_ID.iterdir()) if BY_ID.is_dir() else [])]
+    for link in candidates:
+        if link.is_symlink():
+            names.setdefault(os.path.realpath(link), []).append(str(link))
+    return names
+
+
+def _driver(name: str) -> str:
+    return Path(os.path.realpath(f"/sys/class/tty/{name}/device/driver")).name.replace("driver", "")

@@ -1,0 +1,165 @@
+"""acsard as a system service: its files, its commands, and which steps install or remove it.
+
+The files are those of `deploy/`, with the path of this installation in the unit. Nothing that
+somebody else wrote is overwritten or removed without force.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import acsard
+from acsard.host.exits import Exit, ExitError
+from acsard.host.steps import File, Keep, Remove, Run, Step, Write, called
+
+UNIT, STOP = "acsard.service", "acsard-stop"
+DROP_IN = Path("/etc/systemd/system/acsard.service.d/lan.conf")
+HOME = "/opt/acsard/venv"
+"""Where the unit of `deploy/` believes acsard to be."""
+
+TLS = "/etc/acsard/tls"
+"""Where `lan.conf` believes the certificates to be."""
+
+OUT_OF_SIGHT = ("/home/", "/root", "/tmp/")
+"""Places a service cannot see."""
+
+Found = Mapping[Path, bytes | None]
+"""What is there now in the place of each file."""
+
+ASK_S = 10.0
+"""systemd answers at once, or hangs."""
+
+RELOAD = (
+    Run(("systemctl", "daemon-reload")),
+    Run(("udevadm", "control", "--reload"), may_fail=True),
+)
+AGAIN = ("tty", "usb-serial", "misc")
+"""Subsystems with devices that the rules are about: they are looked at again."""
+
+INSTALLED = (
+    *RELOAD,
+    Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
+    Run(("systemctl", "enable", "--now", UNIT)),
+)
+LEAVING = (Run(("systemctl", "disable", "--now", UNIT)),)
+GONE = (*RELOAD, Run(("systemctl", "reset-failed", UNIT), may_fail=True))
+
+
+def files() -> list[File]:
+    """Every file of the service, as this installation writes it."""
+    unit = (_source() / "systemd" / UNIT).read_text(encoding="utf-8").replace(HOME, sys.prefix)
+    reference = _reference().read_text(encoding="utf-8")
+    return [
+        File(Path("/etc/systemd/system") / UNIT, unit.encode()),
+        File(Path("/opt/acsard/bin") / STOP, (_source() / "systemd" / STOP).read_bytes(), 0o755),
+        File(
+            Path("/etc/udev/rules.d/70-acsar.rules"),
+            (_source() / "udev" / "70-acsar.rules").read_bytes(),
+        ),
+        File(
+            Path("/etc/acsard/acsard.toml"),
+            reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
+            kept=True,
+        ),
+    ]
+
+
+def lan_drop_in() -> File:
+    """What lets the unit onto the local network and gives it its certificates."""
+    return File(DROP_IN, (_source() / "systemd" / "lan.conf").read_bytes())
+
+
+def admitting(directory: Path) -> Write | None:
+    """What lets the installed service onto the network with these certificates; None without one.
+
+    The unit itself sees loopback only, and none of root's files.
+    """
+    if os.geteuid() != 0 or not (DROP_IN.parent.parent / UNIT).exists():
+        return None
+    file = lan_drop_in()
+    return Write(File(file.path, file.content.replace(TLS.encode(), str(directory).encode())))
+
+
+def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
+    """What is there now in the place of these files."""
+    return {file.path: file.found() for file in wanted}
+
+
+def misplaced(prefix: str = sys.prefix, base: str = sys.base_prefix) -> str:
+    """Why this installation is no place for a service, or ""."""
+    if prefix != base and not prefix.startswith(OUT_OF_SIGHT):
+        return ""
+    return (
+        f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard in a "
+        f"venv at {HOME} (deploy/systemd/README.md)"
+    )
+
+
+def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
+    """The steps to the service; raises `ExitError` when they would overwrite somebody's work."""
+    steps: list[Step] = []
+    changed: list[str] = []
+    for file in wanted:
+        there = found[file.path]
+        if there == file.content or (file.kept and there is not None):
+            steps.append(Keep(file.path))
+            continue
+        if there is not None:
+            changed.append(str(file.path))
+        steps.append(Write(file))
+    if changed and not force:
+        paths = ", ".join(changed)
+        raise ExitError(Exit.FAILURE, f"would overwrite {paths}; look at them, or use --force")
+    return [*steps, *INSTALLED]
+
+
+def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
+    """The steps that undo it; what somebody has changed stays unless forced, a `kept` file also
+    then."""
+    there = [file for file in wanted if found[file.path] is not None]
+    staying = {
+        file.path.name
+        for file in there
+        if found[file.path] != file.content and (file.kept or not force)
+    }
+    if UNIT in staying:
+        staying.add(STOP)  # a unit that is started again must find what sends zeros after it
+    why = "changed, or needed by what is; --force removes it"
+    steps: list[Step] = []
+    for file in there:
+        stays = file.path.name in staying
+        steps.append(Keep(file.path, why) if stays else Remove(file.path))
+    leaving = LEAVING if any(file.path.name == UNIT for file in there) else ()
+    return [*leaving, *steps, *GONE]
+
+
+def state() -> str:
+    """What systemd says of the service, "" where it does not answer."""
+    about = "--property=ActiveState,SubState,StatusText,NRestarts"
+    try:
+        done = called(("systemctl", "show", UNIT, about), ASK_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() or done.stderr.strip()
+
+
+def _source() -> Path:
+    """The files of `deploy/`: inside the package, or beside it in a clone."""
+    package = Path(acsard.__file__).parent
+    inside = package / "deploy"
+    if inside.is_dir():
+        return inside
+    clone = package.parent / "deploy"
+    if not clone.is_dir():
+        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} is there; install acsard anew")
+    return clone
+
+
+def _reference() -> Path:
+    """The reference configuration, which lies beside `deploy/` in a clone."""
+    inside = _source() / "acsard.toml"
+    return inside if inside.is_file() else _source().parent / "acsard.toml"

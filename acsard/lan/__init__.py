@@ -1,0 +1,1 @@
+"""Shell: `acsard lan`: an authority of your own, and the certificates it gives."""

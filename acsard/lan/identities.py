@@ -1,0 +1,111 @@
+"""Who has which certificate: a directory with the robot's own, the authority, and all clients'.
+
+The robot lets in who has a certificate of its authority, and the common name in it decides what
+they may do (`[access]`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.bus.session import CA
+from acsard.config.settings import Config
+from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.bus.access import Role
+    from acsard.lan.authority import Authority
+
+PORT = 7449
+ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
+
+ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
+"""A host name or IP address."""
+
+
+def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> None:
+    """Make an authority, the robot's certificate and one for each role."""
+    if (directory / CA).exists() and not force:
+        raise ExitError(
+            Exit.FAILURE,
+            f"{directory / CA} exists: `acsard lan add` makes one more certificate with it; "
+            "--force makes a new authority, and all certificates of the old one are refused then",
+        )
+    maker = _maker()
+    _writable(directory)
+    authority = maker.make(directory, f"acsard at {socket.gethostname()}", days)
+    authority.issue(directory, "robot", _robot_names(addresses), days)
+    for role in ROLES:
+        authority.issue(directory / "clients" / role, role, [], days)
+
+
+def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
+    """Make one more client's certificate; where it is."""
+    authority = _load(directory)
+    place = directory / "clients" / name
+    if place.exists():
+        raise ExitError(Exit.FAILURE, f"{place} exists; remove it, or choose another name")
+    named = [name] if ADDRESS.match(name) else []
+    authority.issue(place, name, [*named, *addresses], days)
+    return place
+
+
+def renew(directory: Path, addresses: Sequence[str], days: int) -> None:
+    """Replace the robot's own certificate."""
+    _load(directory).issue(directory, "robot", _robot_names(addresses), days)
+
+
+def _robot_names(more: Sequence[str]) -> list[str]:
+    """What the robot is reached by: from elsewhere, by mDNS, and on itself."""
+    host = socket.gethostname()
+    return [host, f"{host}.local", "localhost", "127.0.0.1", *more]
+
+
+def keys(config: Config, directory: Path) -> dict[str, object]:
+    """The keys by which the bus leaves the machine; where it does so already, it stays there."""
+    listen = list(config.bus.listen)
+    if not any(endpoint.startswith("tls/") for endpoint in listen):
+        listen.append(f"tls/0.0.0.0:{PORT}")
+    return {"bus.listen": listen, "bus.tls": str(directory)}
+
+
+def _maker() -> type[Authority]:
+    try:
+        from acsard.lan.authority import Authority
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE, "needs the library cryptography; run: pip install 'acsard[lan]'"
+        ) from None
+    return Authority
+
+
+def _load(directory: Path) -> Authority:
+    """The authority there, once we know that we may write beside it."""
+    maker = _maker()
+    _writable(directory)
+    try:
+        return maker.load(directory)
+    except FileNotFoundError:
+        raise ExitError(
+            Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
+
+
+def _writable(directory: Path) -> None:
+    try:
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExitError(
+            Exit.NO_PERMISSION, f"cannot make {directory}: {error.strerror}; use --directory"
+        ) from None
+    if not os.access(directory, os.W_OK):
+        raise ExitError(
+            Exit.NO_PERMISSION, f"cannot write to {directory}: run it by sudo, or use --directory"
+        )

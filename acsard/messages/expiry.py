@@ -1,0 +1,20 @@
+"""How long the certificate of the bus lasts, as `state`, `diagnostics` and `doctor` say it."""
+
+from __future__ import annotations
+
+from acsard.values import NS_PER_S
+
+EXPIRY_DAYS = 30
+"""From when on a certificate that ends is a warning."""
+
+DAY_NS = 86400 * NS_PER_S
+
+
+def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
+    """How bad (0 ok, 1 warning, 2 error) and in words; wall-clock times, None when not known."""
+    if ends_ns is None:
+        return 1, "unknown: the library to read it is missing (pip install 'acsard[lan]')"
+    days = (ends_ns - now_ns) / DAY_NS
+    if days < 0:
+        return 2, f"ended {-days:.0f} days ago: nobody can join any more"
+    return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"

@@ -1,0 +1,192 @@
+"""The parts of the screen below the mode, each a list of lines with a rule as its first; pure."""
+
+from __future__ import annotations
+
+import math
+
+from rich.text import Text
+
+from acsard.messages.schema import Info, RobotState, SourceState, Spread
+from acsard.runtime.figures import NAMES
+from acsard.top.seen import Seen
+from acsard.top.text import (
+    ago,
+    bar,
+    clean,
+    count,
+    duration,
+    rate,
+    row,
+    rule,
+    signed,
+)
+from acsard.values import NS_PER_S
+
+WIDEST = 116
+"""Wider than this a line is harder to read, not easier."""
+
+SHORT_WORDS, LONG_WORDS = 21, 56
+"""The room for what each figure is; the long words from `WIDEST` on."""
+
+MOST_REASONS, MOST_PORT = 16, 34
+
+LINKS = {"up": "green", "booting": "yellow"}
+
+FIGURES = {
+    "period_lateness": ("period due → step", "from a period due (the first missed) to its step"),
+    "step_time": ("work of one step", "from the start of a step to the end of its work"),
+    "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
+    "command_to_wire": ("arrival → first line", "from arrival in its turn to the first such line"),
+    "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
+    "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
+}
+"""`figures.Name` in few words and in more. An arrow is from one moment to another."""
+
+
+def motion(state: RobotState, width: int) -> list[Text]:
+    """Pose and twist on the left, the wheels as they sit on the robot on the right."""
+    wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
+    right, left, rear_left, rear_right = wheels
+    known = [abs(speed) for speed in wheels if math.isfinite(speed)]
+    top = max(known, default=0.0)
+    scale = next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
+    cells = 6 + max(0, width - 80) // 2
+    at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
+    place = f"x {signed(state.x, 3, 8)} m  y {signed(state.y, 3, 8)} m  "
+    place += f"yaw {signed(math.degrees(state.yaw), 1, 6)}°"
+    twist = f"forward {signed(state.linear, 3, 7)} m/s  turn {signed(state.angular, 3, 7)} rad/s"
+    rows = ((place, "front", left, right), (twist, "rear", rear_left, rear_right))
+    lines = [rule(width, at)]
+    for told, axle, one, other in rows:
+        line = Text(told.ljust(40))
+        line.append(axle.ljust(6), "dim")
+        line.append_text(_wheel(one, scale, cells)).append("  ")
+        lines.append(line.append_text(_wheel(other, scale, cells)))
+    return lines
+
+
+def _wheel(speed: float, scale: float, cells: int) -> Text:
+    """Direction, speed and bar in `10 + cells` cells."""
+    if speed == 0.0 or not math.isfinite(speed):
+        sign, style = "·", "dim"
+    else:
+        sign, style = ("▲", "green") if speed > 0 else ("▼", "magenta")
+    number = "-".rjust(7) if math.isnan(speed) else signed(speed, 2, 7)
+    return Text.assemble(
+        (sign, style), number, "  ", (bar(speed, scale, cells).ljust(cells), style)
+    )
+
+
+def sources(state: RobotState, room: int, width: int) -> list[Text]:
+    """A line for each source, in at most `room` lines."""
+    room_name = 13 + max(0, width - 80) // 2
+    start = room_name + 3
+    at = ((0, "sources"), (start, "priority"), (start + 10, "heard"), (start + 17, "waits for"))
+    lines = [rule(width, at)]
+    shown = state.sources[: room if len(state.sources) <= room else room - 1]
+    lines += [_source(source, state, room_name) for source in shown]
+    hidden = [clean(source.name) for source in state.sources[len(shown) :]]
+    if hidden:
+        names = ", ".join(hidden[:MOST_REASONS])
+        lines.append(Text(f"  and {count(len(hidden))} more: {names}", "dim"))
+    return lines if state.sources else [*lines, Text("  none", "dim")]
+
+
+def _source(source: SourceState, state: RobotState, room: int) -> Text:
+    drives = source.name == state.source and state.mode == "driving" and not source.waits_for
+    live = drives or source.waits_for != "a command"
+    told = clean(source.waits_for)
+    if not told:
+        told = "nothing: it drives" if drives else f"nothing, but the robot is {clean(state.mode)}"
+    mark, style = ("▶ ", "bold green") if drives else ("  ", "" if live else "dim")
+    name = Text(clean(source.name))
+    name.truncate(room, overflow="ellipsis", pad=True)
+    figures = f"{count(source.priority):>8}  {ago(source.age):<7}"
+    return Text(f"{mark}{name.plain} {figures}{told}", style)
+
+
+def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
+    """The serial line, the commands, and all that was refused."""
+    before = seen.before or state
+    title = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
+    if seen.info is not None:
+        sim = seen.info.simulated
+        title.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
+    titles: list[tuple[int, str | Text]] = [(0, title)]
+    if state.certificate:
+        style = "" if state.certificate.startswith("valid for") else "bold red"
+        told = Text(f"certificate {clean(state.certificate)}", style)
+        titles.append((max(title.cell_len + 2, width - told.cell_len - 4), told))
+    seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
+
+    def counted(name: str) -> str:
+        now, then = state.counters.get(name, 0), before.counters.get(name, 0)
+        return f"{rate(now, then, seconds)} of {count(now):<10}"
+
+    counters = state.counters
+    superseded, overrun = counters.get("lines_superseded", 0), counters.get("bus_overrun", 0)
+    lines = [
+        rule(width, titles),
+        row("lines", f"in {counted('lines')} out {counted('lines_sent')}").append(
+            f" superseded {count(superseded)}"
+        ),
+        row("commands", f"   {counted('commands')} ").append_text(_missed(state, before)),
+    ]
+    if overrun:
+        lines[-1].append(f"  bus overrun {count(overrun)}", "yellow")
+    lines += _refusals(state, before)
+    return lines
+
+
+def _port(info: Info) -> str:
+    """The serial port; of a long name its own part."""
+    port = clean(info.port)
+    return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
+
+
+def _missed(state: RobotState, before: RobotState) -> Text:
+    missed = state.counters.get("missed_periods", 0)
+    grows = missed > before.counters.get("missed_periods", 0)
+    return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
+
+
+def _refusals(state: RobotState, before: RobotState) -> list[Text]:
+    """What was rejected, by reason, what grows in yellow; and the last refusal in words."""
+    kinds = []
+    for kind, prefix in (("lines", "line_"), ("commands", "command_")):
+        found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
+        found.sort(key=lambda one: -one[1])
+        parts = []
+        for name, number in found[:MOST_REASONS]:
+            grows = number > before.counters.get(name, 0)
+            told = f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}"
+            parts.append(Text(told, "yellow" if grows else ""))
+        if parts:
+            kinds.append(Text(f"{kind} ").append_text(Text(", ").join(parts)))
+    joined = Text(" · ").join(kinds) if kinds else Text("nothing", "dim")
+    last = row("last one", clean(state.refused)) if state.refused else row("last one", "-", "dim")
+    return [row("rejected", "").append_text(joined), last]
+
+
+def timing(state: RobotState, width: int) -> list[Text]:
+    """The daemon's figures of itself."""
+    long = width >= WIDEST
+    room = LONG_WORDS if long else SHORT_WORDS
+    start = 16 + room
+    at = ((0, "timing"), (start + 2, "last minute"), (start + 23, "since start"))
+    heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
+    lines = [rule(width, at), Text(f"{'':{start}}{heads}{heads}", "dim")]
+    for name in NAMES:
+        line = Text(f"{name:<16}").append(FIGURES[name][long].ljust(room), "dim")
+        one = state.figures.get(name)
+        for spread in (one.last_minute, one.since_start) if one else (None, None):
+            line.append_text(_spread(spread))
+        lines.append(line)
+    return lines
+
+
+def _spread(spread: Spread | None) -> Text:
+    if spread is None or spread.count <= 0:
+        return Text("-".rjust(7) * 3, "dim")
+    p50, p99, most = (duration(value).rjust(7) for value in (spread.p50, spread.p99, spread.max))
+    return Text.assemble(p50, (p99, "bold"), (most, "dim"))

@@ -1,0 +1,216 @@
+"""What the pages say to type is typed here, as it stands there, beside a simulated robot.
+
+The README's Python is run by `test_client.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.pages import COMMANDS, Block, Run, blocks, promises
+from tests.system.harness import (
+    ROOT,
+    Bus,
+    Daemon,
+    Finished,
+    Program,
+    environment,
+    finish,
+    free_endpoint,
+    write_config,
+)
+from tests.system.test_fleet import Fleet
+
+SLOW_PAGES = ("deploy/zenoh/README.md",)
+
+TYPED = [
+    pytest.param(
+        block,
+        id=block.where,
+        marks=[pytest.mark.network] if block.page in SLOW_PAGES else [],
+    )
+    for block in blocks()
+    if any(isinstance(COMMANDS.get(command), Run) for command in block.commands())
+]
+
+INSTALL_S = 300.0
+"""From an index far away."""
+
+
+def find(page: str, *words: str) -> str:
+    """The one command of a page with these words."""
+    commands = [c for block in blocks() if block.page == page for c in block.commands()]
+    (found,) = {c for c in commands if all(word in c for word in words)}
+    return found
+
+
+def shell(place: Path, command: str, within: float = 60.0) -> Finished:
+    """A command typed in a directory whose `.venv` has acsard, and first on the PATH."""
+    path = os.pathsep.join([str(place / ".venv/bin"), os.environ["PATH"]])
+    return finish(["bash", "-c", command], place, within, environment(PATH=path))
+
+
+def with_acsard(place: Path) -> Path:
+    """Make a `.venv` as after `pip install`, of the acsard that is tested."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place / ".venv"], check=True)
+    script = place / ".venv/bin/acsard"
+    script.write_text(f'#!/bin/sh\nexec {sys.executable} -m acsard "$@"\n')
+    script.chmod(0o755)
+    return place
+
+
+@pytest.fixture(scope="module")
+def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory whose acsard.toml is of the robot that runs, as in a clone."""
+    place = with_acsard(tmp_path_factory.mktemp("desk"))
+    write_config(place / "acsard.toml", {"bus": {"listen": [shared.endpoint]}})
+    return place
+
+
+@pytest.mark.parametrize("block", TYPED)
+def test_what_a_page_says_to_type_does_what_it_says(block: Block, desk: Path, bus: Bus) -> None:
+    if "lan init" in block.text and Path("/etc/systemd/system/acsard.service").exists():
+        pytest.skip("lan init would write the drop-in of the service of this machine")
+    for command in block.commands():
+        how = COMMANDS.get(command)
+        if isinstance(how, Run):
+            done = shell(desk, command)
+            assert done.code in how.codes, f"{command}\n{done.out}\n{done.err}"
+            assert re.search(how.says, done.out, re.M), f"{command}\n{done.out}\n{done.err}"
+            assert "Traceback" not in done.err
+
+
+def test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port() -> None:
+    if shutil.which("make") is None:
+        pytest.skip("no make")
+    words = ["make", "-n", "flash", "PORT=/dev/ttyACM0"]
+    assert find("deploy/firmware/README.md", "make flash").split() == ["make", *words[2:]]
+    done = finish(words, ROOT / "deploy/firmware")
+    assert done.code == 0, done
+    assert re.search(r"avrdude .*-P /dev/ttyACM0 .*firmware\.hex", done.out)
+
+
+# what takes longer
+
+
+COLLECT = """\
+import json, sys
+import pytest
+
+for arguments in json.loads(sys.argv[1]):
+    print("asked", arguments)
+    code = pytest.main(["--collect-only", "-qq", "-p", "no:cacheprovider", *arguments])
+    print("ended", int(code), arguments, flush=True)
+"""
+"""One process for all: most of the time goes into imports."""
+
+
+@pytest.mark.network
+@pytest.mark.timeout(600)
+def test_each_call_that_proves_a_promise_finds_tests() -> None:
+    asked = [words for words in promises() if any(word.startswith("tests/") for word in words)]
+    done = finish([sys.executable, "-c", COLLECT, json.dumps(asked)], ROOT, 500.0)
+    ended = re.findall(r"^ended (\d+) (.*)$", done.out, re.M)
+    assert len(ended) == len(asked) > 20, done
+    assert [words for code, words in ended if code != "0"] == []
+
+
+@pytest.mark.network
+def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -> None:
+    page, place = "deploy/firmware/README.md", with_acsard(tmp_path)
+    board = find(page, "acsard sim --link").split()[1:]
+    with Program([sys.executable, "-m", "acsard", *board], place) as sim:
+        sim.says("acsard run --port")
+        done = shell(place, find(page, "--port ./mcu --yes"), 100.0)
+    assert done.code == 1, done
+    assert "trailing_comma = true" in done.out
+    assert re.search("^FAIL +motor b ", done.out, re.M)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    with Fleet(tmp_path_factory.mktemp("fleet")) as fleet:
+        yield fleet
+
+
+@pytest.mark.network
+def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> None:
+    place = with_acsard(fleet.where)
+    (place / "fleet").mkdir()
+    (place / "fleet/clients").symlink_to(place)
+    (place / "laptop-anna").symlink_to(place / "operator")
+    page = "deploy/zenoh/README.md"
+    story = [
+        (find(page, "echo state", "laptop-anna"), 0, '"mode":"ready"'),
+        (find(page, "call stop", "laptop-anna"), 0, "stopped and latched"),
+        (find(page, "echo state", "viewer"), 0, '"mode":"stopped"'),
+        (find(page, "call clear", "viewer"), 69, ""),
+        (find(page, "call clear", "operator"), 0, "cleared"),
+        (find(page, "call stop", "viewer"), 0, "stopped and latched"),
+    ]
+    for command, code, says in story:
+        done = shell(place, command.replace("tls/router.local:7447", fleet.endpoint))
+        assert (done.code, says in done.out) == (code, True), f"{command}\n{done}"
+
+
+# what installs from an index
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """The files of a clone, without what has been made in it."""
+    place = tmp_path / "clone"
+    for name in ("acsard", "deploy"):
+        made = shutil.ignore_patterns("__pycache__", "build")
+        shutil.copytree(ROOT / name, place / name, ignore=made)
+    for name in ("pyproject.toml", "acsard.toml", "README.md", "LICENSE", "CHANGELOG.md"):
+        shutil.copy(ROOT / name, place / name)
+    return place
+
+
+def of_a_stranger(**more: str) -> dict[str, str]:
+    """An environment in which only what was installed can be imported."""
+    env = environment(**more)
+    del env["PYTHONPATH"]
+    return env
+
+
+@pytest.mark.network
+@pytest.mark.timeout(2 * INSTALL_S)
+def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: Path) -> None:
+    endpoint = free_endpoint()  # 7448 may be in use here
+    config = write_config(clone.parent / "other.toml", {"bus": {"listen": [endpoint]}})
+    env = of_a_stranger(ACSARD_CONFIG=str(config))
+    words = ["bash", "-c", find("README.md", "pip install . ")]
+    with Program(words, clone, env, start_new_session=True) as program:
+        try:
+            program.says(endpoint, INSTALL_S)
+            with Bus(endpoint) as bus:
+                assert bus.get("info")["simulated"] is True
+        finally:
+            os.killpg(program.pid, signal.SIGTERM)  # the shell, and the daemon under it
+
+
+@pytest.mark.network
+@pytest.mark.timeout(2 * INSTALL_S)
+def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> None:
+    page, venv = "deploy/systemd/README.md", clone.parent / "opt"
+    wanted = [find(page, "python3 -m venv"), find(page, "sudo /opt", "pip install"), ""]
+    assert "'.[lan]'" in wanted[1]
+    wanted[2] = f"{venv}/bin/acsard lan init --directory {clone.parent}/tls"
+    for command in wanted:
+        typed = command.removeprefix("sudo ").replace("/opt/acsard/venv", str(venv))
+        done = finish(["bash", "-c", typed], clone, INSTALL_S, of_a_stranger())
+        assert done.code == 0, done
+    files = finish([str(venv / "bin/acsard"), "service", "install", "--dry-run"], clone.parent)
+    assert "acsard.service" in files.out

@@ -1,0 +1,238 @@
+"""The pages are true as far as one can see without running anything: commands, files, links, toml.
+
+What they say to type is run by `tests/system/test_pages.py`, or by what `tests/pages.py` names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from acsard.cli import VERBS
+from acsard.config.settings import Config
+from tests.pages import (
+    COMMANDS,
+    LANGUAGES,
+    PAGES,
+    ROOT,
+    Block,
+    Elsewhere,
+    blocks,
+    promises,
+    prose,
+    text_of,
+)
+
+ON_PAGES = [(block, command) for block in blocks() for command in block.commands()]
+
+PLACEHOLDERS = {"NAME": "mute", "ROLE": "viewer", "VERB": "run", "HZ": "50"}
+
+
+def at(block: Block) -> str:
+    return block.where
+
+
+def test_there_is_a_page_beside_each_thing_it_describes() -> None:
+    beside = {f"deploy/{part}/README.md" for part in ("firmware", "ros2", "systemd", "zenoh")}
+    assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
+
+
+def test_the_readme_is_short() -> None:
+    assert len(text_of("README.md").splitlines()) <= 250
+
+
+# commands
+
+
+def test_something_runs_every_command_on_every_page() -> None:
+    unknown = [f"{block.where}: {text}" for block, text in ON_PAGES if text not in COMMANDS]
+    assert not unknown, "say in tests/pages.py what runs these:\n" + "\n".join(unknown)
+
+
+def test_every_command_that_something_runs_is_on_a_page() -> None:
+    assert set(COMMANDS) == {command for _, command in ON_PAGES}
+
+
+@pytest.mark.parametrize(
+    "how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}), ids=" ".join
+)
+def test_what_is_said_to_run_a_command_has_the_words_for_it(how: Elsewhere) -> None:
+    assert how.words in (ROOT / how.file).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("block", blocks(), ids=at)
+def test_a_block_is_of_a_kind_that_is_checked(block: Block) -> None:
+    assert block.language in LANGUAGES
+    if block.language != "console":
+        assert not re.search(r"^\$ ", block.text, re.M), "a command in no console"
+
+
+def test_every_block_of_commands_is_shell() -> None:
+    shell = shutil.which("bash")
+    if shell is None:
+        pytest.skip("no bash")
+    text = "\n".join(command for _, command in ON_PAGES)
+    done = subprocess.run([shell, "-n", "-c", text], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@cache
+def parser() -> argparse.ArgumentParser:
+    found = argparse.ArgumentParser("acsard")
+    verbs = found.add_subparsers(required=True)
+    for verb in VERBS:
+        verb.add(verbs)
+    return found
+
+
+def calls(command: str) -> Iterator[list[str]]:
+    """The words behind each `acsard` of a command, also of one that a shell is given."""
+    words = shlex.split(command)
+    while words:
+        end = words.index("&&") if "&&" in words else len(words)
+        one, words = words[:end], words[end + 1 :]
+        one = one[1:] if one[0] == "sudo" else one
+        if one[:2] == ["sh", "-c"]:
+            yield from calls(one[2])
+        elif Path(one[0]).name == "acsard":
+            yield one[1:]
+
+
+@pytest.mark.parametrize("command", [text for text in COMMANDS if "acsard" in text])
+def test_a_call_of_acsard_has_the_options_it_is_given(command: str) -> None:
+    for words in calls(command):
+        parser().parse_args(words)
+
+
+def inline() -> Iterator[tuple[str, list[str]]]:
+    """What the text calls by name: the page, and the words behind `acsard`."""
+    for page in PAGES:
+        for span in re.findall(r"`acsard\s([^`]+)`", prose(page)):
+            yield page, span.split()
+
+
+@pytest.mark.parametrize(("page", "words"), list(inline()), ids=str)
+def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
+    page: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [PLACEHOLDERS.get(word, word) for word in words if word not in ("…", "...")]
+    verbs = [word for word in words if re.fullmatch("[a-z][a-z0-9]*", word)]
+    path = verbs[: 2 if verbs[:1] in (["lan"], ["mcu"], ["service"]) else 1]
+    with pytest.raises(SystemExit) as end:
+        parser().parse_args([*path, "--help"])
+    assert end.value.code == 0, f"{page}: acsard {' '.join(words)}"
+    told = capsys.readouterr().out
+    assert not [word for word in words if word.startswith("-") and word not in told]
+
+
+# calls of pytest
+
+
+@pytest.mark.parametrize("arguments", promises(), ids=" ".join)
+def test_what_proves_a_promise_is_there(arguments: list[str]) -> None:
+    files: list[Path] = []
+    for path in (ROOT / word for word in arguments if word.startswith("tests/")):
+        assert path.exists(), path
+        files += [path] if path.is_file() else path.rglob("test_*.py")
+    text = "".join(file.read_text(encoding="utf-8") for file in files)
+    options = dict(pairwise(arguments))
+    for word in re.findall(r"\w+", options.get("-k", "")):
+        assert word in ("or", "and", "not") or re.search(rf"def test_\w*{word}", text), word
+    marks = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    for word in re.findall(r"\w+", options.get("-m", "")):
+        assert word in ("or", "and", "not") or f'"{word}: ' in marks, word
+
+
+# other blocks
+
+
+@pytest.mark.parametrize("block", blocks("toml"), ids=at)
+def test_lines_for_the_configuration_are_accepted(block: Block) -> None:
+    for table, values in tomllib.loads(block.text).items():
+        kind: Any = type(getattr(Config(), table))
+        known = {field.name for field in msgspec.structs.fields(kind)}
+        assert set(values) <= known
+        msgspec.convert(values, kind)
+
+
+@pytest.mark.parametrize("block", blocks("json5"), ids=at)
+def test_settings_for_zenoh_are_accepted(block: Block) -> None:
+    zenoh.Config.from_json5(block.text)
+
+
+def test_python_is_on_the_page_whose_examples_are_run() -> None:
+    """`tests/system/test_client.py` runs them, and says which there are."""
+    assert {block.page for block in blocks("python")} == {"README.md"}
+
+
+# links and files
+
+
+def anchors(text: str) -> set[str]:
+    """What a forge lets one link to: headings, lower-case, with - for spaces."""
+    titles = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_somewhere(page: str) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if "://" in target:
+            continue
+        name, _, anchor = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        assert path.exists(), target
+        if anchor:
+            assert anchor in anchors(path.read_text(encoding="utf-8")), target
+
+
+def files_in(text: str) -> set[str]:
+    """The words that are names of files or directories."""
+    found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
+    kinds = (".py", ".toml", ".json5", ".c", ".md")
+    return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
+
+
+def exists(name: str, *, below: Path) -> bool:
+    return any((place / name).exists() for place in (below, ROOT))
+
+
+def test_every_file_that_a_recipe_names_is_there() -> None:
+    named = files_in("\n".join(re.findall(r"`([^`\s]+)`", prose("acsard/README.md"))))
+    assert len(named) > 40
+    assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
+
+
+def test_every_file_of_the_tour_is_there() -> None:
+    tour = ast.get_docstring(ast.parse((ROOT / "acsard/__init__.py").read_text(encoding="utf-8")))
+    assert tour is not None
+    named = files_in(tour) - {"acsard/"}
+    assert len(named) > 15
+    assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
+
+
+@pytest.mark.parametrize("page", ["tests/README.md", "deploy/systemd/README.md"])
+def test_every_file_that_a_page_s_table_names_is_there(page: str) -> None:
+    here = (ROOT / page).parent
+    for cell in re.findall(r"^\| `([^`\s]+)`[^|]* \|", prose(page), re.M):
+        assert sorted(here.glob(cell)), cell
+    if page.startswith("deploy"):
+        missing = {p.name for p in here.iterdir() if p.name != "README.md"}
+        assert not {name for name in missing if f"`{name}`" not in text_of(page)}
+    else:
+        rooms = {p.name for p in here.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
+        assert not {name for name in rooms if f"`{name}/`" not in text_of(page)}

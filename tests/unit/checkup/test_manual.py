@@ -1,0 +1,65 @@
+"""Each outcome has its words, and says what to look at."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.checkup import manual
+from acsard.checkup.manual import MANUAL, find
+from acsard.checkup.procedure import STEPS
+
+
+@pytest.mark.parametrize("outcome", MANUAL)
+def test_every_outcome_is_whole(outcome: str) -> None:
+    found = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, Seen()))
+    assert found.name == outcome.partition(":")[0]
+    assert found.keys == {"mcu.baud_rate": 9600}
+    assert not {"{", "}", "  ", "->"} & {*found.figure, *found.text.split(" "), *found.mend}
+    if found.verdict in ("FAIL", "WARN"):
+        assert found.text
+        # What nobody mended or could mend by a look at the board has none.
+        assert found.mend or outcome in ("encoder counts: many", "wheels: not lifted")
+
+
+class Seen(float):
+    """Anything that was seen: a number, or words."""
+
+    def __format__(self, how: str) -> str:
+        return "seen"
+
+    def __repr__(self) -> str:
+        return "seen"
+
+
+SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
+        for part in manual.OUTCOMES.split("{")[1:]}  # fmt: skip
+
+
+def test_every_step_can_pass_or_be_left_out() -> None:
+    for step in STEPS:
+        name = "motor" if step == "motors" else step
+        verdicts = {o.verdict for key, o in MANUAL.items() if key.startswith(f"{name}:")}
+        assert verdicts & {"PASS", "SKIPPED"}, step
+        assert verdicts & {"FAIL", "WARN"}, step
+
+
+def test_a_motor_bears_its_name_and_the_figures_are_as_they_are_written() -> None:
+    found = find("motor: right", name="motor d (rear right)", figure="+3.00 -3.00 rad/s")
+    assert (found.name, found.verdict) == ("motor d (rear right)", "PASS")
+    found = find("runaway: along", letter="a", told=3, seen=9.04, most=6.0, motor="motor a")
+    assert found.figure == "a: told 3.0, seen 9.0 rad/s"
+    assert found.text == "the encoder of motor a says more than 6 rad/s"
+
+
+def test_a_runaway_against_the_command_is_crossed_leads() -> None:
+    seen: dict[str, Any] = {
+        "letter": "b",
+        "told": 3.0,
+        "seen": -9.0,
+        "most": 6.0,
+        "motor": "motor b (front left)",
+    }
+    assert "leads" in find("runaway: against", **seen).mend
+    assert "leads" not in find("runaway: along", **seen).mend

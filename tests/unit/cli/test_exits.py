@@ -1,0 +1,51 @@
+"""Each family of errors has its exit code, and is what Python calls such a thing."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.cli import main
+from acsard.cli.exits import CODES, code_of
+from acsard.host import errors
+from acsard.host.errors import MendableError
+from acsard.host.exits import Exit, ExitError
+
+PROMISED = [
+    (errors.UsageError, ValueError, 2),
+    (errors.ReplyError, RuntimeError, 1),
+    (errors.NoPortError, FileNotFoundError, 66),
+    (errors.UnreachableError, ConnectionError, 69),
+    (errors.NoAnswerError, TimeoutError, 69),
+    (errors.InUseError, OSError, 75),
+    (errors.NotPermittedError, PermissionError, 77),
+    (errors.CertificateError, ValueError, 78),
+]
+"""DESIGN section 6."""
+
+
+@pytest.mark.parametrize(("kind", "builtin", "code"), PROMISED)
+def test_an_error_is_of_a_family_of_pythons_and_has_its_code(
+    kind: type[MendableError], builtin: type[Exception], code: int
+) -> None:
+    error = kind("it is so; mend it")
+    assert isinstance(error, builtin)
+    assert code_of(error) == code
+    assert str(error) == "it is so; mend it"
+
+
+def test_no_family_is_without_a_code() -> None:
+    kinds = {kind for kind in vars(errors).values() if isinstance(kind, type)}
+    families = {kind for kind in kinds if issubclass(kind, MendableError)} - {MendableError}
+    assert families == set(CODES) == {kind for kind, _, _ in PROMISED}
+
+
+def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
+    assert all(f" {int(code)} " in told for code in Exit)
+
+
+@pytest.mark.parametrize("code", list(Exit))
+def test_a_verb_may_end_with_any_code(code: Exit) -> None:
+    assert code_of(ExitError(code, "so")) is code

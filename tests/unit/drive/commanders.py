@@ -1,0 +1,70 @@
+"""Commanders of an arbiter, and its time."""
+
+from __future__ import annotations
+
+from acsard.config.settings import CommandsConfig, Source
+from acsard.drive.arbiter import Arbiter, Choice
+from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist
+
+MS = 1_000_000
+HOUR_NS = 3600 * NS_PER_S
+GO = Twist(0.5, 0.2)
+BACK = Twist(-0.3, 0.0)
+
+HIGH = Source("high", 100)
+SLOW = Source("slow", 100, timeout=1.0)
+LEFT = Source("left", 50)
+RIGHT = Source("right", 50)
+LOW = Source("low", 10)
+
+
+class Bench:
+    """An arbiter and its time; `offset_ns` is how far the senders' clocks are ahead."""
+
+    def __init__(self, *sources: Source, neutral_first: bool = True, armed: bool = True) -> None:
+        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources))
+        self.arbiter.require_neutral()
+        self.now_ns = 10 * NS_PER_S
+        self.offset_ns = 1_800_000_000 * NS_PER_S
+        if armed:
+            for source in sources:
+                self.send(source, REST)
+            self.wait(5000)
+
+    def wait(self, ms: float) -> Bench:
+        self.now_ns += int(ms * MS)
+        return self
+
+    def send(self, source: Source | str, twist: Twist = GO, sender: str = "") -> str:
+        name = source if isinstance(source, str) else source.name
+        return self.arbiter.accept(Command(name, twist, self.now_ns, sender=sender))
+
+    def stamped(
+        self,
+        source: Source,
+        late_ms: float = 0.0,
+        clock: str = "",
+        twist: Twist = GO,
+        sender: str = "",
+    ) -> str:
+        """Send a command that was stamped `late_ms` ago by the sender's clock."""
+        stamp_ns = self.now_ns + self.offset_ns - int(late_ms * MS)
+        return self.arbiter.accept(
+            Command(source.name, twist, self.now_ns, stamp_ns, clock, sender)
+        )
+
+    def unreadable(self, source: Source, sender: str = "") -> None:
+        """Something that could not be decoded came from there."""
+        self.arbiter.notice(source.name, sender, self.now_ns)
+
+    def choice(self) -> Choice:
+        return self.arbiter.choose(self.now_ns)
+
+    def driver(self) -> str:
+        """Whose command is followed now, "" if nobody's."""
+        choice = self.choice()
+        return "" if choice.twist is None else choice.source
+
+    def status(self, source: Source) -> SourceStatus:
+        (status,) = (s for s in self.arbiter.sources(self.now_ns) if s.name == source.name)
+        return status

@@ -1,0 +1,57 @@
+"""The sentences that `state` and `diagnostics` say of the arbiter's decisions."""
+
+from __future__ import annotations
+
+from typing import get_args, get_type_hints
+
+import pytest
+
+from acsard.drive.arbiter import Choice, Objection
+from acsard.drive.words import REFUSED, chosen, waiting
+from acsard.values import REST, Wait
+
+SENTENCES = [
+    (Wait("nothing"), ""),
+    (Wait("command"), "a command"),
+    (
+        Wait("neutral", "slow", 1.0),
+        "neutral first: slow must send a zero, or pause for 1 s, before it can drive",
+    ),
+    (
+        Wait("neutral", "high", 0.25),
+        "neutral first: high must send a zero, or pause for 0.25 s, before it can drive",
+    ),
+    (Wait("higher", "high"), "high has the higher priority: until it is silent"),
+    (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),
+    (Wait("senders", senders=15), "15 more of its senders: the first until it is silent"),
+]
+
+
+@pytest.mark.parametrize(("wait", "text"), SENTENCES)
+def test_what_a_source_waits_for_is_a_sentence(wait: Wait, text: str) -> None:
+    assert waiting(wait) == text
+
+
+def test_every_wait_has_its_sentence_above() -> None:
+    kinds = get_args(get_type_hints(Wait)["what"])
+    assert {wait.what for wait, _ in SENTENCES} == set(kinds)
+
+
+@pytest.mark.parametrize(
+    ("choice", "text"),
+    [
+        (Choice(), "no commands: no source has sent one within its timeout"),
+        (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
+        (
+            Choice("app", None, Wait("neutral", "app", 0.25)),
+            "neutral first: app must send a zero, or pause for 0.25 s, before it can drive",
+        ),
+    ],
+)
+def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice, text: str) -> None:
+    assert chosen(choice) == text
+
+
+def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
+    assert {"", *REFUSED} == {*get_args(Objection)}
+    assert REFUSED["crowded"] == "16 other senders of this source are live"

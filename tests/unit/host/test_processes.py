@@ -1,0 +1,93 @@
+"""Who has a device open: on ptys of our own."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from acsard.host.processes import holder_of, holders, master_of, running
+
+HOLD = """\
+import fcntl, os, sys
+fd = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
+if len(sys.argv) > 2:
+    fcntl.flock(fd, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@contextmanager
+def another(path: str, *words: str) -> Iterator[int]:
+    """A process that has the device open, locked with a word more; its pid."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, path, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held\n"
+        yield process.pid
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+@pytest.fixture
+def device() -> Iterator[str]:
+    """A pty whose ends we both have open."""
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+def test_everybody_who_has_it_open_is_told_once(device: str) -> None:
+    again = os.open(device, os.O_RDWR | os.O_NOCTTY)
+    with another(device) as pid:
+        assert sorted(one.pid for one in holders(device)) == sorted([os.getpid(), pid])
+    os.close(again)
+    assert [one.pid for one in holders(device)] == [os.getpid()]
+
+
+def test_who_has_locked_it_is_who_keeps_us_out(device: str) -> None:
+    assert holder_of(device) is None, "we ourselves do not"
+    with another(device, "lock") as locker, another(device), another(device):
+        found = holder_of(device)
+        assert found is not None
+        assert found.pid == locker
+
+
+def test_without_a_lock_it_is_another_who_has_it_open(device: str) -> None:
+    own = os.open(device, os.O_RDWR | os.O_NOCTTY)
+    fcntl.flock(own, fcntl.LOCK_EX)
+    with another(device) as pid:
+        found = holder_of(device)
+        assert found is not None
+        assert found.pid == pid
+    os.close(own)
+
+
+def test_the_other_end_of_a_pty_is_found_and_a_real_device_has_none(device: str) -> None:
+    other = master_of(device)
+    assert other is not None
+    assert other.pid == os.getpid()
+    assert master_of("/dev/null") is None
+
+
+@pytest.mark.parametrize("path", ["/dev/acsar_that_is_not", "/etc/passwd", "/tmp"])
+def test_what_is_no_device_is_held_by_nobody(path: str) -> None:
+    assert list(holders(path)) == []
+    assert holder_of(path) is None
+    assert master_of(path) is None
+
+
+def test_a_program_is_found_by_its_name(device: str) -> None:
+    with another(device) as pid:
+        (found,) = [one for one in holders(device) if one.pid == pid]
+        assert running(found.name)
+    assert not running("no such program")

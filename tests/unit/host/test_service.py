@@ -1,0 +1,111 @@
+"""The service's files and commands: which steps, when."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acsard.host.exits import ExitError
+from acsard.host.service import (
+    GONE,
+    INSTALLED,
+    LEAVING,
+    STOP,
+    UNIT,
+    Found,
+    files,
+    installing,
+    misplaced,
+    present,
+    uninstalling,
+)
+from acsard.host.steps import File, Keep, Remove, Write
+
+ETC = Path("/etc/x")
+UNIT_FILE = File(ETC / UNIT, b"unit")
+STOP_FILE = File(ETC / STOP, b"stop", 0o755)
+RULES = File(ETC / "rules", b"rules")
+OWN = File(ETC / "acsard.toml", b"first", kept=True)
+ALL = [UNIT_FILE, STOP_FILE, RULES, OWN]
+
+
+def there(**other: bytes | None) -> Found:
+    """All files as installed, but for these."""
+    names = {"unit": UNIT_FILE, "stop": STOP_FILE, "rules": RULES, "own": OWN}
+    changes = {names[name].path: content for name, content in other.items()}
+    return {file.path: file.content for file in ALL} | changes
+
+
+NOTHING: Found = {file.path: None for file in ALL}
+
+
+def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> None:
+    assert installing(ALL, NOTHING, force=False) == [*map(Write, ALL), *INSTALLED]
+
+
+def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
+    assert installing(ALL, there(), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
+
+
+def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
+    found = there(unit=b"mine", own=None)
+    with pytest.raises(ExitError, match=f"would overwrite {UNIT_FILE.path};"):
+        installing(ALL, found, force=False)
+    steps = installing(ALL, found, force=True)
+    assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None:
+    assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), force=force)
+
+
+def test_all_that_is_as_installed_is_removed() -> None:
+    removed = [Remove(file.path) for file in ALL]
+    assert uninstalling(ALL, there(), force=False) == [*LEAVING, *removed, *GONE]
+
+
+def test_where_nothing_is_nothing_is_stopped_or_removed() -> None:
+    assert uninstalling(ALL, NOTHING, force=False) == [*GONE]
+
+
+def kept(found: Found, *, force: bool) -> set[Path]:
+    steps = uninstalling(ALL, found, force=force)
+    return {step.path for step in steps if isinstance(step, Keep)}
+
+
+def test_what_somebody_has_changed_stays_unless_forced() -> None:
+    assert kept(there(rules=b"mine"), force=False) == {RULES.path}
+    assert kept(there(rules=b"mine"), force=True) == set()
+
+
+def test_a_changed_configuration_stays_whatever_is_said() -> None:
+    assert kept(there(own=b"mine"), force=True) == {OWN.path}
+
+
+def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
+    assert kept(there(unit=b"mine"), force=False) == {UNIT_FILE.path, STOP_FILE.path}
+
+
+def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
+    unit, _, _, configuration = files()
+    assert unit.path.name == UNIT
+    assert b'port = "/dev/acsar"' in configuration.content
+    assert set(present([unit])) == {unit.path}
+
+
+@pytest.mark.parametrize(
+    ("prefix", "base", "good"),
+    [
+        ("/opt/acsard/venv", "/usr", True),
+        ("/usr", "/usr", False),
+        ("/home/anna/venv", "/usr", False),
+        ("/root/venv", "/usr", False),
+        ("/tmp/venv", "/usr", False),
+    ],
+)
+def test_a_service_cannot_live_in_a_home_nor_outside_a_venv(
+    prefix: str, base: str, good: bool
+) -> None:
+    assert (misplaced(prefix, base) == "") is good

@@ -1,0 +1,93 @@
+"""A serial device on a pty: why it cannot be opened, and how it is given back."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import pty
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.cli.exits import code_of
+from acsard.host import clock
+from acsard.host.errors import InUseError, NoPortError
+from acsard.host.exits import Exit
+from acsard.serial.device import close, draining, open_raw, refusal, require, unsent
+
+
+@pytest.fixture
+def path() -> Iterator[str]:
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (errno.ENOENT, Exit.NO_PORT, "is not there"),
+        (errno.ENXIO, Exit.NO_PORT, "is not there"),
+        (errno.ENOTTY, Exit.NO_PORT, "is not a serial port"),
+        (errno.EACCES, Exit.NO_PERMISSION, "dialout"),
+        (errno.EPERM, Exit.NO_PERMISSION, "dialout"),
+        (errno.EBUSY, Exit.IN_USE, "in use by another process"),
+        (errno.EAGAIN, Exit.IN_USE, "in use by another process"),
+        (errno.EIO, Exit.FAILURE, "the driver did not answer"),
+    ],
+)
+def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
+    refused = refusal("/dev/acsar_that_is_not", OSError(number, "the driver did not answer"))
+    assert code_of(refused) is code
+    assert str(refused).count("/dev/acsar_that_is_not") == 1
+    assert words in str(refused)
+
+
+def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
+    device = open_raw(path, 115200)
+    with pytest.raises(OSError, match="lock") as locked:
+        open_raw(path, 115200)
+    assert isinstance(refusal(path, locked.value), InUseError)
+    close(device).join(5.0)
+    # Root may pass the mark, so it is looked for itself.
+    after = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    exclusive = bytearray(4)
+    fcntl.ioctl(after, 0x80045440, exclusive)  # TIOCGEXCL
+    os.close(after)
+    assert not any(exclusive)
+    again = open_raw(path, 115200)
+    close(again).join(5.0)
+    again.close()
+    device.close()
+
+
+def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:
+    device = open_raw(path, 115200)
+    close(device, lost=True).join(5.0)
+    assert os.readlink(f"/proc/self/fd/{device.fileno()}") == os.devnull
+    with pytest.raises(termios.error):
+        device.flush()
+    device.close()
+
+
+def test_what_cannot_say_what_it_holds_is_drained_at_once(path: str) -> None:
+    with open(os.devnull) as null:
+        assert unsent(null.fileno()) == 0
+        assert list(draining(null.fileno(), clock.mono_ns() + 10**9)) == []
+
+
+@pytest.mark.parametrize("name", ["nothing", "file", "."])
+def test_what_is_no_device_is_no_port(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NoPortError, match=r"`acsard ports` lists"):
+        require(str(tmp_path / name))
+
+
+def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
+    link = tmp_path / "acsar"
+    link.symlink_to("/dev/null")
+    require(str(link))
