@@ -33,7 +33,7 @@ GLIBC = 36
 HEAD = """\
 # What the service runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
 #
-#     pip install --require-hashes --only-binary :all: -r requirements.lock
+#     pip install -r requirements.lock
 #
 # Written by `python -m tests.lock`; all tests of .ci/run run on it.
 """

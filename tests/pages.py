@@ -190,7 +190,10 @@ COMMANDS: dict[str, How] = {
     "ros-$ROS_DISTRO-joint-state-topic-hardware-interface": NO_ROS,
     # deploy/systemd
     "sudo python3 -m venv /opt/acsard/venv": Elsewhere(HERE, "def test_the_service_s_venv"),
-    "sudo /opt/acsard/venv/bin/pip install '.[lan]'": Elsewhere(
+    "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": Elsewhere(
+        HERE, "def test_the_service_s_venv"
+    ),
+    "sudo /opt/acsard/venv/bin/pip install --no-deps .": Elsewhere(
         HERE, "def test_the_service_s_venv"
     ),
     "sudo /opt/acsard/venv/bin/acsard service install": Elsewhere(SERVICE, '"service", "install")'),
@@ -198,10 +201,9 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
         "tests/system/test_doctor.py", '"doctor", "--config"'
     ),
-    "sudo sh -c \"/opt/acsard/venv/bin/pip install '.[lan]' && /opt/acsard/venv/bin/acsard service "
-    'install --force && systemctl restart acsard"': Elsewhere(
-        SERVICE, '"service", "install", "--force"'
-    ),
+    'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
+    "/opt/acsard/venv/bin/pip install --no-deps . && /opt/acsard/venv/bin/acsard service install "
+    '--force && systemctl restart acsard"': Elsewhere(SERVICE, '"service", "install", "--force"'),
     "systemctl status acsard": Elsewhere(SERVICE, 'show("StatusText")'),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(CONTAINER, '"journalctl"'),
     "/opt/acsard/venv/bin/acsard service status": Elsewhere(SERVICE, '"service", "status"'),

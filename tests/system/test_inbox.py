@@ -7,18 +7,28 @@ from functools import partial
 import zenoh
 
 from acsard.bus.inbox import Inbox
-from acsard.bus.replies import OPEN_QUERIES, Replies
+from acsard.bus.replies import TICKETS, Replies
 from tests.system.harness import Bus, client_config, free_endpoint
+
+
+class Deaf:
+    """Told that something came in; here nobody is waiting."""
+
+    def command(self) -> None:
+        """What may be a command."""
+
+    def stop(self) -> None:
+        """A stop."""
 
 
 def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answered() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     # Never started, so no query is ever answered, as behind clients that read no reply.
-    inbox = Inbox(prefix, Replies(prefix), (), lambda: None)
+    inbox = Inbox(prefix, Replies(prefix), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("info", "srv/stop")
         held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
-        asked = [bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(OPEN_QUERIES + 1)]
+        asked = [bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(TICKETS + 1)]
         # One more is let go, at once, and so is the stop itself; but it counts.
         assert list(bus.session.get(f"{prefix}info", timeout=60.0)) == []
         assert inbox.take(0).arrivals == ()
