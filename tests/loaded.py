@@ -119,8 +119,10 @@ def main() -> int:
         print(f"run {number}: {one.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
         for line in one.failed:
             print(f"    {line}", flush=True)
-        if one.code:
-            Path(f"loaded-{number}.log").write_text(one.said)
+        if one.code != 0:
+            log = Path(tempfile.gettempdir(), f"acsard-loaded-{number}.log")
+            log.write_text(one.said)
+            print(f"    all of it: {log}", flush=True)
     good = sum(one.code == 0 for one in done)
     print(f"{good} of {len(done)} runs without a failure, beside {asked.loops} busy loops")
     return 0 if good == len(done) else 1

@@ -141,7 +141,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
-    ".venv/bin/pytest -m '(network or systemd or firmware) and not soak'": PYTEST,
+    ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),

@@ -740,18 +740,20 @@ class Periods(NamedTuple):
     sent: int
     superseded: int
     missed: int
+    commands: int
+    """Taken meanwhile: their lines go at once, in the place of a period's or beside it."""
     latest: float
     """How late the latest period since the start of the daemon began, in periods."""
 
     @classmethod
     def between(cls, first: Any, last: Any) -> Periods:
-        counters = ("lines_sent", "lines_superseded", "missed_periods")
-        sent, superseded, missed = (
+        counters = ("lines_sent", "lines_superseded", "missed_periods", "commands")
+        sent, superseded, missed, commands = (
             last["counters"].get(c, 0) - first["counters"].get(c, 0) for c in counters
         )
         elapsed = 100.0 * (seconds(last["stamp"]) - seconds(first["stamp"]))
         latest = last["figures"]["period_lateness"]["since_start"]["max"] / 10_000
-        return cls(elapsed, sent, superseded, missed, latest)
+        return cls(elapsed, sent, superseded, missed, commands, latest)
 
     @property
     def accounted(self) -> int:
@@ -759,10 +761,8 @@ class Periods(NamedTuple):
 
     def are_all_accounted_for(self) -> bool:
         """A state falls anywhere within a period, at either end, or into one that is yet to begin:
-        what is due by its stamp is counted then. What a command's own line supersedes is counted
-        beyond the periods."""
-        over = self.accounted - self.elapsed
-        return -2 - self.latest <= over <= 2 + self.latest + self.superseded
+        what is due by its stamp is counted then."""
+        return abs(self.accounted - self.elapsed) <= 2 + self.latest + self.commands
 
 
 def waited_for_a_core(pid: int) -> float:

@@ -426,8 +426,17 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
         assert periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.
         assert len(waited) <= 6
+
+        def obeyed() -> bool:
+            # A busy machine may hand over what we said in one burst, which no wheel can do.
+            state = bus.state()
+            if state["mode"] == "fault":
+                bus.get("srv/clear")
+            driver.wish = ZERO if "neutral first" in state["reason"] else twist(0.2)
+            return peer.lines[-1].line.startswith(text(0.2))
+
         # Long unheard, the MCU has stopped: we start over from zero.
-        until(lambda: peer.lines[-1].line.startswith(text(0.2)), 5.0, "the newest command")
+        until(obeyed, 5.0, "the newest command")
 
 
 # no processor time

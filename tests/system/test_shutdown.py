@@ -88,9 +88,13 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
     ramp = ramp_after(peer, sent)
     print(f"SIGTERM at 2 m/s with a slow ramp: {seconds:.3f} s")
     assert code == 0
-    assert 0.55 < seconds < 1.0 + lost(sent, sent + seconds)
+    machine_s = lost(sent, sent + seconds)
+    assert seconds < 1.0 + machine_s
     assert last == ZERO_LINE, "STOP is the last line"
-    assert wheels(ramp[-2].line)[0] > 20.0, "it was still fast when its time was up"
+    # Where the machine keeps the link waiting for a tenth of a second, it stops at once instead.
+    if machine_s < 0.1:
+        assert seconds > 0.55
+        assert wheels(ramp[-2].line)[0] > 20.0, "it was still fast when its time was up"
 
 
 # Several times: a STOP that is thrown away behind the last line is lost once in five to ten.

@@ -224,11 +224,11 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
             state = bus.state()
             assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, 0.0), name
             assert state["counters"]["lines"] == 0, name
+        assert set(peer.session.said()[1:]) == {ZERO_LINE}
         # The next newline resynchronises: three good lines and the link is up.
         peer.say(b"\r\n")
         peer.reply = PLAIN
         bus.linked()
-    assert set(peer.session.said()[1:]) == {ZERO_LINE}
 
 
 def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_short_gap(
