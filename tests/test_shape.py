@@ -27,7 +27,11 @@ PURE_AMONG_SHELLS = (
     "runtime.at_once",
     "runtime.figures",
     "runtime.histogram",
+    "runtime.period",
     "bench.matching",
+    "bench.record",
+    "top.text",
+    "top.view",
 )
 """Pure modules in rooms that do I/O."""
 
