@@ -22,7 +22,7 @@ import zenoh
 from ruamel.yaml import YAML
 
 from acsard.config.settings import Config, RosConfig
-from acsard.ros.trees import ros_names
+from acsard.ros.transports import ros_names
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()

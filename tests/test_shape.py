@@ -22,7 +22,17 @@ PURE_ROOMS = (
 )  # fmt: skip
 """No clock, no I/O, no asyncio, no logging, no randomness."""
 
-PURE_AMONG_SHELLS = ("bus.access", "runtime.figures", "runtime.histogram", "bench.matching")
+PURE_AMONG_SHELLS = (
+    "bus.access",
+    "runtime.at_once",
+    "runtime.figures",
+    "runtime.histogram",
+    "runtime.period",
+    "bench.matching",
+    "bench.record",
+    "top.text",
+    "top.view",
+)
 """Pure modules in rooms that do I/O."""
 
 IMPURE_IMPORTS = {

@@ -13,7 +13,7 @@ from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
 from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
-from acsard.ros.trees import Endpoint, endpoints
+from acsard.ros.transports import Endpoint, endpoints
 from acsard.values import ROOT, Verb
 
 Role = Literal["viewer", "operator", "maintainer"]

@@ -25,7 +25,7 @@ from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
 from acsard.messages.topics import PUBLISHED, TOPICS, full_key
 from acsard.ros.tokens import gid
-from acsard.ros.trees import Endpoint, command_keys, endpoints, node_tokens
+from acsard.ros.transports import Endpoint, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
 
 OPEN_TIMEOUT_S = 10.0

@@ -18,7 +18,7 @@ from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import VERBS, service_key, source_keys
-from acsard.ros.trees import Endpoint
+from acsard.ros.transports import Endpoint
 
 ARRIVALS = 16
 """Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come

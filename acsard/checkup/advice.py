@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from msgspec import ValidationError
 
 from acsard.checkup.findings import Finding
+from acsard.config.contradictions import contradictions
 from acsard.config.parsing import effective, from_builtins
-from acsard.config.rules import contradictions
 from acsard.config.settings import Config
 from acsard.config.validation import write
 

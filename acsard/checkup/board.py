@@ -13,8 +13,8 @@ from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
-from acsard.config.baud import line_bytes, wire_ns
 from acsard.config.settings import McuConfig, WheelMap
+from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader

@@ -11,7 +11,7 @@ from statistics import fmean
 from msgspec import Struct
 
 from acsard.checkup.limits import GLANCE_S
-from acsard.config.baud import FIELD
+from acsard.config.wire_time import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
 

@@ -10,7 +10,7 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import CUT_S, GLANCE_S
 from acsard.checkup.motion import ZERO
-from acsard.config.baud import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 
 ENOUGH = 10
 """Replies for a figure."""

@@ -18,7 +18,7 @@ from acsard.checkup.findings import StoppedError
 from acsard.checkup.limits import CUT_S, PATIENCE_S, PERIOD_S, RUNAWAY, SPEED, STOOD_S
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.turning import run_up
-from acsard.config.baud import FIELD
+from acsard.config.wire_time import FIELD
 from acsard.mcu.frames import LETTERS, Motors
 
 FINE_S = 0.03

@@ -25,8 +25,8 @@ def main(args: argparse.Namespace) -> int:
     """Check and print."""
     import msgspec
 
+    from acsard.config.contradictions import warnings
     from acsard.config.parsing import effective
-    from acsard.config.rules import warnings
     from acsard.config.writing import document
 
     where, config = load(args.config)

@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     import asyncio
     import faulthandler
 
-    from acsard.config.rules import warnings
+    from acsard.config.contradictions import warnings
     from acsard.host.logs import Log, Writer
     from acsard.runtime import daemon
     from acsard.values import Event

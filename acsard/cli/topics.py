@@ -49,7 +49,7 @@ def ros_table(config: Config) -> Topics:
     from acsard.messages.schema import TopicInfo, Topics
     from acsard.messages.topics import by_key
     from acsard.ros.names import full_name
-    from acsard.ros.trees import left_out, ros_names
+    from acsard.ros.transports import left_out, ros_names
 
     ros = config.ros
     rows = []

@@ -1,7 +1,8 @@
 """`acsard.toml` bytes -> one frozen `Config`, or an error that names every key and its mend.
 
-What lives here: decoding. The keys are in `settings.py`, the rules between them in `rules.py`.
-What must not: reading files (the command line does), or anything that uses the values.
+What lives here: decoding. The keys are in `settings.py`, the rules between them in
+`contradictions.py`. What must not: reading files (the command line does), or anything that uses
+the values.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import tomllib
 
 from msgspec import convert, to_builtins
 
-from acsard.config.rules import contradictions
+from acsard.config.contradictions import contradictions
 from acsard.config.settings import Config
 from acsard.config.validation import build
 from acsard.values import AcsardError

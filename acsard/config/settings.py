@@ -1,7 +1,8 @@
 """The keys of `acsard.toml`: names, defaults, ranges and units, one frozen struct per table.
 
 What lives here: the shape of the configuration. `acsard.toml` at the root is its commented
-reference and must equal these defaults (a test). What must not: rules between keys (`rules.py`).
+reference and must equal these defaults (a test). What must not: rules between keys
+(`contradictions.py`).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from acsard.config.baud import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 
 Name = Annotated[
     str,

@@ -1,6 +1,6 @@
 """A TOML table -> one frozen struct, or every problem at once, each naming key, value and mend.
 
-Generic: knows msgspec types, nothing of robots. The rules between keys are in `rules.py`.
+Generic: knows msgspec types, nothing of robots. The rules between keys are in `contradictions.py`.
 """
 
 from __future__ import annotations

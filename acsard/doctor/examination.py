@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, parse
-from acsard.config.rules import warnings
 from acsard.doctor.certificates import certificates
 from acsard.doctor.daemon import daemon, routers
 from acsard.doctor.finding import Finding

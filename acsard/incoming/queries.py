@@ -29,7 +29,7 @@ from acsard.messages.schema import (
 from acsard.messages.topics import PUBLISHED, TOPICS, VERBS, full_key
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
-from acsard.ros.trees import PARAMETERS
+from acsard.ros.transports import PARAMETERS
 from acsard.values import Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]

@@ -13,7 +13,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.config.baud import FIELD
+from acsard.config.wire_time import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
 from acsard.mcu.promptest import Promptest

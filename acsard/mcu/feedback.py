@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.config.baud import wire_ns
 from acsard.config.settings import McuConfig
+from acsard.config.wire_time import wire_ns
 from acsard.mcu.check import Reading
 from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.frames import Codec, Motors

@@ -17,8 +17,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Literal
 
-from acsard.config.baud import line_bytes, wire_ns
 from acsard.config.settings import McuConfig
+from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.mcu.frames import FrameError
 from acsard.values import NS_PER_S

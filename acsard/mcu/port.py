@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal, Protocol
 
-from acsard.config.baud import wire_ns
+from acsard.config.wire_time import wire_ns
 from acsard.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]

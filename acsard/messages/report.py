@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection, Iterator
 
 from msgspec.structs import asdict
 
-from acsard.config.baud import wire_use
 from acsard.config.settings import Config
+from acsard.config.wire_time import wire_use
 from acsard.drive.words import waiting
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (

@@ -1,7 +1,7 @@
 """ROS 2 names: types and their hashes, and how a topic or service is called on either transport.
 
 zenoh-bridge-ros2dds uses the bare name as key; rmw_zenoh_cpp adds domain, type and hash, so a
-wrong hash is silence. What must not live here: which topics the robot has (`ros/trees.py`).
+wrong hash is silence. What must not live here: which topics the robot has (`ros/transports.py`).
 """
 
 from __future__ import annotations

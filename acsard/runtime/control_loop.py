@@ -9,19 +9,19 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from acsard.config.baud import wire_ns
 from acsard.config.settings import Config
+from acsard.config.wire_time import wire_ns
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.bus import Bus
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.queries import Queries
-from acsard.mcu.pace import Pace
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
 from acsard.robot import Robot
+from acsard.runtime.at_once import Pace
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.runtime.stopwatch import Stopwatch
 from acsard.values import (

@@ -25,7 +25,7 @@ from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
-from acsard.ros.trees import left_out
+from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
 from acsard.runtime.ticker import Ticker

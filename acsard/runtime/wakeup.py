@@ -2,8 +2,8 @@
 
     tick     a period has ended (`ticker.py`)
     bytes    the port has read something, or was lost
-    retry    a line with something new may go now (`mcu/pace.py`)
-    command  the bus has what may be a command, if its line could go at once (`mcu/pace.py`); else
+    retry    a line with something new may go now (`at_once.py`)
+    command  the bus has what may be a command, if its line could go at once (`at_once.py`); else
              the next period has it
     stop     the bus has a stop: whatever the pace, but not every one of a flood of them
     signal   the way down begins

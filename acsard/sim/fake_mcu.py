@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count, cycle
 
-from acsard.config.baud import wire_ns
 from acsard.config.settings import Config, WheelMap
+from acsard.config.wire_time import wire_ns
 from acsard.sim import protocol
 from acsard.sim.faults import WATCHDOG_NS as WATCHDOG_NS
 from acsard.sim.faults import Faults

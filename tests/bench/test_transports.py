@@ -32,7 +32,7 @@ from acsard.host import clock
 from acsard.messages import encodings
 from acsard.messages.schema import Message
 from acsard.messages.topics import full_key
-from acsard.ros.trees import left_out
+from acsard.ros.transports import left_out
 from acsard.runtime.daemon import SIMULATOR
 from tests.bench.rigs import config, in_turns, rig, sibling
 from tests.unit.messages.test_cdr import odometry

@@ -21,8 +21,8 @@ import zenoh
 import zenoh.ext
 from msgspec.structs import astuple
 
+from acsard.config.contradictions import warnings
 from acsard.config.parsing import parse
-from acsard.config.rules import warnings
 from acsard.config.settings import Config
 from acsard.host.exits import Exit
 from acsard.lan.authority import Authority

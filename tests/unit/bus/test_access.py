@@ -20,7 +20,7 @@ from acsard.config.settings import (
     Source,
 )
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
-from acsard.ros.trees import PARAMETERS, endpoints
+from acsard.ros.transports import PARAMETERS, endpoints
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)

@@ -6,8 +6,8 @@ import tomllib
 
 from acsard.checkup import advice
 from acsard.checkup.findings import Finding
+from acsard.config.contradictions import contradictions
 from acsard.config.parsing import parse
-from acsard.config.rules import contradictions
 from acsard.config.settings import Config
 from tests.unit.checkup.robots import configured
 

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
+from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, effective, from_builtins, parse
-from acsard.config.rules import warnings
 from acsard.config.settings import Config, Source
 from tests.unit.keys import KEYS, Key
 

@@ -19,7 +19,7 @@ from acsard.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceR
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
 from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
-from acsard.ros.trees import PARAMETER_SERVICES, TRIGGERS
+from acsard.ros.transports import PARAMETER_SERVICES, TRIGGERS
 from acsard.values import Answer, Outputs, Pose, Request
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.config.baud import wire_ns
 from acsard.config.settings import McuConfig, WheelMap
+from acsard.config.wire_time import wire_ns
 from acsard.mcu.check import seal
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.link import BAD_LINES, GOOD_LINES

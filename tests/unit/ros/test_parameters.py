@@ -11,7 +11,7 @@ from acsard.config.settings import Config
 from acsard.messages.cdr import Cdr, CdrError
 from acsard.ros import parameters as rcl
 from acsard.ros.parameters import Parameters
-from acsard.ros.trees import PARAMETER_SERVICES
+from acsard.ros.transports import PARAMETER_SERVICES
 
 TABLES: dict[str, object] = {
     "robot": {"id": "acsar"},

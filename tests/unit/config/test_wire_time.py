@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.config.baud import (
+from acsard.config.wire_time import (
     COMFORTABLE_USE,
     highest_rate,
     line_bytes,

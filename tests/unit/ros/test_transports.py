@@ -14,7 +14,7 @@ from acsard.config.settings import (
 )
 from acsard.messages.topics import TOPICS
 from acsard.ros.names import TYPE_HASHES
-from acsard.ros.trees import (
+from acsard.ros.transports import (
     PARAMETERS,
     Endpoint,
     command_keys,

@@ -8,9 +8,16 @@ from __future__ import annotations
 import ipaddress
 import math
 
-from acsard.config.baud import COMFORTABLE_USE, FIELD, highest_rate, line_bytes, wire_ns, wire_use
 from acsard.config.settings import AccessConfig, BusConfig, Config, McuConfig, RosConfig
 from acsard.config.validation import show
+from acsard.config.wire_time import (
+    COMFORTABLE_USE,
+    FIELD,
+    highest_rate,
+    line_bytes,
+    wire_ns,
+    wire_use,
+)
 from acsard.values import ROOT, WHEELS
 
 LEAST_BRIDGE = 2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.config.contradictions import contradictions, warnings
 from acsard.config.parsing import parse
-from acsard.config.rules import contradictions, warnings
 from acsard.config.settings import (
     AccessConfig,
     BusConfig,
