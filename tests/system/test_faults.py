@@ -527,7 +527,7 @@ def no_burst(lines: list[Heard]) -> float:
         if (count := sum(first.at <= heard.at < first.at + 0.1 for heard in lines)) > most:
             most += round(lost(first.at - 0.1, first.at + 0.1) / TICK_S)
         assert count <= most
-    return min(gaps(lines))
+    return min(gaps(lines), default=0.0)
 
 
 def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_has_gone(
