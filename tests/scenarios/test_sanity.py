@@ -8,7 +8,8 @@ from contextlib import nullcontext
 
 import pytest
 
-from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.config.rules import contradictions
+from acsard.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
 from acsard.sim.faults import Fault
 from acsard.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
@@ -236,3 +237,32 @@ def test_a_runaway_that_is_cleared_while_it_lasts_is_found_again(world: World) -
         assert world.call("clear").success
         world.run(1.0)
         assert world.state.mode == "fault"
+
+
+@pytest.mark.parametrize("lag", [0.05, 0.2])
+def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost(
+    lag: float,
+) -> None:
+    config = Config(mcu=McuConfig(reply_period=0.25), sim=SimConfig(motor_time_constant=lag))
+    assert contradictions(config) == []
+    world, dice = World(config), random.Random(3)
+    world.bus.wanted = set()
+    with world.mcu.unprompted(0.25), world.mcu.lost_replies(3):
+        world.run(3.0)
+        world.send(0.0)
+        world.run(0.1)
+        for _ in range(20):
+            linear = dice.choice((-1, 1)) * dice.uniform(0.3, 1.0)
+            world.hold(linear, dice.uniform(-3, 3), seconds=dice.uniform(0.4, 3.0))
+            assert world.state.mode == "driving"
+            world.send(0.0)
+            world.run(dice.uniform(0.3, 1.5))
+    assert told(world, "fault") == told(world, "wheels_turned") == []
+
+
+def test_a_robot_that_may_not_turn_drives_straight_on() -> None:
+    world = World(Config(limits=LimitsConfig(angular_speed=0.0)))
+    world.run(0.2)
+    world.drive(0.5, 0.001, seconds=2.0)
+    assert world.state.mode == "driving"
+    assert (world.state.linear, world.state.yaw) == pytest.approx((0.5, 0.0), abs=0.02)
