@@ -53,7 +53,8 @@ class _Wheel:
 
     def forget(self) -> None:
         """Start over; but a wheel that has not come to rest still has to."""
-        self.expected = self.seen = 0.0
+        self.expected = 0.0
+        self.seen = 0.0
         self.evidence = dict.fromkeys(_FAULTS, 0.0)
         self.slowest = 0.0
         """rad/s; down to here it has slowed since it is faster than it should be."""
