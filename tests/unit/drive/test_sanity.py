@@ -290,6 +290,7 @@ def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slo
     while speed > 8.0:
         speed -= 5.0 * DT
         faults.append(sanity.watch(STILL, WheelSpeeds(speed, speed, speed, speed), DT))
+        faults.append(sanity.turned)
     assert not any(faults)
     stays = [sanity.watch(STILL, noisy(only(2, speed), step), DT) for step in range(52)]
     assert "rear_left wheel turns faster" in next(filter(None, stays))
@@ -341,9 +342,10 @@ def test_a_slow_wheel_that_brakes_as_it_was_said_to_is_no_fault(sign: float) -> 
             assert sanity.watch(only(3, told), only(3, speed), DT) == ""
 
 
-def test_a_wheel_that_stops_sooner_than_it_was_said_to_is_no_fault() -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wheel_that_is_sooner_than_it_was_said_to_be_is_no_fault(sign: float) -> None:
     sanity = Sanity(FeedbackConfig(response_time=2.0))
-    for told in (20.0, 0.0):
+    for told in (sign * 20.0, 0.0):
         for step in range(1000):
             seen = WheelSpeeds(*(told and told + step % 2 / 10 for _ in WHEELS))
             assert sanity.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
