@@ -188,6 +188,9 @@ class Robot:
         fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
         if fault:
             self._fault(fault, now_ns, events)
+        if self._sanity.turned:
+            self.counters["wheels_turned"] += 1
+            events.append(Event("wheels_turned", self._sanity.turned, "warning"))
         return self._odometry.fold(line)
 
     # requests

@@ -1,6 +1,7 @@
 """The rules between the keys of a configuration: what contradicts, and what will surprise.
 
-Each contradiction is a line with key, value and mend; each warning a sentence.
+Each contradiction is a line with key, value and mend; each warning a sentence. Those about motion
+are in `motion_rules.py`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import math
 
+from acsard.config import motion_rules
 from acsard.config.settings import AccessConfig, BusConfig, Config, McuConfig, RosConfig
 from acsard.config.validation import show
 from acsard.config.wire_time import (
@@ -22,9 +24,6 @@ from acsard.values import ROOT, WHEELS
 
 LEAST_BRIDGE = 2
 """Control periods that encoder counts must last without a wrap: one lost line must cost nothing."""
-
-LEAST_JERK = 0.01
-"""m/s3 or rad/s3; at less a robot takes over ten seconds to reach walking pace."""
 
 
 def warnings(config: Config) -> list[str]:
@@ -49,7 +48,7 @@ def warnings(config: Config) -> list[str]:
         )
     if config.bus.insecure:
         found.append("bus.insecure = true: everyone who reaches the bus can drive this robot")
-    hosts = [_host(endpoint) for endpoint in (*config.bus.listen, *config.bus.connect)]
+    hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
     if config.robot.id == Config().robot.id and not all(_is_loopback(h) for h in hosts if h):
         found.append(
             f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
@@ -91,7 +90,8 @@ def contradictions(config: Config) -> list[str]:
         *_wire_problems(config),
         *_count_problems(config),
         *_name_problems(config),
-        *_limit_problems(config),
+        *motion_rules.problems(config),
+        *_source_problems(config),
         *_bus_problems(config.bus),
         *_access_problems(config.access),
         *_ros_problems(config.ros),
@@ -168,24 +168,9 @@ def _repeated(noun: str, names: dict[str, str]) -> list[str]:
     return found
 
 
-def _limit_problems(config: Config) -> list[str]:
-    limits, period = config.limits, 1.0 / config.rate_hz
+def _source_problems(config: Config) -> list[str]:
+    period = 1.0 / config.rate_hz
     found = []
-    for axis in ("linear", "angular"):
-        stop, normal = (
-            getattr(limits, f"{axis}_{kind}") for kind in ("stop_deceleration", "deceleration")
-        )
-        jerk = getattr(limits, f"{axis}_jerk")
-        if 0.0 < jerk < LEAST_JERK:
-            found.append(
-                f"limits.{axis}_jerk = {jerk:g}: the robot would take minutes to start; write "
-                f"{LEAST_JERK:g} or more, or 0 for no limit"
-            )
-        if stop < normal:
-            found.append(
-                f"limits.{axis}_stop_deceleration = {stop:g}: lower than {axis}_deceleration; a "
-                f"stop must not brake more softly than a timeout: write {normal:g} or more"
-            )
     for i, source in enumerate(config.commands.sources):
         if source.timeout < 2 * period:
             found.append(
@@ -202,9 +187,9 @@ def _bus_problems(bus: BusConfig) -> list[str]:
             'bus.mode = "client": connects to nothing; write bus.connect = ["tcp/127.0.0.1:7447"] '
             'or bus.mode = "peer"'
         )
-    if not bus.listen:
+    if not bus.listen and bus.mode == "peer":
         found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
-    for key, endpoints in (("listen", bus.listen), ("connect", bus.connect)):
+    for key, endpoints in _endpoints(bus).items():
         for endpoint in endpoints:
             where = f"bus.{key} = {show(endpoint)}"
             host = _host(endpoint)
@@ -243,6 +228,12 @@ def _ros_problems(ros: RosConfig) -> list[str]:
             'bridge\'s would fall among; write another, like "robot1"'
         ]
     return []
+
+
+def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
+    """Those in use, by key: a client listens nowhere."""
+    listen = {"listen": bus.listen} if bus.mode == "peer" else {}
+    return listen | {"connect": bus.connect}
 
 
 def _host(endpoint: str) -> str | None:

@@ -92,13 +92,18 @@ class Limiter:
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Both axes scaled together until each is within its limit: curvature is kept."""
+        """Both axes scaled together until each is within its limit: curvature is kept.
+
+        An axis whose limit is 0 is left out, as those that a planar base does not have.
+        """
+        linear = wished.linear if self._linear.speed else 0.0
+        angular = wished.angular if self._angular.speed else 0.0
         scale = 1.0
-        if abs(wished.linear) > self._linear.speed:
-            scale = self._linear.speed / abs(wished.linear)
-        if abs(wished.angular) * scale > self._angular.speed:
-            scale = self._angular.speed / abs(wished.angular)
-        return Twist(wished.linear * scale, wished.angular * scale)
+        if abs(linear) > self._linear.speed:
+            scale = self._linear.speed / abs(linear)
+        if abs(angular) * scale > self._angular.speed:
+            scale = self._angular.speed / abs(angular)
+        return Twist(linear * scale, angular * scale)
 
 
 def _braking(axis: _Axis, stop: bool) -> float:

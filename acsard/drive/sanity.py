@@ -7,6 +7,10 @@ the wheels' feedback contradicts what they were sent; the fault names the wheel.
 What a healthy wheel does is modelled as a first-order lag behind its command. Between the model
 and the feedback there is room for load, slip and coarse encoders: only what no healthy wheel does
 counts as evidence, and evidence must last.
+
+A wheel that goes on turning when it is told to stand is a runaway, unless it is slowing down. Once
+it has been at rest, what turns it is not its command: a hand, or a slope. That is told, and never a
+fault: the zero that is being sent is all that a fault could say.
 """
 
 from __future__ import annotations
@@ -19,16 +23,16 @@ REPEATED = 3
 """Impossible lines in a row that make a fault: 30 ms at 100 Hz."""
 
 SLACK = 2.0
-"""rad/s; below this coarse encoders and a robot pushed by hand look like anything."""
+"""rad/s; below this coarse encoders and a robot at rest look like anything."""
 
+LEAST = 0.005
+"""rad/s; a line says less as zero."""
 
-class _Wheel:
-    """What one wheel should be doing, and for how long it has not."""
+ROLLED_S = 0.2
+"""How long wheels must turn by hand before it is told: rocking to rest is no news."""
 
-    def __init__(self) -> None:
-        self.expected = 0.0
-        self.seen = 0.0
-        self.evidence = dict.fromkeys(_FAULTS, 0.0)
+TOLD_AGAIN_S = 1.0
+"""A push is told at most this often."""
 
 
 _FAULTS = {
@@ -37,6 +41,47 @@ _FAULTS = {
     "runaway": "turns faster than commanded: the motor driver or its encoder is at fault",
     "stuck": "reports one and the same speed: its encoder is stuck",
 }
+
+
+class _Wheel:
+    """What one wheel should be doing, and for how long it has not."""
+
+    def __init__(self) -> None:
+        self.driven = False
+        """It has been told to turn, and not seen at rest since it was told to stand."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Start over; but a wheel that has not come to rest still has to."""
+        self.expected = 0.0
+        self.seen = 0.0
+        self.evidence = dict.fromkeys(_FAULTS, 0.0)
+        self.slowest = 0.0
+        """rad/s; down to here it has slowed since it is faster than it should be."""
+
+    def signs(self, told: float, speed: float, share: float, still: bool) -> tuple[bool, ...]:
+        """Whether it looks dead, reversed, running away, stuck: in the order of `_FAULTS`.
+
+        `share` is how far towards its command it should have come; `still` that all wheels should
+        stand.
+        """
+        self.expected += (told - self.expected) * share
+        self.driven = not still or (self.driven and abs(speed) > SLACK)
+        constant, self.seen = speed == self.seen, speed
+        expected = self.expected
+        size, most = abs(expected), max(abs(expected), abs(told))
+        fast = self.driven and abs(speed) > 1.5 * most + SLACK
+        slowing = fast and abs(speed) < self.slowest - SLACK
+        if slowing or not fast:
+            self.slowest = abs(speed)
+        moving = size > SLACK and expected * told > 0
+        apart = abs(speed - expected) > SLACK + 0.3 * most
+        return (
+            moving and abs(speed) < 0.1 * size,
+            moving and speed * expected < 0 and abs(speed) > 0.3 * size,
+            fast and not slowing,
+            self.driven and constant and speed != 0.0 and apart,
+        )
 
 
 class Sanity:
@@ -48,11 +93,16 @@ class Sanity:
         self._since = 0.0
         self._impossible = 0
         self._wheels = tuple(_Wheel() for _ in WHEELS)
+        self._rolled = 0.0
+        self._untold = TOLD_AGAIN_S
+        self.turned = ""
+        """What the last `watch` has to tell of wheels turned by hand, or ""."""
 
     def forget(self) -> None:
         """Start over: the link was gone, or a fault has been cleared."""
         self._last, self._since, self._impossible = None, 0.0, 0
-        self._wheels = tuple(_Wheel() for _ in WHEELS)
+        for wheel in self._wheels:
+            wheel.forget()
 
     @property
     def doubtful(self) -> bool:
@@ -91,32 +141,26 @@ class Sanity:
 
         `sent` is what the wheels are told, `seen` what they report, rad/s.
         """
-        settings = self._settings
-        if not settings.fault_time:
-            return ""
-        share = dt / (settings.response_time + dt) if dt else 0.0
+        limit, response = self._settings.fault_time, self._settings.response_time
+        share = dt / (response + dt) if dt else 0.0
+        still = max(map(abs, sent.as_tuple())) < LEAST
+        self._notice(seen, dt, still)
         rows = zip(WHEELS, self._wheels, sent.as_tuple(), seen.as_tuple(), strict=True)
         for name, wheel, told, speed in rows:
-            wheel.expected += (told - wheel.expected) * share
-            signs = _signs(wheel.expected, told, speed, constant=speed == wheel.seen)
-            wheel.seen = speed
-            for kind, bad in zip(_FAULTS, signs, strict=True):
+            for kind, bad in zip(_FAULTS, wheel.signs(told, speed, share, still), strict=True):
                 lasted = wheel.evidence[kind] + dt if bad else 0.0
                 wheel.evidence[kind] = lasted
-                if lasted > settings.fault_time:
+                if limit and lasted > limit:
                     return f"{name} wheel {_FAULTS[kind]} (told {told:.1f}, saw {speed:.1f} rad/s)"
         return ""
 
-
-def _signs(
-    expected: float, told: float, speed: float, *, constant: bool
-) -> tuple[bool, bool, bool, bool]:
-    """Whether this looks dead, reversed, running away, stuck: in the order of `_FAULTS`."""
-    size, most = abs(expected), max(abs(expected), abs(told))
-    moving = size > SLACK and expected * told > 0
-    return (
-        moving and abs(speed) < 0.1 * size,
-        moving and speed * expected < 0 and abs(speed) > 0.3 * size,
-        abs(speed) > 1.5 * most + SLACK,
-        constant and speed != 0.0 and abs(speed - expected) > SLACK + 0.3 * most,
-    )
+    def _notice(self, seen: WheelSpeeds, dt: float, still: bool) -> None:
+        """Tell once in a while of wheels that turn though they were at rest and are told to be."""
+        rows = zip(self._wheels, map(abs, seen.as_tuple()), strict=True)
+        fastest = max([speed for wheel, speed in rows if still and not wheel.driven], default=0.0)
+        self._rolled = self._rolled + dt if fastest > SLACK else 0.0
+        self._untold += dt
+        self.turned = ""
+        if self._rolled > ROLLED_S and self._untold >= TOLD_AGAIN_S:
+            self._untold = 0.0
+            self.turned = f"wheels turn at {fastest:.1f} rad/s with nothing commanded: pushed?"

@@ -13,10 +13,6 @@ from acsard.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
 
-STALE_NS = 10_000_000
-"""From the start of a step to its line: a period at the usual rate, a hundred times what it takes
-unless the process is stopped in between."""
-
 
 class Port(Protocol):
     """The serial port as the loop sees it."""
@@ -39,9 +35,11 @@ class Port(Protocol):
 class Gate:
     """One opening of a port, from the line's side; it never keeps one."""
 
-    def __init__(self, baud_rate: int, stop: bytes) -> None:
-        """`stop` is the plain stop line."""
-        self._baud_rate, self._stop = baud_rate, stop
+    def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
+        """`stop` is the plain stop line; a line older than a period has one to supersede it."""
+        self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
+        self._still = stop.removesuffix(b"\r\n")
+        """What every stop begins with, plain or sealed."""
         self.sent_ns = 0
         """When the last line had been handed over, monotonic."""
         self._free_ns = 0
@@ -52,14 +50,16 @@ class Gate:
 
         None when it is superseded: the kernel still holds something, the line before is still on
         the wire, or the process stood still in the middle of the step and what it says is old. A
-        stop never is. The first line of an opening is a stop, whatever is wished by then.
+        stop never is, in whatever form. The first line of an opening is a plain stop, whatever is
+        wished by then.
         """
         if kernel_bytes or made_ns < self._free_ns:
             return None
-        if line != self._stop and now_ns - made_ns > STALE_NS:
+        goes = self._stop if self._first else line
+        if now_ns - made_ns > self._period_ns and not goes.startswith(self._still):
             return None
         # What the board or a torn line left on the wire ends with an end of line of its own.
-        return (b"\r\n" if self._torn else b"") + (self._stop if self._first else line)
+        return (b"\r\n" if self._torn else b"") + goes
 
     def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
         """The kernel took so many of the bytes handed to it for `line`; the rest is dropped."""

@@ -92,7 +92,10 @@ async def _run(
             access_control(config),
             wake,
         )
-        port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
+        period_ns = int(NS_PER_S / config.rate_hz)
+        port = SerialPort(
+            path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, log.event
+        )
         if config.bus.tls:
             check_certificates(config.bus.tls)
         # The bus first: an id or address in use must end us before the first byte to the MCU.

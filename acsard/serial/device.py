@@ -32,28 +32,32 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
     device.port = path
     try:
         device.open()
-    except serial.SerialException as error:
-        # Only a device that is no tty fails without a number.
-        raise OSError(error.errno or errno.ENOTTY, str(error)) from error
-    try:
-        fd = device.fileno()
-        fcntl.ioctl(fd, termios.TIOCEXCL)
-        attributes = termios.tcgetattr(fd)
-        # pyserial leaves some input processing on; a tty that echoes would command the robot with
-        # its own feedback. HUPCL off: closing must not drop DTR, which resets many boards.
-        attributes[0] = attributes[1] = attributes[3] = 0
-        attributes[2] &= ~termios.HUPCL
-        termios.tcsetattr(fd, termios.TCSANOW, attributes)
-        try:
-            device.set_low_latency_mode(True)
-        except (OSError, ValueError, NotImplementedError):
-            pass  # a pty and CDC-ACM have no such mode
-        device.reset_input_buffer()
-        device.reset_output_buffer()
+        _set_up(device)
     except (OSError, termios.error) as error:
         device.close()
-        raise OSError(errno.EIO, f"cannot set up {path}: {error}") from error
+        # A device that vanishes, or is no tty, is a `termios.error`: that is no OSError, and
+        # pyserial passes it on as it is or in words only.
+        hidden = error.__context__
+        known = hidden if isinstance(hidden, termios.error) else error
+        raise OSError(*known.args) from error
     return device
+
+
+def _set_up(device: serial.Serial) -> None:
+    fd = device.fileno()
+    fcntl.ioctl(fd, termios.TIOCEXCL)
+    attributes = termios.tcgetattr(fd)
+    # pyserial leaves some input processing on; a tty that echoes would command the robot with
+    # its own feedback. HUPCL off: closing must not drop DTR, which resets many boards.
+    attributes[0] = attributes[1] = attributes[3] = 0
+    attributes[2] &= ~termios.HUPCL
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    try:
+        device.set_low_latency_mode(True)
+    except (OSError, ValueError, NotImplementedError):
+        pass  # a pty and CDC-ACM have no such mode
+    device.reset_input_buffer()
+    device.reset_output_buffer()
 
 
 def unsent(fd: int) -> int:

@@ -45,15 +45,17 @@ class SerialPort:
         path: str,
         baud_rate: int,
         stop: bytes,
+        period_ns: int,
         wake: Callable[[], None],
         log: Callable[[Event], None],
     ) -> None:
         self.is_open = False
         self.opened = 0
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
+        self._period_ns = period_ns
         self._wake, self._log = wake, log
         self._received: list[Received] = []
-        self._gate = Gate(baud_rate, stop)
+        self._gate = Gate(baud_rate, stop, period_ns)
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
@@ -135,7 +137,7 @@ class SerialPort:
             raise OSError(errno.EIO, "the driver did not answer") from None
         self._lost.clear()
         self._fd = device.fileno()
-        self._gate = Gate(baud_rate, self._stop)
+        self._gate = Gate(baud_rate, self._stop, self._period_ns)
         self._received.clear()
         loop = asyncio.get_running_loop()
         self._transport, _ = await serial_asyncio.connection_for_serial(

@@ -132,12 +132,12 @@ class FakeMcu(Faults):
         """Move the vehicle; the watchdog trips at its own time on the way."""
         deadline = max(self._fed_ns + self.watchdog_ns, self._now_ns)
         if self.watchdog and deadline <= now_ns and any(self.vehicle.set_points):
-            self.vehicle.advance((deadline - self._now_ns) / NS_PER_S)
+            self.vehicle.advance((deadline - self._now_ns) / NS_PER_S, self.push)
             self._now_ns = deadline
             self.watchdog_trips += 1
             self.vehicle.set_points[:] = [0.0] * 4
         if now_ns > self._now_ns:
-            self.vehicle.advance((now_ns - self._now_ns) / NS_PER_S)
+            self.vehicle.advance((now_ns - self._now_ns) / NS_PER_S, self.push)
             self._now_ns = now_ns
 
     # lines

@@ -41,6 +41,8 @@ class Faults:
         """Which motor each channel's output turns."""
         self.drives = [1.0] * 4
         """What of a channel's command reaches its motor: 1, turned round -1, none 0."""
+        self.push: float | None = None
+        """m/s at which hands move the robot."""
         self.encoders = [0, 1, 2, 3]
         """Which motor's encoder each channel reads."""
         self.encoder_signs = [1, 1, 1, 1]
@@ -127,6 +129,10 @@ class Faults:
         """The motor does not turn."""
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
+    def pushed(self, speed: float) -> Fault:
+        """Hands move the robot straight on at `speed` m/s, whatever its motors do."""
+        return self._with(push=speed)
+
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
         """Takes `delay_s` longer to act and answer."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
@@ -203,6 +209,7 @@ ARGUMENTS = {
     "stuck_encoder": "m", "dead_motor": "m", "reversed_motor": "m", "reversed_encoder": "m",
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
     "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
+    "pushed": "n",
 }  # fmt: skip
 """The faults that need arguments: `m` a motor, 0 to 3 for a to d; `n` a number."""
 

@@ -2,7 +2,8 @@
 
 Motors follow their set points as first-order systems. The base moves by the wheels' real speeds;
 `turn_slip` makes skidding wheels turn it less than they roll, `load` makes the motors give less
-than they are asked. Wheels are in `values.WHEELS` order.
+than they are asked. Hands that push it are stronger than the motors. Wheels are in
+`values.WHEELS` order.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import math
 from acsard.config.settings import DriveConfig, SimConfig
 from acsard.drive.odometry import arc
 from acsard.values import Pose
+
+HANDS_S = 0.1
+"""How long hands take to bring the robot to their speed, as a motor's time constant."""
 
 
 class Vehicle:
@@ -31,19 +35,23 @@ class Vehicle:
         self.load = 0.0
         """Share of every set point the motors fall short by, 0 to 1."""
 
-    def advance(self, dt: float) -> None:
-        """Let `dt` s pass under the present set points."""
+    def advance(self, dt: float, push: float | None = None) -> None:
+        """Let `dt` s pass under the present set points, or pushed by hand at `push` m/s."""
         if dt <= 0.0:
             return
-        if not (any(self.set_points) or any(self.speeds)):
+        if push is not None:
+            right, left = push / self._right_radius, push / self._left_radius
+            goals, lag = [right, left, left, right], HANDS_S
+        else:
+            goals, lag = [point * (1.0 - self.load) for point in self.set_points], self._lag
+        if not (any(goals) or any(self.speeds)):
             return
-        rest = math.exp(-dt / self._lag) if self._lag else 0.0
+        rest = math.exp(-dt / lag) if lag else 0.0
         turned = [0.0] * 4
-        for i in range(4):
-            goal = self.set_points[i] * (1.0 - self.load)
+        for i, goal in enumerate(goals):
             error = self.speeds[i] - goal
             # The integral of an exponential approach, so that any dt gives the same path.
-            turned[i] = goal * dt + error * self._lag * (1.0 - rest)
+            turned[i] = goal * dt + error * lag * (1.0 - rest)
             speed = goal + error * rest
             self.speeds[i] = speed if abs(speed) > 1e-9 else 0.0
             self.angles[i] += turned[i]

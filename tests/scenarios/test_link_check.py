@@ -389,7 +389,7 @@ class LatePort(VirtualPort):
 
 def jittery_drive(check: str, counts: int) -> World:
     world = World(config(check, counts))
-    port = LatePort(115200, world.port._stop)
+    port = LatePort(*world.port._opening)
     port.world, port.held = world, []
     port.plug(world.mcu)
     world.port = world.loop._port = port

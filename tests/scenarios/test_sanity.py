@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+from contextlib import nullcontext
+
 import pytest
 
-from acsard.config.settings import Config, McuConfig, WheelMap
+from acsard.config.contradictions import contradictions
+from acsard.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
 from acsard.sim.faults import Fault
-from acsard.values import WHEELS
+from acsard.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 
 
@@ -82,3 +87,183 @@ def test_minutes_of_driving_about_raise_no_false_alarm(world: World) -> None:
         world.send(0.0)
         world.run(0.2 + i % 3)
     assert "fault" not in {event.name for event in world.events}
+
+
+# hands
+
+
+def told(world: World, name: str) -> list[str]:
+    return [event.text for event in world.events if event.name == name]
+
+
+def enter(world: World, mode: str, dice: random.Random) -> None:
+    """Drive a bit and end in this mode at rest; "driving" is a commander that holds zero."""
+    world.drive(dice.choice((-1, 1)) * dice.uniform(0.2, 1.0), dice.uniform(-2, 2), seconds=0.6)
+    world.send(0.0)
+    if mode in ("stopped", "fault"):
+        world.put("stop", b"")
+    world.run(1.8)
+    if mode == "fault":
+        assert world.call("clear").success
+        with world.mcu.bias(3, 9.0):
+            world.drive(0.5, seconds=1.0)
+        world.run(1.0)
+    elif mode == "inactive":
+        assert world.call("deactivate").success
+    elif mode == "driving":
+        world.hold(0.0, seconds=0.1)
+    assert world.state.mode == mode
+
+
+def leave(world: World, mode: str) -> None:
+    """Back to ready, whichever mode it was."""
+    if mode in ("stopped", "fault"):
+        assert world.call("clear").success
+    elif mode == "inactive":
+        assert world.call("activate").success
+    world.run(0.5)
+    assert world.state.mode == "ready"
+
+
+def shove(world: World, mode: str, dice: random.Random) -> None:
+    """Push it by hand once or a few times, as fast as hands do, and let go."""
+    for _ in range(dice.randint(1, 3)):
+        for hands, seconds in ((True, dice.uniform(0.1, 3.0)), (False, dice.uniform(0.05, 0.4))):
+            speed = dice.choice((-1, 1)) * dice.uniform(0.05, 1.0)
+            with world.mcu.pushed(speed) if hands else nullcontext():
+                if mode == "driving":
+                    world.hold(0.0, seconds=seconds)
+                else:
+                    world.run(seconds)
+
+
+@pytest.mark.parametrize(
+    "count", [40, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
+)
+def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> None:
+    dice, kinds = random.Random(7), Counter[str]()
+    modes = ("ready", "inactive", "stopped", "fault", "driving")
+    world.bus.wanted = set()
+    for trial in range(count):
+        mode = modes[trial % len(modes)]
+        enter(world, mode, dice)
+        world.events.clear()
+        reason = world.state.reason
+        shove(world, mode, dice)
+        latched = told(world, "fault")
+        assert (world.state.mode, latched) == (mode, []), f"push {trial} in {mode}: {latched}"
+        assert mode == "ready" or world.state.reason == reason
+        kinds[mode] += 1
+        world.run(0.5)
+        leave(world, mode)
+        world.port.sent.clear()
+    print(f"\nhands: {dict(kinds)}, seen {world.state.counters['wheels_turned']} times, no fault")
+
+
+@pytest.mark.parametrize("mode", ["ready", "inactive", "stopped"])
+def test_wheels_turned_by_hand_are_told_at_most_once_a_second_and_counted(
+    world: World, mode: str
+) -> None:
+    enter(world, mode, random.Random(1))
+    with world.mcu.pushed(0.12):
+        world.run(4.0)
+    assert world.state.mode == mode
+    assert 3 <= len(told(world, "wheels_turned")) <= 4
+    assert world.state.counters["wheels_turned"] == len(told(world, "wheels_turned"))
+    leave(world, mode)
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("lag", [0.05, 0.2, 0.4, 0.6])
+@pytest.mark.parametrize("way", ["stop", "silence", "zero"])
+def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way: str) -> None:
+    world = World(Config(sim=SimConfig(motor_time_constant=lag)))
+    world.run(0.2)
+    for linear, angular in ((1.0, 0.0), (-1.0, 1.0), (0.0, 4.0), (0.3, 0.0)):
+        world.drive(linear, angular, seconds=3.0)
+        assert world.state.mode == "driving"
+        if way == "stop":
+            world.put("stop", b"")
+        elif way == "zero":
+            world.hold(0.0, seconds=2.0)
+        world.run(3.0)
+        if way == "stop":
+            assert world.call("clear").success
+    assert told(world, "fault") == told(world, "wheels_turned") == []
+
+
+@pytest.mark.parametrize(
+    ("linear", "way", "within"),
+    [
+        (0.2, "stop", 0.78), (0.5, "stop", 0.72), (-1.0, "stop", 0.80),
+        (0.2, "zero", 0.84), (0.5, "zero", 0.92), (-1.0, "zero", 1.12),
+        (0.2, "silence", 1.06), (0.5, "silence", 1.12), (-1.0, "silence", 1.32),
+    ],
+)  # fmt: skip
+def test_a_robot_that_does_not_stop_when_told_is_found_as_soon_as_it_stands_out(
+    world: World, linear: float, way: str, within: float
+) -> None:
+    """For the daemon, hands that hold it at the speed it had are motors that do not obey."""
+    world.drive(linear, seconds=2.0)
+    began_ns = world.now_ns
+    with world.mcu.pushed(linear):
+        if way == "stop":
+            world.put("stop", b"")
+        while world.state.mode != "fault" and world.now_ns - began_ns < 3 * NS_PER_S:
+            if way == "zero":
+                world.send(0.0)
+            world.run(0.02)
+    took = (world.now_ns - began_ns) / NS_PER_S
+    assert "turns faster than commanded" in world.state.reason
+    assert took <= within + 0.021
+
+
+def test_a_robot_found_rolling_after_a_lost_link_is_still_a_runaway(world: World) -> None:
+    """It was driven and has not been seen at rest since: an MCU without a watchdog drives on."""
+    world.drive(0.5, seconds=1.0)
+    mcu = world.mcu
+    with mcu.no_watchdog(), mcu.pushed(0.5):
+        world.port.unplug()
+        world.run(0.5)
+        world.port.plug(mcu)
+        world.run(2.0)
+    assert "turns faster than commanded" in world.state.reason
+
+
+def test_a_runaway_that_is_cleared_while_it_lasts_is_found_again(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.pushed(0.5):
+        world.run(2.5)
+        assert world.call("clear").success
+        world.run(1.0)
+        assert world.state.mode == "fault"
+
+
+@pytest.mark.parametrize("lag", [0.05, 0.2])
+def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost(
+    lag: float,
+) -> None:
+    config = Config(mcu=McuConfig(reply_period=0.25), sim=SimConfig(motor_time_constant=lag))
+    assert contradictions(config) == []
+    world, dice = World(config), random.Random(3)
+    world.bus.wanted = set()
+    with world.mcu.unprompted(0.25), world.mcu.lost_replies(3):
+        world.run(3.0)
+        world.send(0.0)
+        world.run(0.1)
+        for _ in range(20):
+            linear = dice.choice((-1, 1)) * dice.uniform(0.3, 1.0)
+            world.hold(linear, dice.uniform(-3, 3), seconds=dice.uniform(0.4, 3.0))
+            assert world.state.mode == "driving"
+            world.send(0.0)
+            world.run(dice.uniform(0.3, 1.5))
+    assert told(world, "fault") == told(world, "wheels_turned") == []
+
+
+def test_a_robot_that_may_not_turn_drives_straight_on() -> None:
+    world = World(Config(limits=LimitsConfig(angular_speed=0.0)))
+    world.run(0.2)
+    world.drive(0.5, 0.001, seconds=2.0)
+    assert world.state.mode == "driving"
+    assert (world.state.linear, world.state.yaw) == pytest.approx((0.5, 0.0), abs=0.02)

@@ -30,16 +30,15 @@ START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 class VirtualPort:
     """A serial port to the fake MCU that can be unplugged and blocked."""
 
-    def __init__(self, baud_rate: int, stop: bytes) -> None:
-        self._stop = stop
+    def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         self.is_open = False
         self.opened = 0
         self.blocked = False
         self.trouble = ""
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
-        self._baud_rate = baud_rate
-        self._gate = Gate(baud_rate, stop)
+        self._opening = (baud_rate, stop, period_ns)
+        self._gate = Gate(*self._opening)
         self._received: list[Received] = []
 
     @property
@@ -49,7 +48,7 @@ class VirtualPort:
     def plug(self, mcu: FakeMcu) -> None:
         self.mcu, self.is_open = mcu, True
         self.opened += 1
-        self._gate = Gate(self._baud_rate, self._stop)
+        self._gate = Gate(*self._opening)
 
     def unplug(self) -> None:
         self.mcu, self.is_open = None, False
@@ -114,6 +113,7 @@ class World:
         self.port = VirtualPort(
             self.config.mcu.baud_rate,
             Codec(self.config.mcu.wheels, self.config.mcu.trailing_comma).stop,
+            self.period_ns,
         )
         if plugged:
             self.port.plug(self.mcu)

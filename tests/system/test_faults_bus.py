@@ -375,7 +375,7 @@ def flooded(where: Path, length: float) -> Flooded:
     steps that stand or rise from there obey no command's speed yet.
     """
     limits = PROMPT | {"linear_speed": 10.0, "wheel_speed": 99.0}
-    feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.9}
+    feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.99}
     with (
         FarPeer(where) as peer,
         Daemon(where, peer.path, {"limits": limits, "feedback": feedback}) as daemon,

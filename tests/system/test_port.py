@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import itertools
 import os
+import termios
 import tty
 from collections.abc import Sequence
 
+import pytest
+
 from acsard.host import clock
-from acsard.mcu.port import STALE_NS
+from acsard.mcu.check import seal
 from acsard.serial.port import SerialPort
 from acsard.values import Instant
 
+PERIOD_NS = 10_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 GO = b"ap05.00,bp05.00,cp05.00,dp05.00\r\n"
 
@@ -20,17 +26,19 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
     """The step was stopped before it wrote, and goes on later. A stop is never too old."""
 
     async def offered() -> Sequence[str]:
-        async with SerialPort(path, 115200, STOP, lambda: None, lambda event: None) as port:
+        async with SerialPort(
+            path, 115200, STOP, PERIOD_NS, lambda: None, lambda event: None
+        ) as port:
             answers = [port.offer(STOP, clock.now())]
             await asyncio.sleep(0.01)  # the wire is free again
             now = clock.now()
-            before = Instant(now.mono_ns - STALE_NS - 1, now.wall_ns)
+            before = Instant(now.mono_ns - PERIOD_NS - 1, now.wall_ns)
             answers.append(port.offer(GO, before))
             answers.append(port.offer(GO, clock.now()))
             await asyncio.sleep(0.03)
             later = clock.now()
-            late = Instant(later.mono_ns - STALE_NS - 1, later.wall_ns)
-            answers.append(port.offer(STOP, late))
+            late = Instant(later.mono_ns - PERIOD_NS - 1, later.wall_ns)
+            answers.append(port.offer(seal(STOP, 7), late))
             return answers
 
     master, slave = os.openpty()
@@ -42,3 +50,46 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
     finally:
         os.close(master)
         os.close(slave)
+
+
+@pytest.mark.parametrize("name", ["tcgetattr", "tcsetattr", "tcflush"])
+def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """At each call of the opening in turn, until one gets through; no attempt ends the daemon."""
+    master, slave = os.openpty()
+    path, real, attempts = os.ttyname(slave), getattr(termios, name), itertools.count(1)
+    left = 1
+
+    def vanishing(*arguments: object) -> object:
+        nonlocal left
+        left -= 1
+        if not left:
+            left = next(attempts) + 1
+            raise termios.error(errno.EIO, "Input/output error")
+        return real(*arguments)
+
+    async def opened() -> tuple[bool, list[str]]:
+        said = list[str]()
+        async with SerialPort(
+            path, 115200, STOP, PERIOD_NS, lambda: None, lambda event: said.append(event.name)
+        ) as port:
+            keeper = asyncio.create_task(port.keep_open())
+            deadline_ns = clock.mono_ns() + 10 * 10**9
+            while not port.is_open and not keeper.done() and clock.mono_ns() < deadline_ns:
+                await asyncio.sleep(0.01)
+            found = port.is_open, said
+            keeper.cancel()
+            await asyncio.wait([keeper])
+            return found
+
+    try:
+        monkeypatch.setattr(termios, name, vanishing)
+        is_open, said = asyncio.run(opened())
+    finally:
+        monkeypatch.undo()
+        os.close(master)
+        os.close(slave)
+    assert is_open
+    assert said[0] == "port_waiting"
+    assert said[-1] == "port_open"

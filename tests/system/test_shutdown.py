@@ -25,11 +25,11 @@ from tests.system.strangers import STUCK, words
 
 SLOW_STOP = {
     "linear_stop_deceleration": 1.0,
-    "linear_speed": 3.0,
+    "linear_speed": 2.0,
     "linear_acceleration": 20.0,
     "wheel_speed": 99.0,
 }
-"""From 2 m/s this ramp would take 2 s: more than the way down is allowed."""
+"""From 2 m/s this ramp takes 2 s, the longest there may be: more than the way down is allowed."""
 
 
 def ramp_after(peer: Peer, at: float) -> list[Heard]:

@@ -55,6 +55,16 @@ def test_a_client_needs_somewhere_to_connect_to() -> None:
     assert problems(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))) == []
 
 
+@pytest.mark.parametrize("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
+def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
+    listen: tuple[str, ...],
+) -> None:
+    here = ("tcp/127.0.0.1:7447",)
+    client = Config(bus=BusConfig(mode="client", connect=here, listen=listen))
+    assert contradictions(client) == warnings(client) == []
+    assert problems(bus=BusConfig(connect=here, listen=listen)) != []
+
+
 def test_a_certificate_has_one_role() -> None:
     (line,) = problems(access=AccessConfig(viewers=("a", "b"), maintainers=("b",)))
     assert line.startswith('access.maintainers[0] = "b": access.viewers[1] is the same')

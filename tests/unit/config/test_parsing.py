@@ -245,6 +245,35 @@ PLANTED = [
         '"x"',
         "write another",
     ),
+    # what would not stop, or fault while it drives as it is told
+    (
+        "[limits]\nlinear_deceleration = 0.19",
+        "limits.linear_deceleration",
+        "0.19",
+        "would take 5.3 s from full speed (1 m/s) to rest, and may take 5; write 0.2 or more",
+    ),
+    (
+        "[limits]\nangular_deceleration = 0.1",
+        "limits.angular_deceleration",
+        "0.1",
+        "would take 40.0 s from full speed (4 rad/s) to rest, and may take 5; write 0.8 or more",
+    ),
+    (
+        "[limits]\nangular_deceleration = 1\nangular_stop_deceleration = 1.5",
+        "limits.angular_stop_deceleration",
+        "1.5",
+        "may take 2; write 2 or more",
+    ),
+    ("[feedback]\nwheel_speed = 30", "feedback.wheel_speed", "30", "write 35.2 or more"),
+    ("[mcu]\nreply_period = 1.0", "mcu.reply_period", "1", "write 0.25 at most"),
+    ("[mcu]\nreply_period = 0.3", "mcu.reply_period", "0.3", "write 0.25 at most"),
+    (
+        "[mcu]\nreply_period = 0.15\n[feedback]\nfault_time = 0.2",
+        "mcu.reply_period",
+        "0.15",
+        "write 0.1 at most (the firmware must report more often), or feedback.fault_time = 0.3",
+    ),
+    ("[bus]\nlisten = []", "bus.listen", "[]", 'write ["tcp/127.0.0.1:7448"]'),
     ('[bus]\nlisten = ["7448"]', "bus.listen", '"7448"', 'like "tcp/127.0.0.1:7448"'),
     ('[bus]\nconnect = ["tcp/10.0.0.2:1"]', "bus.connect", '"tcp/10.0.0.2:1"', "insecure = true"),
 ]  # fmt: skip

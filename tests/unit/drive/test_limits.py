@@ -114,6 +114,22 @@ def test_the_speed_limits_keep_the_curvature(wish: Twist) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("limits", "wish", "end"),
+    [
+        (LimitsConfig(angular_speed=0.0), (0.5, 0.001), (0.5, 0.0)),
+        (LimitsConfig(angular_speed=0.0), (2.0, -9.0), (1.0, 0.0)),
+        (LimitsConfig(linear_speed=0.0), (0.5, 1.0), (0.0, 1.0)),
+        (LimitsConfig(linear_speed=0.0), (-0.001, 8.0), (0.0, 4.0)),
+        (LimitsConfig(linear_speed=0.0, angular_speed=0.0), (0.5, 1.0), (0.0, 0.0)),
+    ],
+)
+def test_an_axis_with_a_limit_of_zero_is_left_out_and_the_other_is_followed(
+    limits: LimitsConfig, wish: tuple[float, float], end: tuple[float, float]
+) -> None:
+    assert pair(limiter(limits).follow(Twist(*wish), 1000.0)) == approx(*end)
+
+
 def test_a_wheel_that_would_be_too_fast_slows_the_whole_twist() -> None:
     # 1 m/s and 4 rad/s: wheels at (1 -+ 0.6) / 0.05 = 8 and 32 rad/s; 16 rad/s are half of it
     slow = limiter(LimitsConfig(wheel_speed=16.0))

@@ -6,18 +6,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.mcu.port import STALE_NS, Gate
+from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, seal
+from acsard.mcu.port import Gate
 
 MS = 1_000_000
+PERIOD_NS = 10 * MS
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+COMMA_STOP = b"ap00.00,bp00.00,cp00.00,dp00.00,\r\n"
 GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
 
 
 class Wire:
     """A gate and a kernel that takes what it is handed."""
 
-    def __init__(self, baud_rate: int = 115200) -> None:
-        self.gate = Gate(baud_rate, STOP)
+    def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
+        self.gate = Gate(baud_rate, stop, period_ms * MS)
+        self._stop = stop
         self.out = b""
 
     def offer(
@@ -37,7 +41,7 @@ class Wire:
         return self.gate.took(line, data, taken, now_ns)
 
     def started(self) -> Wire:
-        assert self.offer(STOP, 0) == "sent"
+        assert self.offer(self._stop, 0) == "sent"
         self.out = b""
         return self
 
@@ -71,12 +75,39 @@ def test_no_line_goes_while_the_kernel_holds_a_byte() -> None:
     assert wire.offer(GO, 1000) == "sent"
 
 
-def test_what_was_made_before_a_standstill_does_not_go_after_it_but_a_stop_does() -> None:
-    wire = Wire().started()
-    stale_ms = STALE_NS / MS
-    assert wire.offer(GO, 100 + stale_ms + 0.001, made_ms=100) == "superseded"
-    assert wire.offer(STOP, 100 + stale_ms + 0.001, made_ms=100) == "sent"
-    assert wire.offer(GO, 200 + stale_ms, made_ms=200) == "sent"
+@pytest.mark.parametrize("period_ms", [4, 10, 100])
+def test_what_was_made_more_than_a_period_ago_does_not_go(period_ms: int) -> None:
+    wire = Wire(period_ms=period_ms).started()
+    assert wire.offer(GO, 100 + period_ms + 0.001, made_ms=100) == "superseded"
+    assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
+
+
+@pytest.mark.parametrize("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
+@pytest.mark.parametrize("stop", [STOP, COMMA_STOP])
+def test_a_stop_is_never_too_old_in_whatever_form(stop: bytes, letters: bytes | None) -> None:
+    line = stop if letters is None else seal(stop, 7, letters)
+    wire = Wire(stop=stop).started()
+    assert wire.offer(line, 1000, made_ms=100) == "sent"
+    assert wire.out == line
+
+
+@pytest.mark.parametrize(
+    "line", [GO, seal(GO, 7), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n", seal(GO, 7, ASK_SAMPLE)]
+)
+def test_what_turns_a_wheel_is_no_stop(line: bytes) -> None:
+    assert Wire().started().offer(line, 1000, made_ms=100) == "superseded"
+
+
+def test_the_stop_that_opens_goes_however_old_the_line_is_that_was_wished() -> None:
+    wire = Wire()
+    assert wire.offer(GO, 1000, made_ms=100) == "superseded"
+    assert wire.out == b"\r\n" + STOP
+
+
+def test_the_first_stop_of_an_opening_is_the_plain_one_which_every_board_obeys() -> None:
+    wire = Wire()
+    assert wire.offer(seal(STOP, 7), 0) == "superseded"
+    assert wire.out == b"\r\n" + STOP
 
 
 @pytest.mark.parametrize(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
@@ -107,7 +138,7 @@ def test_only_the_bytes_that_were_taken_occupy_the_wire_and_count_as_sent() -> N
 def test_the_gate_never_lets_bytes_queue_on_the_wire(
     baud: int, sends: list[tuple[int, int]]
 ) -> None:
-    gate, now_ns, busy_until_ns = Gate(baud, STOP), 0, 0
+    gate, now_ns, busy_until_ns = Gate(baud, STOP, PERIOD_NS), 0, 0
     for pause_ns, takes in sends:
         now_ns += pause_ns
         data = gate.prepare(GO, now_ns, now_ns, 0)

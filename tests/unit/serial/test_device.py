@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import itertools
 import os
 import pty
 import termios
@@ -63,6 +64,36 @@ def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str)
     close(again).join(5.0)
     again.close()
     device.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [(name, call) for name, calls in (("tcgetattr", 2), ("tcsetattr", 2), ("tcflush", 3))
+     for call in range(1, calls + 1)],
+)  # fmt: skip
+def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
+    path: str, monkeypatch: pytest.MonkeyPatch, name: str, call: int
+) -> None:
+    real, calls = getattr(termios, name), itertools.count(1)
+
+    def vanishing(*arguments: object) -> object:
+        if next(calls) >= call:
+            raise termios.error(errno.EIO, "Input/output error")
+        return real(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(termios, name, vanishing)
+        with pytest.raises(OSError, match="Input/output error") as lost:
+            open_raw(path, 115200)
+    assert lost.value.errno == errno.EIO
+    assert code_of(refusal(path, lost.value)) is Exit.FAILURE
+    close(open_raw(path, 115200)).join(5.0)  # nothing of it was left open or locked
+
+
+def test_a_device_that_is_no_tty_is_told_so() -> None:
+    with pytest.raises(OSError, match="ioctl") as refused:
+        open_raw("/dev/null", 115200)
+    assert refused.value.errno == errno.ENOTTY
 
 
 def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:

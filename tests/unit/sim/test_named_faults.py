@@ -18,6 +18,7 @@ from acsard.sim.named_faults import NamedFault, forms, named
         ("swapped_wheels=b:d", (1, 3)),
         ("bias=c:1.2", (2, 1.2)),
         ("other_baud=57600", (57600,)),
+        ("pushed=0.12", (0.12,)),
         ("reset=0.5", (0.5,)),
         ("reset=5", (5,)),
     ],

@@ -167,3 +167,15 @@ def test_load_takes_its_share_of_every_speed(load: float) -> None:
     made = moved(2.0, 10.0, 10.0, -10.0, 10.0, load=load)
     assert made.speeds == pytest.approx([s * (1 - load) for s in (10.0, 10.0, -10.0, 10.0)])
     assert made.angles == pytest.approx([s * (1 - load) * 2 for s in (10.0, 10.0, -10.0, 10.0)])
+
+
+@pytest.mark.parametrize("speed", [0.5, -0.12])
+def test_hands_move_it_whatever_its_motors_do(speed: float) -> None:
+    made = moved(1.0, 10.0, -10.0, 3.0, 0.0)
+    before = made.pose
+    made.advance(2.0, push=speed)
+    assert made.speeds == pytest.approx([speed / RADIUS] * 4, rel=1e-6)
+    made.set_points[:] = [0.0] * 4
+    made.advance(1.0)
+    assert made.speeds == [0.0] * 4
+    assert math.dist((made.pose.x, made.pose.y), (before.x, before.y)) > 1.5 * abs(speed)
