@@ -22,7 +22,7 @@ class Bench:
     """An arbiter and its time; `offset_ns` is how far the senders' clocks are ahead."""
 
     def __init__(self, *sources: Source, neutral_first: bool = True, armed: bool = True) -> None:
-        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources))
+        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources=sources))
         self.arbiter.require_neutral()
         self.now_ns = 10 * NS_PER_S
         self.offset_ns = 1_800_000_000 * NS_PER_S
