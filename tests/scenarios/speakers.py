@@ -100,7 +100,7 @@ def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, pour
     with_zeros, with_pauses = dice.random() < 0.7, dice.random() < 0.4
     for number in range(max(2, round(span * hz))):
         world.now_ns = now_ns - int((age + span - number / hz) * NS_PER_S)
-        if with_zeros and dice.random() < 0.02 or number == 0 and dice.random() < 0.5:
+        if (with_zeros and dice.random() < 0.02) or (number == 0 and dice.random() < 0.5):
             zeros = dice.randrange(1, 20)
         if with_pauses and dice.random() < 0.01:
             pauses = dice.randrange(round(hz * 3))
