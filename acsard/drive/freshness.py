@@ -24,7 +24,7 @@ FORGET_NS = 250 * NS_PER_S
 """After so long a silence the drift may be 50 ms: who comes back is as good as new."""
 
 EARLY_NS = NS_PER_S // 20
-"""Below the promptest by more than this no network can be: the clock was set forward."""
+"""What falls by more than this is no jitter: a backlog that pours out, or a clock set forward."""
 
 STEADY, SLEWED = 0.01, 0.1
 """By which share of the time delays may change and still be steady: of a clock whose delay jumped
@@ -67,24 +67,32 @@ class _Proof:
 
     def __init__(self) -> None:
         self._share = STEADY
-        self._delay = self._since_ns = self._heard_ns = 0
+        self._first = self._delay = self._since_ns = self._heard_ns = 0
         self._met_ns: int | None = None
         """When a delay was first met again: what falls passes each but once."""
 
     def begin(self, delay: int, at_ns: int, share: float = STEADY) -> Sign:
         """From this command on."""
-        self._share, self._delay = share, delay
-        self._since_ns = self._heard_ns = at_ns
-        self._met_ns = None
+        self._share, self._first = share, delay
+        self._look_from(delay, at_ns)
         return "wavering"
 
+    def _look_from(self, delay: int, at_ns: int) -> None:
+        self._delay, self._since_ns, self._heard_ns, self._met_ns = delay, at_ns, at_ns, None
+
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Sign:
-        """One more; what wavers begins it again."""
+        """One more; what wavers begins it again.
+
+        So does what falls a little, but as no more than the jitter of what came before.
+        """
         more, lasted_ns = delay - self._delay, at_ns - self._since_ns
         silence, self._heard_ns = at_ns - self._heard_ns, at_ns
         allowed = self._share * lasted_ns
-        if more < -allowed or more > timeout_ns or silence > GAP_NS:
+        if more > timeout_ns or silence > GAP_NS or delay < self._first - EARLY_NS:
             return self.begin(delay, at_ns, self._share)
+        if more < -allowed:
+            self._look_from(delay, at_ns)
+            return "steady"
         if more > allowed:
             return "steady"  # jitter, unless none is as prompt again
         if self._met_ns is None:

@@ -12,6 +12,7 @@ from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import Attachment
 from acsard.values import NS_PER_S
+from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
 
 
@@ -201,6 +202,28 @@ def test_a_sender_whose_clock_is_a_day_off_drives_all_the_same(world: World) -> 
         world.send(0.3, stamp_ns=world.now_ns + day_ns)
         world.run(0.05)
     assert world.state.mode == "driving"
+
+
+def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count() -> None:
+    world = World()
+    world.run(0.2)
+    client = Speaker(world, "signed", ahead=-3600.0)
+    client.hold(0.0, 0.2)
+    assert "app may be late: its delays must be steady for 0.25 s" in world.state.reason
+    assert "app may be late" in {s.name: s.waits_for for s in world.state.sources}["app"]
+    assert world.state.counters["command_unproven"] == 4
+    client.hold(0.4, 0.3)
+    assert world.state.mode == "driving"
+
+
+def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> None:
+    client = Speaker(world, "signed", ahead=0.4)
+    client.open()
+    assert "stamps_replaced" not in world.state.counters
+    ahead = Speaker(world, "signed", "b", ahead=3600.0)
+    world.run(0.5)
+    ahead.open()
+    assert world.state.counters["stamps_replaced"] == 40
 
 
 def test_the_wall_clock_may_step_without_changing_the_path() -> None:

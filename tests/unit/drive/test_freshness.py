@@ -86,6 +86,27 @@ def test_jitter_keeps_nobody_out_for_three_seconds(jitter: float) -> None:
         assert "fresh" in [clock.sends(dice.uniform(0.0, jitter)) for _ in range(60)]
 
 
+@pytest.mark.parametrize(("jitter", "zeros"), [(10.0, 8), (40.0, 8), (40.0, 1)])
+def test_a_zero_among_jitter_is_not_forgotten_before_its_clock_is_known(
+    jitter: float, zeros: int
+) -> None:
+    for seed in range(50):
+        dice, bench = random.Random(seed), Bench(HIGH, armed=False)
+        for number in range(60):
+            late, twist = dice.uniform(0.0, jitter), REST if number < zeros else GO
+            bench.wait(50).stamped(HIGH, late, twist=twist)
+        assert bench.driver() == "high"
+
+
+def test_a_zero_at_the_head_of_a_backlog_is_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    for number in range(300):
+        bench.wait(40 if number < 200 else 50)  # then it has caught up
+        late = max(0.0, 2000 - 10.0 * number)
+        bench.stamped(HIGH, late, twist=GO if number else REST)
+    assert bench.choice().wait.what == "neutral"
+
+
 def test_a_network_that_lets_in_by_heaps_keeps_nobody_out() -> None:
     clock = Clock(known=False)
     for _ in range(10):
