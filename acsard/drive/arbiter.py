@@ -128,8 +128,10 @@ class Arbiter:
         sender = known or source.sender(command.sender, command.arrived_ns)
         if sender is None:
             return "crowded"
-        if verdict == "set" or (verdict == "first" and sender.arrived_ns is None):
+        if verdict == "set":
             sender.forget(source.first)
+        elif verdict == "first":
+            sender.unlearn()
         counts = verdict in ("fresh", "set")
         sender.take(command, self._since_ns, counts=counts)
         return "" if counts else "unproven"

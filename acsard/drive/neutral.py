@@ -28,11 +28,8 @@ NEXT: dict[tuple[State, Sign], State] = {
     ("heard", "moving"): "heard",
     ("heard", "zero"): "free",
     ("heard", "pause"): "free",
-    ("free", "moving"): "free",
-    ("free", "zero"): "free",
-    ("free", "pause"): "free",
 }
-"""What a command shows, and what that leads to."""
+"""What a command shows, and what that leads to. Who is free stays so."""
 
 INTERVALS = 5
 """A sender's usual interval is the median of so many: a stall among them does not make it."""
@@ -43,7 +40,8 @@ class Sender:
 
     def __init__(self, timeout_ns: int, pause_ns: int, state: State) -> None:
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
-        self.state = state
+        self.state = self._sure = state
+        """Also by what does not count yet; and only by what does."""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Its last command that counted, since neutral was last required."""
@@ -72,7 +70,11 @@ class Sender:
     def forget(self, state: State) -> None:
         """What it has sent until now counts no more."""
         self.arrived_ns = self._stamp_ns = None
-        self.state = state
+        self.state = self._sure = state
+
+    def unlearn(self) -> None:
+        """What did not count until now never will."""
+        self.state = self._sure
 
     def notice(self, at_ns: int) -> None:
         """Something of it that does not count came in: it may have been a speed."""
@@ -86,7 +88,7 @@ class Sender:
         One that does not count yet makes it neutral all the same, but not live.
         """
         now_ns = command.arrived_ns
-        if now_ns >= since_ns:
+        if now_ns >= since_ns and self.state != "free":
             self.state = NEXT[self.state, self._sign(command)]
         self._stamp_ns, self._sequence = command.stamp_ns, command.sequence
         if is_zero(command):
@@ -98,6 +100,7 @@ class Sender:
             return
         if not self.live(now_ns):
             self.came_ns = now_ns
+        self._sure = self.state
         self.twist, self.arrived_ns, self.doubted_ns = command.twist, now_ns, None
 
     def _sign(self, command: Command) -> Sign:
