@@ -113,7 +113,7 @@ class _Clock:
         """By how much the last one came later; by how much lately some came ever earlier."""
         self._heard_ns = at_ns
         self._proof = _Proof()
-        self._proof.begin(0, at_ns - GAP_NS - 1)
+        self._proof.begin(0, at_ns - GAP_NS - 1)  # too long ago: the first heard begins it
 
     def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
         """What to do with a command that took so long by the two clocks."""
