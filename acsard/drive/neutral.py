@@ -113,10 +113,9 @@ class Sender:
         if self._moved_ns is None:
             return True
         usual = self._usual or 0.0
-        if command.shared:  # whose zero it is, nobody knows: as long as a pause
-            enough = max(self._pause_ns + usual, 3 * usual)
-        else:
-            enough = max(self._timeout_ns, min(1.5 * usual, self._pause_ns))
+        enough = max(self._timeout_ns, min(1.5 * usual, self._pause_ns))
+        if command.shared:  # whose zero it is, nobody knows
+            enough = self._longest_ns(usual)
         return command.arrived_ns - self._moved_ns > enough
 
     def _paused(self, command: Command) -> bool:
@@ -124,15 +123,19 @@ class Sender:
         usual = self._usual
         if usual is None:
             return False  # all one knows this may be how often it sends
-        enough = max(self._pause_ns + usual, 3 * usual)
-        if command.arrived_ns - self.noticed_ns <= enough:
+        longest = self._longest_ns(usual)
+        if command.arrived_ns - self.noticed_ns <= longest:
             return False
         # Or was the network silent?
         sent, before = command.stamp_ns, self._stamp_ns
-        if sent is not None and before is not None and sent - before <= enough:
+        if sent is not None and before is not None and sent - before <= longest:
             return False
         number, last = command.sequence, self._sequence
         return number is None or last is None or number == last + 1
+
+    def _longest_ns(self, usual: float) -> float:
+        """Silence that is no pause yet: it began when its next speed was due."""
+        return max(self._pause_ns + usual, 3 * usual)
 
     @property
     def _usual(self) -> float | None:
