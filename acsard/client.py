@@ -7,8 +7,8 @@
         print(robot.pose())
 
 `connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
-messages (`acsard.messages.schema`). Commands are stamped and each client opens with a zero, so
-the daemon's staleness and neutral-first rules are met without thinking of them.
+messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive opens
+with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them.
 
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
@@ -24,6 +24,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
+import platform
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -39,6 +41,7 @@ from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, Usag
 from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
+from acsard.messages.signature import Signature
 from acsard.messages.topics import by_key, full_key, service_key
 from acsard.values import AcsardError, Pose
 
@@ -61,6 +64,9 @@ ENDPOINT = "tcp/127.0.0.1:7448"
 SEND_PERIOD_S = 0.05
 """Commands are repeated at 20 Hz: five times within the default timeout."""
 
+OPENING_S = 0.3
+"""Zeros at first: so long a daemon that never heard us wants to see that they are not late."""
+
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -73,6 +79,7 @@ class Client:
         self._id, self._source = robot_id, source
         self._opened = False
         self._put_s = 0.0
+        self._sender, self._sequence = _name(session), 0
         started = clock.now()
         # The wall clock may be set while we drive; stamps that jump would be refused as stale.
         self._wall_offset_ns = started.wall_ns - started.mono_ns
@@ -146,16 +153,18 @@ class Client:
         # would be lost.
         time.sleep(max(0.0, self._put_s + SPACING_S - time.monotonic()))
         self._put_s = time.monotonic()
-        stamp = schema.Time.from_ns(clock.now().mono_ns + self._wall_offset_ns)
+        now_ns = clock.mono_ns() + self._wall_offset_ns
         message = schema.TwistStamped(
-            schema.Header(stamp),
+            schema.Header(schema.Time.from_ns(now_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
+        self._sequence += 1
         self.session.put(
             self.key(f"cmd/{self._source}"),
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
+            attachment=Signature(self._sender, now_ns, self._sequence).pack(),
             timestamp=self.session.new_timestamp(),
         )
 
@@ -255,9 +264,10 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
     """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
     if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
         raise UsageError("linear, angular and seconds must be finite numbers")
-    # A zero each time: the robot may have been stopped and cleared since the last drive.
-    client.send(0.0, 0.0)
-    yield SEND_PERIOD_S
+    # Each time: the robot may have been stopped and cleared, or started, since the last drive.
+    for _ in range(round(OPENING_S / SEND_PERIOD_S) + 1):
+        client.send(0.0, 0.0)
+        yield SEND_PERIOD_S
     end = time.monotonic() + seconds
     try:
         while (left := end - time.monotonic()) > 0:
@@ -266,6 +276,11 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
     finally:
         # Whatever interrupts the drive, the robot is told to stop.
         client.send(0.0, 0.0)
+
+
+def _name(session: zenoh.Session) -> str:
+    """Ours alone, and for people to read: the machine, the process and the session."""
+    return f"{platform.node()[:32]}/{os.getpid()}/{str(session.zid())[:8]}"
 
 
 def _close(session: zenoh.Session) -> None:

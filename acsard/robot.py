@@ -255,6 +255,8 @@ class Robot:
             if refusal.source:
                 self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
+            if command.stamp_replaced:
+                self.counters["stamps_replaced"] += 1
             reason = self._arbiter.accept(command)
             if reason:
                 self._refuse(Refusal(reason, f"source {command.source}: {REFUSED[reason]}"))

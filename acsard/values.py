@@ -85,7 +85,7 @@ class Command(Struct, frozen=True):
 
         source  what it commands as, one of `commands.sources`: the `app` of `cmd/app`
         sender  who sent it, as far as the envelope says: two programs on one source are two
-        clock   what stamped it: a router's may stamp for many, a header's is the sender's own
+        clock   what stamped it: the sender's own attachment, Zenoh for it, or a message's header
 
     `arrived_ns` is the monotonic time of arrival and alone decides the age; `stamp_ns` is when it
     was sent by that clock, which nobody has set by ours.
@@ -99,6 +99,12 @@ class Command(Struct, frozen=True):
     sender: str = ""
     cancelled: bool = False
     """The twist is zero only because what was asked for cancels out: nobody let go."""
+    sequence: int | None = None
+    """Its number among those of its sender: none is missing unless it was sent and lost."""
+    shared: bool = False
+    """Several programs may look like this sender: it came by a bridge."""
+    stamp_replaced: bool = False
+    """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose"]
@@ -158,11 +164,11 @@ class Estimate(Struct, frozen=True):
 class Wait(Struct, frozen=True):
     """What a source waits for, and what `drive/words.py` needs to say it."""
 
-    what: Literal["nothing", "command", "neutral", "higher", "equal", "senders"]
+    what: Literal["nothing", "command", "proof", "neutral", "higher", "equal", "senders"]
     source: str = ""
-    """Who must be neutral; of higher or equal priority, who has the robot."""
-    timeout: float = 0.0
-    """s of silence that are neutral."""
+    """Who must be neutral or prove its clock; of higher or equal priority, who has the robot."""
+    seconds: float = 0.0
+    """s of silence that are neutral, or of steady delays that are a proof."""
     senders: int = 0
     """How many wait while another sender of the same source is followed."""
 

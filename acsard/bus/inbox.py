@@ -34,8 +34,8 @@ STOPS = 16
 QUERIES = 64
 """Queries held, and as many service calls; the next one is turned away with an error."""
 
-ATTACHMENT_BYTES = 64
-"""An rmw_zenoh attachment has 33; a longer one is cut, and refused by its length."""
+ATTACHMENT_BYTES = 256
+"""An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
 
 CDR = encoding_name("cdr")
 STOP = service_key("stop")
@@ -92,9 +92,11 @@ class Inbox:
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
         arrived = clock.now()
         put = sample.kind == zenoh.SampleKind.PUT
-        stamp, stamp_ns, sender = sample.timestamp, None, ""
-        if stamp is not None and stamp.get_id() != self.own_id:
+        stamp, stamp_ns, sender, received_ns = sample.timestamp, None, "", None
+        if stamp is not None:
             stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
+            if stamp.get_id() == self.own_id:
+                stamp_ns, sender, received_ns = None, "", stamp_ns
         arrival = Arrival(
             key,
             put,
@@ -105,6 +107,7 @@ class Inbox:
             sender,
             via,
             _bytes(sample.attachment, ATTACHMENT_BYTES),
+            received_ns,
         )
         if key == "stop" and put:
             self._stop(arrival)

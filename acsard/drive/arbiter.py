@@ -15,14 +15,14 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.config.settings import CommandsConfig, Source
-from acsard.drive.freshness import Freshness
+from acsard.drive.freshness import LONGEST_PROOF_NS, Freshness
 from acsard.drive.neutral import Sender, State
 from acsard.values import NS_PER_S, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
 """Senders remembered of one source; nobody pushes out one that is live and may drive."""
 
-Objection = Literal["", "unknown_source", "not_finite", "crowded", "stale"]
+Objection = Literal["", "unknown_source", "not_finite", "crowded", "unproven", "stale"]
 """What a command is refused for; "" when it counts."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
@@ -40,11 +40,13 @@ class Choice(Struct, frozen=True):
 class _Source:
     """One configured source and its senders."""
 
-    def __init__(self, settings: Source, neutral_first: bool) -> None:
+    def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
         self.name, self.priority = settings.name, settings.priority
+        self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
-        self.neutral = Wait("neutral", settings.name, settings.timeout)
-        self._first: State = "unheard" if neutral_first else "free"
+        self.neutral = Wait("neutral", settings.name, pause)
+        self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
+        self.first: State = "unheard" if neutral_first else "free"
         self.senders: dict[str, Sender] = {}
 
     def sender(self, name: str, now_ns: int) -> Sender | None:
@@ -56,7 +58,7 @@ class _Source:
                 if self._account(least, now_ns)[0]:
                     return None
                 del self.senders[least]
-            known = self.senders[name] = Sender(self.timeout_ns, self._first)
+            known = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.first)
         return known
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
@@ -78,14 +80,20 @@ class _Source:
     def forget(self) -> None:
         """Every sender must be neutral once before it drives again."""
         for sender in self.senders.values():
-            sender.forget(self._first)
+            sender.forget(self.first)
+
+    def doubtful(self, now_ns: int) -> bool:
+        """Commands come in that do not count for when they were sent."""
+        return any(sender.doubtful(now_ns) for sender in self.senders.values())
 
 
 class Arbiter:
     """Holds the latest command of each sender and chooses whose is followed."""
 
     def __init__(self, commands: CommandsConfig) -> None:
-        self._sources = {s.name: _Source(s, commands.neutral_first) for s in commands.sources}
+        self._sources = {
+            s.name: _Source(s, commands.neutral_first, commands.pause) for s in commands.sources
+        }
         self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
         self._holder: _Source | None = None
         self._since_ns = 0
@@ -107,33 +115,40 @@ class Arbiter:
         source = self._sources.get(command.source)
         if source is None:
             return "unknown_source"
-        twist = command.twist
-        objection: Objection = ""
+        twist, known = command.twist, source.senders.get(command.sender)
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            objection = "not_finite"
-        elif self._freshness.stale(command, source.timeout_ns):
-            objection = "stale"
-        if objection:
             self.notice(command.source, command.sender, command.arrived_ns)
-            return objection
-        sender = source.sender(command.sender, command.arrived_ns)
+            return "not_finite"
+        verdict = self._freshness.judge(command, source.timeout_ns)
+        if verdict == "stale":
+            if known is not None:
+                known.notice(command.arrived_ns)
+                known.doubted_ns = command.arrived_ns
+            return "stale"
+        sender = known or source.sender(command.sender, command.arrived_ns)
         if sender is None:
             return "crowded"
-        sender.take(command, self._since_ns)
-        return ""
+        if verdict == "set":
+            sender.forget(source.first)
+        elif verdict == "first":
+            sender.unlearn()
+        counts = verdict in ("fresh", "set")
+        sender.take(command, self._since_ns, counts=counts)
+        return "" if counts else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """A command that could not even be read: no sender who does that is silent."""
         known = self._sources.get(source)
         if known is not None and sender in known.senders:
-            known.senders[sender].noticed_ns = arrived_ns
+            known.senders[sender].notice(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:
         """Whose command counts now, and which."""
         live = [(source, found[0]) for source in self._ranking if (found := source.live(now_ns))]
         if not live:
             self._holder = None
-            return Choice()
+            doubtful = (source.proof for source in self._ranking if source.doubtful(now_ns))
+            return Choice(wait=next(doubtful, COMMAND))
         source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
         self._holder = source
         if sender.state != "free":
@@ -152,7 +167,7 @@ class Arbiter:
     def _waits_for(self, source: _Source, now_ns: int) -> Wait:
         holder, live = self._holder, source.live(now_ns)
         if not live:
-            return COMMAND
+            return source.proof if source.doubtful(now_ns) else COMMAND
         if live[0].state != "free":
             return source.neutral
         if holder is None or source is holder:

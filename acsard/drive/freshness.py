@@ -1,86 +1,144 @@
-"""Is a stamped command late, compared with the promptest by the same clock? Too late is stale.
+"""Is a stamped command fresh? By two clocks that nobody has compared.
 
-No clock has to be synchronised (`mcu/promptest.py`), and a clock step here does not matter because
-the arrival is monotonic. One who returns from a long silence with much greater delays has either
-set the clock back or pours out what the network held: only delays that stay the same tell the
-first. What is known of a clock:
+Arrival less departure holds the delay and how far the clocks are apart. That nobody knows, but the
+promptest delay so far tells how much longer this one took. Whose promptest is to be believed must
+first have shown steady delays: a backlog's fall while it pours out, a prompt sender's stay.
 
-    known    its promptest command is believed
-    proving  late after a long silence: it may prove a new promptest
+    new      not heard before, or not for long
+    known    its promptest delay is believed
+    stepped  too late or too early by that: held up on the way, or its clock was set
 
+No clock has to be synchronised, and a step of ours does not matter: arrivals are monotonic.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Command
-
-FORGET_NS = 10 * NS_PER_S
-"""A clock not heard of for this long may prove a new minimum: it may have been set."""
-
-PROVEN_NS = 2 * NS_PER_S
-STEADY_NS = NS_PER_S // 10
-"""It has when its delays stay within 0.1 s of each other for 2 s; a backlog's fall faster."""
 
 DRIFT = 2e-4
 """How much faster than the sender's clock ours may run; twice what a bad crystal does."""
 
+FORGET_NS = 250 * NS_PER_S
+"""After so long a silence the drift may be 50 ms: who comes back is as good as new."""
+
+EARLY_NS = NS_PER_S // 20
+"""What falls by more than this is no jitter: a backlog that pours out, or a clock set forward."""
+
+STEADY, SLEWED = 0.01, 0.1
+"""By which share of the time delays may change and still be steady: of a clock whose delay jumped
+or was never known, and of one that crept away, as it does while NTP slews it (by 8 %)."""
+
+JITTER_NS = NS_PER_S // 200
+"""Creeping is what changes by no more than this beside that share."""
+
+LONGEST_PROOF_NS = 2 * NS_PER_S
+"""A proof takes the timeout of the source, but no longer than this."""
+
+GAP_NS = 2 * NS_PER_S
+"""Who is silent for longer begins the proof again."""
+
 MAX_CLOCKS = 1024
 """Clocks remembered at once; the one heard of longest ago goes first."""
 
-State = Literal["known", "proving"]
-Sign = Literal["usual", "returned", "prompt", "wavering", "steady", "proven"]
+State = Literal["new", "known", "stepped"]
+Sign = Literal["usual", "wavering", "steady", "proven"]
+Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
+"""`fresh` counts. `unproven` does not yet, nor does `first`, with which a proof begins. `set`
+counts: the clock has been set, and who set it begins anew."""
 
-NEXT: dict[tuple[State, Sign], State] = {
-    ("known", "usual"): "known",
-    ("known", "prompt"): "known",
-    ("known", "returned"): "proving",
-    ("proving", "returned"): "proving",  # silent again: from here
-    ("proving", "wavering"): "proving",  # as a backlog's delays: from here
-    ("proving", "steady"): "proving",
-    ("proving", "prompt"): "known",  # as prompt as ever: nothing to prove
-    ("proving", "proven"): "known",  # it was set: the promptest since then is believed
+NEXT: dict[tuple[State, Sign], tuple[State, Verdict]] = {
+    ("new", "wavering"): ("new", "first"),
+    ("new", "steady"): ("new", "unproven"),
+    ("new", "proven"): ("known", "fresh"),
+    ("known", "usual"): ("known", "fresh"),
+    ("known", "wavering"): ("stepped", "stale"),
+    ("stepped", "usual"): ("known", "fresh"),  # as prompt as ever: nothing to prove
+    ("stepped", "wavering"): ("stepped", "stale"),
+    ("stepped", "steady"): ("stepped", "stale"),
+    ("stepped", "proven"): ("known", "set"),
 }
-"""What a command shows of its clock, and what that leads to."""
+"""What a command shows of its clock: where that leads, and what becomes of the command."""
+
+
+class _Proof:
+    """Whether delays are steady, from the one it began with on."""
+
+    def __init__(self) -> None:
+        self._share = STEADY
+        self._first = self._delay = self._since_ns = self._heard_ns = 0
+        self._met_ns: int | None = None
+        """When a delay was first met again: what falls passes each but once."""
+
+    def begin(self, delay: int, at_ns: int, share: float = STEADY) -> Sign:
+        """From this command on."""
+        self._share, self._first = share, delay
+        self._look_from(delay, at_ns)
+        return "wavering"
+
+    def _look_from(self, delay: int, at_ns: int) -> None:
+        self._delay, self._since_ns, self._heard_ns, self._met_ns = delay, at_ns, at_ns, None
+
+    def add(self, delay: int, at_ns: int, timeout_ns: int) -> Sign:
+        """One more; what wavers begins it again.
+
+        So does what falls a little, but as no more than the jitter of what came before.
+        """
+        more, lasted_ns = delay - self._delay, at_ns - self._since_ns
+        silence, self._heard_ns = at_ns - self._heard_ns, at_ns
+        allowed = self._share * lasted_ns
+        if more > timeout_ns or silence > GAP_NS or delay < self._first - EARLY_NS:
+            return self.begin(delay, at_ns, self._share)
+        if more < -allowed:
+            self._look_from(delay, at_ns)
+            return "steady"
+        if more > allowed:
+            return "steady"  # jitter, unless none is as prompt again
+        if self._met_ns is None:
+            self._met_ns = at_ns
+        needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
+        met_again = at_ns - self._met_ns >= needed_ns // 2
+        return "proven" if met_again and lasted_ns >= needed_ns else "steady"
 
 
 class _Clock:
     """What is known of one clock, by the commands it stamped."""
 
-    def __init__(self, stamp_ns: int, arrived_ns: int) -> None:
-        self._state: State = "known"
-        self._promptest = Promptest(DRIFT)
-        self._stamp_ns, self._heard_ns = stamp_ns, arrived_ns
-        self._least = self._most = self._since_ns = 0
-        """The delays since when it has been proving."""
+    def __init__(self, at_ns: int) -> None:
+        self._state: State = "new"
+        self._promptest = 0.0
+        """The believed delay, as it may be by now."""
+        self._late = self._early = 0.0
+        """By how much the last one came later; by how much lately some came ever earlier."""
+        self._heard_ns = at_ns
+        self._proof = _Proof()
+        self._proof.begin(0, at_ns - GAP_NS - 1)  # too long ago: the first heard begins it
 
-    def late_ns(self, stamp_ns: int, arrived_ns: int) -> float:
-        """How late this command came."""
-        silence, delay = arrived_ns - self._heard_ns, arrived_ns - stamp_ns
-        self._promptest.add(silence, stamp_ns - self._stamp_ns)
-        self._stamp_ns, self._heard_ns = stamp_ns, arrived_ns
-        sign = self._sign(silence, delay)
-        self._state = NEXT[self._state, sign]
-        if sign in ("returned", "wavering"):
-            self._least, self._most, self._since_ns = delay, delay, arrived_ns
-        elif sign == "proven":
-            self._promptest.late = delay - self._least
-        return self._promptest.late
-
-    def _sign(self, silence: int, delay: int) -> Sign:
-        prompt = self._promptest.late <= STEADY_NS
+    def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
+        """What to do with a command that took so long by the two clocks."""
+        silence, self._heard_ns = at_ns - self._heard_ns, at_ns
         if silence > FORGET_NS:
-            return "prompt" if prompt else "returned"
-        if self._state == "known":
+            self._state = "new"
+        sign = self._sign(delay, at_ns, silence, timeout_ns)
+        self._state, verdict = NEXT[self._state, sign]
+        if sign == "proven":
+            self._promptest, self._late, self._early = delay, 0.0, 0.0
+        return verdict
+
+    def _sign(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Sign:
+        if self._state == "new":
+            return self._proof.add(delay, at_ns, timeout_ns)
+        self._promptest += DRIFT * silence
+        before, self._late = self._late, delay - self._promptest
+        early = max(0.0, self._early - SLEWED * silence) + max(0.0, -self._late)
+        if self._late <= timeout_ns and early <= EARLY_NS:
+            self._promptest, self._early = min(self._promptest, delay), early
             return "usual"
-        self._least, self._most = min(self._least, delay), max(self._most, delay)
-        if self._most - self._least > STEADY_NS:
-            return "wavering"
-        if prompt:
-            return "prompt"
-        return "proven" if self._heard_ns - self._since_ns >= PROVEN_NS else "steady"
+        if self._state == "stepped":
+            return self._proof.add(delay, at_ns, timeout_ns)
+        crept = abs(self._late - before) <= SLEWED * silence + JITTER_NS
+        return self._proof.begin(delay, at_ns, SLEWED if crept else STEADY)
 
 
 class Freshness:
@@ -89,17 +147,13 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
 
-    def stale(self, command: Command, timeout_ns: int) -> bool:
-        """The command came later than its clock's promptest by more than the timeout."""
+    def judge(self, command: Command, timeout_ns: int) -> Verdict:
+        """What to do with a command; without a stamp it is as old as its arrival."""
         if command.stamp_ns is None:
-            return False
-        name = command.clock or command.source
-        return self.late_ns(name, command.stamp_ns, command.arrived_ns) > timeout_ns
-
-    def late_ns(self, name: str, stamp_ns: int, arrived_ns: int) -> float:
-        """By how much this command came later than the clock's promptest one, ns."""
-        clock = self._clocks.pop(name, None) or _Clock(stamp_ns, arrived_ns)
+            return "fresh"
+        name, at_ns = command.clock or command.source, command.arrived_ns
+        clock = self._clocks.pop(name, None) or _Clock(at_ns)
         self._clocks[name] = clock
         if len(self._clocks) > MAX_CLOCKS:
             del self._clocks[next(iter(self._clocks))]
-        return clock.late_ns(stamp_ns, arrived_ns)
+        return clock.judge(at_ns - command.stamp_ns, at_ns, timeout_ns)

@@ -9,15 +9,16 @@ REFUSED = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
     "crowded": f"{MAX_SENDERS} other senders of this source are live",
-    "stale": "held up on the way for longer than the source's timeout (or the sender's clock was "
-    "set back: let it pause for 10 s, then send on)",
+    "unproven": "of a sender whose clock is not known yet: counts once its delays are steady",
+    "stale": "held up on the way for longer than the source's timeout, or the sender's clock was "
+    "set: counts once its delays are steady",
 }
 """What a command is refused for."""
 
 
 def chosen(choice: Choice) -> str:
     """Whose command is followed, or why nobody's is."""
-    if not choice.source:
+    if choice.wait.what == "command":
         return "no commands: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
@@ -29,10 +30,15 @@ def waiting(wait: Wait) -> str:
             return ""
         case "command":
             return "a command"
+        case "proof":
+            return (
+                f"{wait.source} may be late: its delays must be steady for {wait.seconds:g} s, "
+                "since its clock is new here or was set"
+            )
         case "neutral":
             return (
                 f"neutral first: {wait.source} must send a zero, or pause for "
-                f"{wait.timeout:g} s, before it can drive"
+                f"{wait.seconds:g} s, before it can drive"
             )
         case "higher":
             return f"{wait.source} has the higher priority: until it is silent"

@@ -12,10 +12,10 @@ import os
 import sys
 from typing import Final
 
+from acsard.host import clock
 from acsard.values import NS_PER_S
 
 CLOCK_MONOTONIC: Final = 1
-_ABSTIME: Final = 1
 _FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -28,7 +28,10 @@ class _Itimerspec(ctypes.Structure):
 
 
 class TimerFd:
-    """One timer on the monotonic clock; `fileno` becomes readable when it expires."""
+    """One timer; `fileno` becomes readable when it expires.
+
+    The kernel has none on the clock we read: what is set is how long to wait from now.
+    """
 
     def __init__(self) -> None:
         self._libc = ctypes.CDLL(None, use_errno=True)
@@ -40,12 +43,11 @@ class TimerFd:
         """The descriptor to wait on."""
         return int(self._fd)
 
-    def set(self, at_ns: int, period_ns: int = 0) -> None:
-        """Expire at monotonic `at_ns`, then every `period_ns` if that is not 0."""
-        spec = _Itimerspec(
-            _Timespec(*divmod(period_ns, NS_PER_S)), _Timespec(*divmod(max(1, at_ns), NS_PER_S))
-        )
-        if self._libc.timerfd_settime(self._fd, _ABSTIME, ctypes.byref(spec), None) < 0:
+    def set(self, at_ns: int) -> None:
+        """Expire at monotonic `at_ns`, once."""
+        wait_ns = max(1, at_ns - clock.mono_ns())
+        spec = _Itimerspec(_Timespec(0, 0), _Timespec(*divmod(wait_ns, NS_PER_S)))
+        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(spec), None) < 0:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:

@@ -13,15 +13,18 @@ from msgspec import UNSET, Struct, UnsetType
 
 from acsard.config.settings import JointsConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import GID_BYTES, unpack
-from acsard.values import REST, Command, Pose, Request, Verb, WheelSpeeds
+from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
 from acsard.values import Twist as BodyTwist
 
 MAX_COMMAND_BYTES = 4096
 """A TwistStamped is under 300 bytes as JSON; more than this is not a command."""
 
+REPLACED_NS = NS_PER_S // 2
+"""Zenoh replaces timestamps that are further ahead of our clock."""
 
 Via = Literal["native", "bridge", "rmw"]
 """The tree a sample or query came by."""
@@ -39,11 +42,13 @@ class Arrival(Struct, frozen=True):
     encoding: str
     arrived_ns: int
     stamp_ns: int | None
-    """Zenoh's own timestamp, when it is the sender's."""
+    """Zenoh's timestamp, when it is the sender's."""
     sender: str
     """Whose that is; "" without one."""
     via: Via = "native"
     attachment: bytes = b""
+    received_ns: int | None = None
+    """Zenoh's timestamp, when it is our own: there was none, or one too far ahead of our clock."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
@@ -83,17 +88,28 @@ class Receiver:
             raise DecodeError("not_a_put", "a DELETE is not a command")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
-        stamp_ns, clock = _stamp(arrival)
+        said = voice(arrival)
+        stamp_ns, clock = said.stamp_ns, said.sender
         if kind == "cmd":
             twist, header, cancelled = self._twist(arrival)
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
         if header is not None and header.stamp.to_ns() > 0:
-            # Another clock than the envelope's, which may be a router's for many: its own name.
+            # Another clock than the envelope's: its own name.
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
+        ours = arrival.received_ns
         return Command(
-            source, twist, arrival.arrived_ns, stamp_ns, clock, sender(arrival), cancelled
+            source,
+            twist,
+            arrival.arrived_ns,
+            stamp_ns,
+            clock,
+            said.sender,
+            cancelled,
+            said.sequence,
+            shared=arrival.via == "bridge" and not said.signed,
+            stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
@@ -147,21 +163,39 @@ class Receiver:
         return Request(verb, ticket, Pose(got.x, got.y, got.yaw), asked_ns)
 
 
-def _stamp(arrival: Arrival) -> tuple[int | None, str]:
-    """When it was sent by whose clock, as far as its envelope says; raises `DecodeError`."""
+class Voice(Struct, frozen=True):
+    """Who sent a sample, when and as which of its own, as far as that can be told."""
+
+    sender: str
+    stamp_ns: int | None = None
+    sequence: int | None = None
+    signed: bool = False
+    """By an attachment of its own."""
+
+
+def voice(arrival: Arrival) -> Voice:
+    """By our attachment, else rmw's, else Zenoh's timestamp, else just the key.
+
+    A bridge says nothing of the ROS node behind it: all those of a source are one. Raises
+    `DecodeError`.
+    """
     if arrival.via == "rmw":
-        return unpack(arrival.attachment).stamp_ns, sender(arrival)
-    return arrival.stamp_ns, arrival.sender or f"{arrival.via}/{arrival.key}"
+        rmw = unpack(arrival.attachment)
+        return Voice(rmw.gid.hex(), rmw.stamp_ns, rmw.sequence, signed=True)
+    told = signature.unpack(arrival.attachment)
+    if told is not None:
+        stamp_ns = arrival.stamp_ns if told.stamp is None else told.stamp
+        return Voice(told.sender, stamp_ns, told.sequence, signed=True)
+    if arrival.sender:
+        return Voice(arrival.sender, arrival.stamp_ns)
+    return Voice(f"{arrival.via}/{arrival.key.partition('/')[2]}", arrival.stamp_ns)
 
 
 def sender(arrival: Arrival) -> str:
-    """Who sent it: the rmw publisher, the session that stamped it, or else just the source.
-
-    A bridge says nothing of the ROS node behind it: all those of a source are one.
-    """
+    """Who sent it, also where the attachment of an rmw cannot be read."""
     if arrival.via == "rmw":
         return arrival.attachment[-GID_BYTES:].hex()
-    return arrival.sender or f"{arrival.via}/{arrival.key.partition('/')[2]}"
+    return voice(arrival).sender
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 from acsard.runtime.period import Period
 
@@ -61,16 +62,20 @@ class Ticker(_Timer):
 
     def start(self, now_ns: int) -> None:
         """Begin; the first period ends one period from now."""
-        self._due_ns = now_ns
-        self._timer.set(now_ns + self._period_ns, self._period_ns)
+        self._due_ns = now_ns + self._period_ns
+        self._timer.set(self._due_ns)
 
     def take(self) -> Period:
         """The periods that ended since the last call."""
         expired, self._expired = self._expired, 0
-        due_ns = self._due_ns + self._period_ns
+        due_ns = self._due_ns
         self._due_ns += expired * self._period_ns
         return Period(expired, due_ns)
 
     def _expire(self) -> None:
-        self._expired += self._timer.expirations()
+        self._timer.expirations()
+        # By our clock: while NTP slews the timer's, it goes off up to a tenth too early.
+        passed_ns = clock.mono_ns() - self._due_ns + self._period_ns // 10
+        self._expired = passed_ns // self._period_ns + 1
+        self._timer.set(self._due_ns + self._expired * self._period_ns)
         self._wake()

@@ -12,6 +12,7 @@ from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import Attachment
 from acsard.values import NS_PER_S
+from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
 
 
@@ -29,9 +30,12 @@ def test_a_source_that_never_sent_a_zero_does_not_move_the_robot(world: World) -
     assert "app" in world.state.reason
 
 
-def test_a_source_that_paused_for_its_timeout_may_drive(world: World) -> None:
+def test_a_source_that_paused_for_more_than_a_second_may_drive(world: World) -> None:
     world.hold(0.5, seconds=0.5)
-    world.run(0.3)
+    world.run(0.9)  # and the 0.05 s until the next was due
+    world.hold(0.5, seconds=0.5)
+    assert world.state.mode == "ready"
+    world.run(1.1)
     world.hold(0.5, seconds=0.5)
     assert world.state.mode == "driving"
 
@@ -200,6 +204,28 @@ def test_a_sender_whose_clock_is_a_day_off_drives_all_the_same(world: World) -> 
     assert world.state.mode == "driving"
 
 
+def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count() -> None:
+    world = World()
+    world.run(0.2)
+    client = Speaker(world, "signed", ahead=-3600.0)
+    client.hold(0.0, 0.2)
+    assert "app may be late: its delays must be steady for 0.25 s" in world.state.reason
+    assert "app may be late" in {s.name: s.waits_for for s in world.state.sources}["app"]
+    assert world.state.counters["command_unproven"] == 4
+    client.hold(0.4, 0.3)
+    assert world.state.mode == "driving"
+
+
+def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> None:
+    client = Speaker(world, "signed", ahead=0.4)
+    client.open()
+    assert "stamps_replaced" not in world.state.counters
+    ahead = Speaker(world, "signed", "b", ahead=3600.0)
+    world.run(0.5)
+    ahead.open()
+    assert world.state.counters["stamps_replaced"] == 40
+
+
 def test_the_wall_clock_may_step_without_changing_the_path() -> None:
     worlds = World(), World()
     for i, world in enumerate(worlds):
@@ -334,7 +360,9 @@ def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
         assert world.state.linear == 0.0
     assert world.state.x == x
     assert waits_for(world).startswith("neutral first: nav must send a zero")
-    holding.send(0.0)
+    for _ in range(30):
+        holding.send(0.0)
+        world.run(0.05)
     holding.drive(0.4)
 
 
@@ -441,7 +469,7 @@ def test_one_who_sends_nonsense_for_a_while_was_not_silent(
     world.run(0.05)
     assert world.state.linear == 0.0
     assert waits_for(world).startswith("neutral first")
-    world.run(0.3)  # now it was
+    world.run(1.2)  # now it was
     for _ in range(10):
         person.send(0.5)
         world.run(0.05)
@@ -460,7 +488,8 @@ def test_wheel_speeds_that_cancel_out_do_not_arm_their_sender(world: World) -> N
         send(8.0, 8.0, 8.0, 8.0)
     assert world.state.mode == "ready"
     assert waits_for(world, "app").startswith("neutral first")
-    send(0.0, 0.0, 0.0, 0.0)
+    for _ in range(6):
+        send(0.0, 0.0, 0.0, 0.0)
     for _ in range(10):
         send(8.0, 8.0, 8.0, 8.0)
     assert world.state.mode == "driving"

@@ -418,7 +418,7 @@ def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
     for _ in range(15):
         world.drive(0.9, 0.9, seconds=1.0)
         here = (world.state.x, world.state.y)
-        assert math.dist(here, last) < 1.0
+        assert math.dist(here, last) < 1.3
         last = here
     world.send(0.0)
     world.run(1.5)

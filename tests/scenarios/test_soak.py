@@ -21,6 +21,7 @@ import pytest
 from acsard.config.settings import CommandsConfig, Config, ControlConfig, Source
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Outputs
+from tests.scenarios.speakers import NUMBERED, STAMPED, Speaker, Way, backlog, moved
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -441,3 +442,218 @@ def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count
     )
     assert missed == 0
     assert disturbed == undisturbed
+
+
+# f. backlogs
+
+
+def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
+    """A backlog of one who has ended since comes in: it moves the robot."""
+    world = quiet_bus(World())
+    world.run(0.3)
+    ahead = dice.choice((0.0, 0.3, -0.3, -2.0, 2.0, -3600.0, 86400.0))
+    # Zenoh's own stamp does not survive being ahead: its sender is unstamped then.
+    speaker = Speaker(world, way, ahead=min(0.0, ahead) if way == "zenoh" else ahead)
+    if running:
+        speaker.open()
+        speaker.hold(0.0, 1.0)
+        if dice.random() < 0.5:
+            world.call("stop")
+            world.call("clear")
+    world.run(1.0)
+    while True:
+        age, span, poured = (dice.uniform(*limits) for limits in ((0.3, 60), (0.3, 60), (0.1, 20)))
+        if abs(span / poured - 1) > 0.011:
+            break  # at the pace it was sent it is a clock that is behind, as far as can be told
+    since_ns = world.now_ns
+    world.run(age if running else 0.0)
+    backlog(dice, speaker, age, span, poured)
+    return moved(world, since_ns)
+
+
+@pytest.mark.parametrize("count", [24, long(500, 1800)])
+def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
+    count: int,
+) -> None:
+    dice, kept, seen = random.Random(7), 0, Counter[str]()
+    for trial in range(count):
+        way, running = STAMPED[trial % len(STAMPED)], trial % 8 >= 4
+        still = not poured_out(dice, way, running)
+        kept += still
+        seen[f"{way}, {'running' if running else 'fresh'}"] += not still
+    print(f"\nbacklogs: {count - kept} of {count} moved the robot {dict(+seen)}")
+    assert kept == count
+
+
+# g. clocks of senders
+
+
+def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
+    """It sends speeds for so long, then zeros, then drives."""
+    speaker.hold(0.4, within)
+    speaker.hold(0.0, 0.5)
+    speaker.hold(0.4, 0.5)
+    return world.state.mode == "driving"
+
+
+def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
+    """Its clock is set by `step` seconds while it drives and a cut follows; what went wrong."""
+    world = quiet_bus(World())
+    world.run(0.3)
+    speaker = Speaker(world, way, ahead=ahead)
+    speaker.open()
+    speaker.ahead += step
+    if not driving_again(world, speaker):
+        return f"does not drive again: {world.state.reason}"
+    # What the network holds now is stale, whatever the clock was before.
+    cut = dice.uniform(0.6, 8.0)
+    held, end_ns = [], world.now_ns + int(cut * NS_PER_S)
+    while world.now_ns < end_ns:
+        held.append(speaker.message(-0.5))
+        world.run(0.05)
+    since_ns = world.now_ns
+    for message in held[:-6]:
+        speaker.deliver(message)
+        world.run(0.001)
+    if any(at >= since_ns and min(wheels(line)) < 0 for at, line in world.port.sent):
+        return "what was stale moved it"
+    speaker.hold(0.4, 0.3)
+    return "" if driving_again(world, speaker) else f"after the cut: {world.state.reason}"
+
+
+@pytest.mark.parametrize("count", [16, long(400, 1800)])
+def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
+    dice, wrong = random.Random(8), Counter[str]()
+    for trial in range(count):
+        way = STAMPED[trial % len(STAMPED)]
+        ahead = dice.choice((-1, 1)) * dice.choice((0.0, 0.3, 2.0, 3600.0, 86400.0))
+        step = dice.choice((-1, 1)) * dice.choice((0.1, 0.3, 1.0, dice.uniform(0.1, 10.0)))
+        if way == "zenoh":  # one that is ahead is unstamped, as Zenoh replaces it
+            ahead = -abs(ahead) - 10.0
+        found = stepped(dice, way, ahead, step)
+        wrong[found] += bool(found)
+    print(f"\nclocks set: {count} by 0.1 to 10 s, wrong: {dict(+wrong)}")
+    assert not +wrong
+
+
+@pytest.mark.parametrize("rate", [0.92, 1.08])
+@pytest.mark.parametrize("way", STAMPED)
+def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
+    way: Way, rate: float
+) -> None:
+    world = quiet_bus(World())
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    speaker.open()
+    speaker.slew(rate)
+    assert driving_again(world, speaker, 5.0), world.state.reason
+    speaker.hold(0.4, 6.0)
+    speaker.slew(1.0)
+    assert driving_again(world, speaker), world.state.reason
+
+
+@pytest.mark.parametrize("ahead", [-86400.0, -3600.0, -2.0, -0.3, 0.3, 2.0, 3600.0, 86400.0])
+@pytest.mark.parametrize("way", ["signed", "rmw", "header", "zenoh"])
+def test_two_senders_never_arm_each_other_whatever_their_clocks(way: Way, ahead: float) -> None:
+    world = quiet_bus(World())
+    world.run(0.3)
+    holding, other = Speaker(world, way, "a", ahead), Speaker(world, way, "b", ahead)
+    holding.open()
+    for verb in ("stop", "clear"):
+        holding.hold(0.4, 1.0)
+        assert world.call(verb).success
+    since_ns = world.now_ns
+    for number in range(60):
+        holding.send(0.4)
+        if number in (5, 6, 7, 30):
+            other.send(0.0)
+        world.run(0.05)
+    assert not moved(world, since_ns)
+
+
+# h. what neutral is
+
+RATES_HZ = (3.8, 5.0, 10.0, 50.0)
+
+
+def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
+    """One who never lets go, through stop and clear, and then this: it moves the robot."""
+    world = quiet_bus(World())
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    speaker.open(hz=10.0)
+    speaker.hold(0.5, 2.0, hz)
+    for verb in ("stop", "clear"):
+        speaker.hold(0.5, dice.uniform(0.5, 2.0), hz)
+        assert world.call(verb).success
+    since_ns = world.now_ns
+    other = Speaker(world, way, "a" if way in ("plain", "bridge") else "b")
+    for _ in range(dice.randrange(2, 5)):
+        speaker.hold(0.5, dice.uniform(0.5, 2.0), hz)
+        if kind == "stalls":
+            world.run(dice.uniform(0.1, 0.9))
+        elif kind == "cuts":
+            for _ in range(max(1, round(dice.uniform(0.3, 10.0) * hz))):
+                speaker.message(0.5)  # lost
+                world.run(1 / hz)
+        elif kind == "another":
+            zeros = dice.randrange(1, 6)
+            for number in range(round(3 * hz)):
+                speaker.send(0.5)
+                at = dice.uniform(0.0, 1.0) / hz
+                world.run(at)
+                if zeros > number:
+                    other.send(0.0)
+                world.run(1 / hz - at)
+    speaker.hold(0.5, 1.5, hz)
+    return moved(world, since_ns)
+
+
+@pytest.mark.parametrize("count", [6, long(100, 1800)])
+@pytest.mark.parametrize("kind", ["steady", "stalls", "cuts", "another"])
+def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> None:
+    dice, found = random.Random(9), Counter[str]()
+    # A cut that loses all is a pause as far as one can tell who does not number what it sends.
+    ways: tuple[Way, ...] = NUMBERED if kind == "cuts" else (*STAMPED, "plain", "bridge")
+    for trial in range(count * len(RATES_HZ)):
+        way, hz = ways[trial // len(RATES_HZ) % len(ways)], RATES_HZ[trial % len(RATES_HZ)]
+        found[f"{way} at {hz:g} Hz"] += stuck(dice, way, hz, kind)
+    print(f"\n{kind}: {found.total()} of {count * len(RATES_HZ)} moved the robot {dict(+found)}")
+    assert not +found
+
+
+def test_another_s_zeros_while_a_bridged_sender_is_stalled_do_not_set_it_off() -> None:
+    dice, found = random.Random(10), 0
+    for trial in range(12):
+        world = quiet_bus(World())
+        world.run(0.3)
+        speaker, hz = Speaker(world, "bridge"), RATES_HZ[trial % 4]
+        speaker.open(hz=10.0)
+        speaker.hold(0.5, 2.0, hz)
+        for verb in ("stop", "clear"):
+            speaker.hold(0.5, 1.0, hz)
+            assert world.call(verb).success
+        since_ns = world.now_ns
+        speaker.hold(0.5, 0.5, hz)
+        stall = dice.uniform(0.3, 0.9)
+        world.run(stall * 0.9)
+        speaker.send(0.0)
+        world.run(stall * 0.1)
+        speaker.hold(0.5, 1.5, hz)
+        found += moved(world, since_ns)
+    assert found == 0
+
+
+@pytest.mark.parametrize("way", [*STAMPED, "plain"])
+def test_a_key_pressed_again_after_more_than_a_second_s_rest_just_drives(way: Way) -> None:
+    world = quiet_bus(World())
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    speaker.open()
+    for verb in ("stop", "clear"):
+        assert world.call(verb).success
+    speaker.hold(0.4, 1.0)
+    assert world.state.mode == "ready"
+    world.run(1.1)
+    speaker.hold(0.4, 0.5)
+    assert world.state.mode == "driving"

@@ -26,6 +26,9 @@ from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
+LET_GO_NS = 4 * NS_PER_S // 10
+"""A zero counts so long after a speed, for commanders of 5 Hz and more."""
+
 
 class VirtualPort:
     """A serial port to the fake MCU that can be unplugged and blocked."""
@@ -131,6 +134,8 @@ class World:
             lambda: self.now_ns,
         )
         self._queries = 0
+        self._moved_ns: dict[str, int] = {}
+        """When a speed was last sent, by source."""
         self.steps = 0
         self._alarm_ns: int | None = None
         self._alarm_set_ns: int | None = None
@@ -197,6 +202,8 @@ class World:
         self, linear: float, angular: float = 0.0, source: str = "app", stamp_ns: int | None = None
     ) -> None:
         """One Twist as JSON, as any client would put it."""
+        if linear or angular:
+            self._moved_ns[source] = self.now_ns
         payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
         self.put(f"cmd/{source}", payload, stamp_ns=stamp_ns)
 
@@ -215,7 +222,11 @@ class World:
         source: str = "app",
         hz: float = 20.0,
     ) -> None:
-        """Open with a zero, then send the twist at `hz` for so long."""
+        """Open with a zero, or as many as are neutral now; then the twist at `hz` for so long."""
+        let_go_ns = self._moved_ns.get(source, 0) + LET_GO_NS
+        while self.now_ns < let_go_ns:
+            self.send(0.0, 0.0, source)
+            self.run(1 / hz)
         self.send(0.0, 0.0, source)
         self.run(1 / hz)
         self.hold(linear, angular, seconds, source, hz)

@@ -169,8 +169,12 @@ def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
 
     # The source's own clock is known from here on.
     heard = bus.count("commands")
-    bus.session.put("acsard/acsar/cmd/app", stamped(0.0).replace(b"0.5", b"0.0"))
-    until(lambda: bus.count("commands") > heard, 5.0, "a stamped zero")
+
+    def counted() -> bool:
+        bus.session.put("acsard/acsar/cmd/app", stamped(0.0).replace(b"0.5", b"0.0"))
+        return bus.count("commands") > heard
+
+    until(counted, 5.0, "stamped zeros")
     refused_without_motion(bus, send, "stale", "held up on the way")
 
 

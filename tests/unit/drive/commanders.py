@@ -21,8 +21,14 @@ LOW = Source("low", 10)
 class Bench:
     """An arbiter and its time; `offset_ns` is how far the senders' clocks are ahead."""
 
-    def __init__(self, *sources: Source, neutral_first: bool = True, armed: bool = True) -> None:
-        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources))
+    def __init__(
+        self,
+        *sources: Source,
+        neutral_first: bool = True,
+        armed: bool = True,
+        pause: float = 1.0,
+    ) -> None:
+        self.arbiter = Arbiter(CommandsConfig(neutral_first, pause, sources))
         self.arbiter.require_neutral()
         self.now_ns = 10 * NS_PER_S
         self.offset_ns = 1_800_000_000 * NS_PER_S
@@ -52,6 +58,13 @@ class Bench:
         return self.arbiter.accept(
             Command(source.name, twist, self.now_ns, stamp_ns, clock, sender)
         )
+
+    def known(self, source: Source, clock: str = "", sender: str = "") -> Bench:
+        """Zeros, until the clock that stamps them is known."""
+        for _ in range(60):
+            self.wait(50).stamped(source, 0.0, clock, REST, sender)
+        assert self.stamped(source, 0.0, clock, REST, sender) == ""
+        return self
 
     def unreadable(self, source: Source, sender: str = "") -> None:
         """Something that could not be decoded came from there."""

@@ -273,7 +273,7 @@ def test_a_sender_that_was_never_neutral_holds_its_source_s_place_with_zero() ->
     bench.send(HIGH, GO, "a")
     choice = bench.choice()
     assert (choice.source, choice.twist) == ("high", None)
-    assert bench.status(HIGH).waits_for == Wait("neutral", "high", 0.25)
+    assert bench.status(HIGH).waits_for == Wait("neutral", "high", 1.0)
 
 
 @pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
@@ -309,8 +309,9 @@ def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_h
 
 def test_the_pause_of_one_sender_is_not_cut_short_by_another_nor_made_up_by_it() -> None:
     bench = Bench(HIGH, armed=False)
-    bench.send(HIGH, GO, "a")
-    for _ in range(6):
+    for _ in range(2):
+        bench.wait(50).send(HIGH, GO, "a")
+    for _ in range(22):
         bench.wait(50).send(HIGH, BACK, "b")
     bench.send(HIGH, GO, "a")
     assert bench.choice().twist == GO
@@ -408,10 +409,11 @@ def test_a_crowd_that_sends_zeros_takes_the_robot_from_nobody_who_is_heard_as_of
 
 def test_a_crowd_that_sends_what_cannot_be_read_makes_nobody_forgotten() -> None:
     bench = Bench(HIGH, armed=False)
-    bench.send(HIGH, GO, "a")
+    for _ in range(2):
+        bench.wait(50).send(HIGH, GO, "a")
     for number in range(100):
         bench.wait(1).unreadable(HIGH, f"stranger {number}")
-    bench.wait(251).send(HIGH, GO, "a")
+    bench.wait(951).send(HIGH, GO, "a")
     assert bench.driver() == "high"
 
 

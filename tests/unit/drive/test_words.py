@@ -18,8 +18,13 @@ SENTENCES = [
         "neutral first: slow must send a zero, or pause for 1 s, before it can drive",
     ),
     (
-        Wait("neutral", "high", 0.25),
-        "neutral first: high must send a zero, or pause for 0.25 s, before it can drive",
+        Wait("neutral", "high", 0.5),
+        "neutral first: high must send a zero, or pause for 0.5 s, before it can drive",
+    ),
+    (
+        Wait("proof", "high", 0.25),
+        "high may be late: its delays must be steady for 0.25 s, since its clock is new here or "
+        "was set",
     ),
     (Wait("higher", "high"), "high has the higher priority: until it is silent"),
     (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),
@@ -41,6 +46,11 @@ def test_every_wait_has_its_sentence_above() -> None:
     ("choice", "text"),
     [
         (Choice(), "no commands: no source has sent one within its timeout"),
+        (
+            Choice(wait=Wait("proof", "app", 2.0)),
+            "app may be late: its delays must be steady for 2 s, since its clock is new here or "
+            "was set",
+        ),
         (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
         (
             Choice("app", None, Wait("neutral", "app", 0.25)),

@@ -28,7 +28,7 @@ JOINTS = list(JointsConfig().as_tuple())
 ARRIVED_NS = 77_000_000_000
 AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
         ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
-HEADER_S = "native/cmd/app, header on native/cmd/app"
+HEADER_S = "native/app, header on native/cmd/app"
 """Whose clock the stamp in a message is, when nothing else says who sent it."""
 
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -83,7 +83,7 @@ def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_twist_is_a_command_of_the_source_in_its_key(form: Format) -> None:
     assert command(twist(), form) == Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/cmd/app", "native/app"
+        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/app", "native/app"
     )
 
 
@@ -303,7 +303,7 @@ def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -
     payload = native_twist(header)
     assert len(payload) == 52
     got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/cmd/app", "native/app")
+    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/app", "native/app")
 
 
 @pytest.mark.parametrize("header", ORDERS)
@@ -500,7 +500,7 @@ def test_wheel_commands_are_stamped_the_same_way() -> None:
 
 def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
     assert command(twist(), sender="z1").clock == "z1"
-    assert command(twist(), sender="").clock == "native/cmd/app"
+    assert command(twist(), sender="").clock == "native/app"
 
 
 def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
@@ -663,7 +663,10 @@ def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
 
 def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
-    assert command == Command("nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, GID.hex(), GID.hex())
+    gid = GID.hex()
+    assert command == Command(
+        "nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, gid, gid, sequence=1, shared=False
+    )
 
 
 def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
@@ -694,7 +697,7 @@ def test_by_a_bridge_any_attachment_is_ignored() -> None:
 
 
 def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/cmd/nav"
+    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/nav"
     seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
     assert (seen.stamp_ns, seen.clock) == (SENT_NS, "router")
 
@@ -733,7 +736,8 @@ def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_sen
                 by_ros("bridge", body, key=key, stamp_ns=now_ns, sender="router"), arrived_ns=at_ns
             )
             reasons.append(arbiter.accept(RECEIVER.command(came)))
-    assert set(reasons) == {""}
+    assert set(reasons[:10]) == {"unproven"}
+    assert set(reasons[12:]) == {""}
 
 
 # who speaks
@@ -765,3 +769,54 @@ def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> Non
     assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
     ros = by_ros("rmw", twist())
     assert sender(replace(ros, payload=b"")) == RECEIVER.command(ros).sender
+
+
+# our own attachment
+
+
+def signed(**told: Any) -> bytes:
+    return msgspec.msgpack.encode({"sender": "joystick-7"} | told)
+
+
+def test_our_attachment_says_who_sent_it_when_and_as_which() -> None:
+    told = command(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5)
+    assert (told.sender, told.clock, told.stamp_ns) == ("joystick-7", "joystick-7", 9)
+    assert (told.sequence, told.shared) == (3, False)
+
+
+def test_a_message_s_own_stamp_goes_before_our_attachment_s() -> None:
+    told = command(stamped(12), attachment=signed(stamp=9))
+    assert told.stamp_ns == 12_000_000_000
+    assert told.clock == "joystick-7, header on native/cmd/app"
+    assert told.sender == "joystick-7"
+
+
+def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
+    assert command(twist(), attachment=signed(), sender="z1", stamp_ns=5).stamp_ns == 5
+    assert command(twist(), attachment=signed()).stamp_ns is None
+
+
+def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
+    for attachment in (b"trace", b"{}", b"\x80", signed()[:-1]):
+        assert command(twist(), attachment=attachment).sender == "native/app"
+
+
+def test_by_a_bridge_many_may_look_like_one_unless_they_are_signed() -> None:
+    assert RECEIVER.command(by_ros("bridge", twist())).shared
+    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
+    assert not RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
+    assert not command(twist()).shared
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
+)
+def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_is(
+    ahead_ns: int, replaced: bool
+) -> None:
+    attachment = signed(stamp=SENT_NS + ahead_ns)
+    told = command(twist(), attachment=attachment, received_ns=SENT_NS)
+    assert told.stamp_replaced == replaced
+    assert told.stamp_ns == SENT_NS + ahead_ns
+    assert not command(twist(), attachment=attachment).stamp_replaced
+    assert not command(twist(), received_ns=SENT_NS).stamp_replaced

@@ -1,0 +1,118 @@
+"""Who sends commands over a network that may hold them back, by a clock that may be set."""
+
+from __future__ import annotations
+
+import random
+from typing import Literal
+
+import msgspec
+
+from acsard.incoming.commands import Arrival
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
+from acsard.ros.attachments import Attachment
+from acsard.values import NS_PER_S
+from tests.scenarios.world import World
+
+Way = Literal["signed", "rmw", "header", "zenoh", "plain", "bridge"]
+STAMPED: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
+NUMBERED: tuple[Way, ...] = ("signed", "rmw")
+
+AHEAD_NS = NS_PER_S // 2
+"""Zenoh replaces a timestamp that is further ahead of the receiver's clock by its own."""
+
+
+class Speaker:
+    """One program that commands `app`; `ahead` is by how much its clock is ahead, s."""
+
+    def __init__(self, world: World, way: Way, name: str = "a", ahead: float = 0.0) -> None:
+        self.world, self.way, self.name, self.ahead = world, way, name, ahead
+        self.rate = 1.0
+        """How fast its clock goes, once it is slewed."""
+        self._slewed_ns = world.now_ns
+        self._sent = 0
+
+    def slew(self, rate: float) -> None:
+        """From now on its clock goes so fast."""
+        self.ahead += (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
+        self.rate, self._slewed_ns = rate, self.world.now_ns
+
+    def message(self, linear: float) -> tuple[float, int, int]:
+        """What it sends now: speed, stamp by its clock, number."""
+        self._sent += 1
+        world = self.world
+        slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
+        return linear, int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed), self._sent
+
+    def deliver(self, message: tuple[float, int, int]) -> None:
+        """It arrives now."""
+        linear, stamp_ns, number = message
+        world, way = self.world, self.way
+        twist = Twist(Vector3(linear), Vector3())
+        stamped = TwistStamped(Header(Time.from_ns(stamp_ns)), twist)
+        payload = encode(stamped if way in ("signed", "header") else twist, "cdr")
+        attachment, sender, told_ns = b"", "", None
+        if way == "rmw":
+            attachment = Attachment(number, stamp_ns, self.name.encode().ljust(16)).pack()
+        elif way == "signed":
+            told = {"sender": self.name, "stamp": stamp_ns, "sequence": number}
+            attachment = msgspec.msgpack.encode(told)
+        if way in ("signed", "zenoh") and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
+            sender, told_ns = f"session of {self.name}", stamp_ns
+        via = way if way in ("rmw", "bridge") else "native"
+        kind = "TwistStamped" if way in ("signed", "header") else "Twist"
+        encoding = f"application/cdr;geometry_msgs/msg/{kind}"
+        arrival = Arrival(
+            "cmd/app", True, payload, encoding, world.now_ns, told_ns, sender, via, attachment
+        )
+        if not sender and hasattr(arrival, "received_ns"):
+            arrival = msgspec.structs.replace(arrival, received_ns=world.instant.wall_ns)
+        world.bus.arrivals.append(arrival)
+
+    def send(self, linear: float) -> None:
+        """It sends, and that arrives at once."""
+        self.deliver(self.message(linear))
+
+    def hold(self, linear: float, seconds: float, hz: float = 20.0) -> None:
+        """It sends so often, for so long."""
+        for _ in range(round(seconds * hz)):
+            self.send(linear)
+            self.world.run(1 / hz)
+
+    def open(self, linear: float = 0.4, hz: float = 20.0) -> None:
+        """Zeros for a second, then on from there until it drives."""
+        self.hold(0.0, 1.0, hz)
+        self.hold(linear, 1.0, hz)
+        assert self.world.state.mode == "driving", (self.way, self.world.state.reason)
+
+
+def moved(world: World, since_ns: int) -> bool:
+    """A line that turns a wheel went out since then."""
+    still = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+    return any(at_ns >= since_ns and line != still for at_ns, line in world.port.sent)
+
+
+def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, poured: float) -> None:
+    """What was sent in `span` seconds, the last of it `age` seconds ago, pours in."""
+    world, hz = speaker.world, dice.choice((10.0, 20.0, 50.0))
+    now_ns, held = world.now_ns, []
+    zeros = pauses = 0
+    with_zeros, with_pauses = dice.random() < 0.7, dice.random() < 0.4
+    for number in range(max(2, round(span * hz))):
+        world.now_ns = now_ns - int((age + span - number / hz) * NS_PER_S)
+        if (with_zeros and dice.random() < 0.02) or (number == 0 and dice.random() < 0.5):
+            zeros = dice.randrange(1, 20)
+        if with_pauses and dice.random() < 0.01:
+            pauses = dice.randrange(round(hz * 3))
+        pauses -= 1
+        zeros -= 1
+        if pauses < 0:
+            held.append((number, speaker.message(0.0 if zeros >= 0 else 0.5)))
+    world.now_ns = now_ns
+    heaps = dice.choice((1, 1, 4, 12)) / hz
+    for number, message in held:
+        due = number / (span * hz) * poured
+        due -= due % heaps if heaps > 1.5 / hz else 0.0
+        world.run(max(0.0, (now_ns - world.now_ns) / NS_PER_S + due))
+        speaker.deliver(message)
+    world.run(0.6)

@@ -1,0 +1,56 @@
+"""Who sent a command is read from its attachment, or from none that is not ours."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.messages.signature import Signature, unpack
+
+WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
+
+
+def test_what_is_packed_is_read() -> None:
+    signature = Signature("laptop/12/ab", 5, 1)
+    assert unpack(signature.pack()) == signature
+
+
+@pytest.mark.parametrize("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
+@pytest.mark.parametrize("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
+def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_there(
+    form: object, left_out: tuple[str, ...]
+) -> None:
+    assert callable(form)
+    told = {name: value for name, value in WHOLE.items() if name not in left_out}
+    signature = unpack(form(told))
+    assert signature == Signature("joystick-7", told.get("stamp"), told.get("sequence"))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "attachment",
+    [
+        b"",
+        b"{",
+        b"traceparent=00-1",
+        b"\x81",
+        json.dumps({"stamp": 5}).encode(),
+        json.dumps(WHOLE | {"sender": ""}).encode(),
+        json.dumps(WHOLE | {"sender": "x" * 65}).encode(),
+        json.dumps(WHOLE | {"stamp": -1}).encode(),
+        json.dumps(WHOLE | {"stamp": 1 << 70}).encode(),
+        json.dumps(WHOLE | {"sequence": 1.5}).encode(),
+        msgspec.msgpack.encode([1, 2, 3]),
+    ],
+)
+def test_anything_else_is_somebody_else_s(attachment: bytes) -> None:
+    assert unpack(attachment) is None
+
+
+@given(st.binary(max_size=80))
+def test_no_bytes_raise_anything(attachment: bytes) -> None:
+    unpack(attachment)
+    unpack(b"{" + attachment)

@@ -1,0 +1,75 @@
+"""The period is one of our clock's, whatever the kernel's timers do."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.runtime import ticker
+from acsard.runtime.period import Period
+from acsard.runtime.ticker import Ticker
+
+PERIOD_NS = 10_000_000
+
+
+class Kernel:
+    """A timer whose clock NTP slews: it waits `rate` times as long as it should."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.rate, self.at_ns = 5_000_000_000, 1.0, 0
+
+    def mono_ns(self) -> int:
+        return self.now_ns
+
+    def set(self, at_ns: int) -> None:
+        self.at_ns = self.now_ns + round((at_ns - self.now_ns) * self.rate)
+
+    def expirations(self) -> int:
+        return 1
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
+    kernel = Kernel()
+    monkeypatch.setattr(ticker, "TimerFd", lambda: kernel)
+    monkeypatch.setattr(ticker, "clock", kernel)
+    return kernel
+
+
+def goes_off(kernel: Kernel, one: Ticker, late_ns: int = 0) -> Period:
+    kernel.now_ns = kernel.at_ns + late_ns
+    one._expire()
+    return one.take()
+
+
+@pytest.mark.parametrize("rate", [0.92, 1.0, 1.08])
+def test_while_the_timer_is_slewed_no_period_is_lost_nor_does_it_drift(
+    kernel: Kernel, rate: float
+) -> None:
+    one = Ticker(PERIOD_NS, lambda: None)
+    kernel.rate = rate
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    for number in range(1, 1001):
+        assert goes_off(kernel, one) == Period(1, start_ns + number * PERIOD_NS)
+        assert abs(kernel.now_ns - start_ns - number * PERIOD_NS) < PERIOD_NS / 10
+
+
+def test_periods_that_were_missed_are_counted_from_the_first(kernel: Kernel) -> None:
+    one = Ticker(PERIOD_NS, lambda: None)
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    assert goes_off(kernel, one, late_ns=3 * PERIOD_NS) == Period(4, start_ns + PERIOD_NS)
+    assert goes_off(kernel, one) == Period(1, start_ns + 5 * PERIOD_NS)
+
+
+def test_what_was_not_taken_is_not_lost(kernel: Kernel) -> None:
+    woken: list[int] = []
+    one = Ticker(PERIOD_NS, lambda: woken.append(1))
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    for _ in range(3):
+        kernel.now_ns = kernel.at_ns
+        one._expire()
+    assert len(woken) == 3
+    assert one.take() == Period(3, start_ns + PERIOD_NS)
+    assert one.take().expired == 0

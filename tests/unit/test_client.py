@@ -1,0 +1,79 @@
+"""What the client puts on each command, without a bus."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from acsard.client import Client
+from acsard.config.settings import DriveConfig, JointsConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.incoming.commands import Arrival, Receiver
+from acsard.values import REST, Command, Twist
+
+RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+
+
+class Session:
+    """Takes what is put, as the daemon would hear it."""
+
+    def __init__(self, zid: str) -> None:
+        self._zid = zid
+        self.heard: list[Command] = []
+
+    def zid(self) -> str:
+        return self._zid
+
+    def new_timestamp(self) -> None:
+        return None
+
+    def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
+        key = key.removeprefix("acsard/acsar/")
+        arrival = Arrival(key, True, payload, encoding, 0, None, "", attachment=attachment)
+        self.heard.append(RECEIVER.command(arrival))
+
+
+@pytest.fixture
+def session() -> Session:
+    return Session("0123456789abcdef")
+
+
+def client_of(session: Session) -> Client:
+    fake: Any = session
+    return Client(fake, "acsar", "app")
+
+
+def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Session) -> None:
+    client = client_of(session)
+    before_ns = time.time_ns()
+    for _ in range(3):
+        client.send(0.5)
+    assert [one.sequence for one in session.heard] == [1, 2, 3]
+    (sender,) = {one.sender for one in session.heard}
+    assert sender.endswith("/01234567")
+    stamps = [one.stamp_ns or 0 for one in session.heard]
+    assert before_ns <= stamps[0] + 1_000_000
+    assert stamps == sorted(stamps)
+    assert stamps[-1] <= time.time_ns() + 1_000_000
+
+
+def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
+    other = Session("fedcba9876543210")
+    for one in (session, other):
+        client_of(one).send(0.5)
+    assert session.heard[0].sender != other.heard[0].sender
+
+
+def test_a_drive_opens_with_zeros_for_longer_than_a_first_contact_takes(
+    session: Session,
+) -> None:
+    client = client_of(session)
+    client.drive(0.5, 0.2, seconds=0.2)
+    twists = [one.twist for one in session.heard]
+    first = twists.index(Twist(0.5, 0.2))
+    assert set(twists[:first]) == {REST}
+    opened_ns = (session.heard[first].stamp_ns or 0) - (session.heard[0].stamp_ns or 0)
+    assert opened_ns >= 300_000_000
+    assert twists[-1] == REST
