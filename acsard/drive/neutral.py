@@ -37,6 +37,7 @@ class Sender:
     def __init__(self, timeout_ns: int, state: State) -> None:
         self._timeout_ns = timeout_ns
         self.state = state
+        self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Its last command that counted, since neutral was last required."""
@@ -64,6 +65,7 @@ class Sender:
         if not self.live(now_ns):
             self.came_ns = now_ns
         self.twist, self._stamp_ns = command.twist, command.stamp_ns
+        self.name = command.sender
         self.arrived_ns = self.noticed_ns = now_ns
 
     def _sign(self, command: Command) -> Sign:

@@ -78,6 +78,8 @@ async def _run(
     manager: Systemd,
 ) -> None:
     async with AsyncExitStack() as stack:
+        totals: dict[str, object] = {}
+        stack.callback(lambda: log.info("ended", **totals))  # first in, last out
         path = config.mcu.port
         if path == SIMULATOR:
             mcu = FakeMcu(config, clock.now().mono_ns)
@@ -104,6 +106,7 @@ async def _run(
         control = ControlLoop(
             config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns
         )
+        stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
         manager.ready()
         departure.started()
