@@ -17,4 +17,4 @@ def own_name() -> str:
     machine = os.uname().nodename.partition(".")[0]
     path = Path(sys.argv[0])
     program = path.parent.name if path.stem == "__main__" else path.stem
-    return f"{user}@{machine} {program}".rstrip(" -")
+    return f"{user}@{machine} {program.removeprefix('-c')}".rstrip()
