@@ -107,7 +107,7 @@ class Robot:
 
     def step(self, inputs: Inputs) -> Outputs:
         """Take all that happened since the last step; decide what happens now."""
-        events: list[Event] = []
+        events = list(inputs.events)
         if inputs.missed:
             self.counters["missed_periods"] += inputs.missed
             events.append(missed(inputs.missed))

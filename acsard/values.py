@@ -224,6 +224,8 @@ class Inputs(Struct, frozen=True):
     """The line of the step before did not go out: what it said never happened."""
     missed: int = 0
     """Periods that ended without a step, since the step before."""
+    events: tuple[Event, ...] = ()
+    """What the shell has to say, to be kept to a line a second with the rest."""
     at_once: bool = False
     leaving: bool = False
     """The daemon is going down: ramp to zero and stay there."""

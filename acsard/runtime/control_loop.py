@@ -57,13 +57,16 @@ class ControlLoop:
         log: Callable[[Event], None],
         mono_ns: Callable[[], int],
         certificate_ends_ns: int | None = None,
+        others: list[Event] | None = None,
     ) -> None:
+        """`others` are the events of the daemon's other parts; each step takes what is there."""
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
+        self._others = [] if others is None else others
         stop = self.robot.session.codec.stop
         self._guard = Guard(
             stop,
@@ -126,8 +129,10 @@ class ControlLoop:
             guard_trip=self._trip,
             superseded=self._superseded,
             missed=missed,
+            events=tuple(self._others),
             leaving=self.leaving,
         )
+        self._others.clear()
         outputs = self.outputs = self.robot.step(inputs)
         went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)

@@ -33,7 +33,7 @@ from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
 from acsard.serial.sim_pty import SimPty
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S
+from acsard.values import NS_PER_S, Event
 
 SWITCH_INTERVAL_S = 0.0005
 """How long another Python thread may hold up the loop; by default 5 ms, half a period."""
@@ -94,7 +94,8 @@ async def _run(
             access_control(config),
             wake,
         )
-        port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, log.event)
+        events: list[Event] = []
+        port = SerialPort(path, config.mcu.baud_rate, _stop_line(config), wake, events.append)
         if config.bus.tls:
             check_certificates(config.bus.tls)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
@@ -104,7 +105,7 @@ async def _run(
         ends_ns = ends_ns_of(config.bus.tls) if config.bus.tls else None
         info = _info(config, path)
         control = ControlLoop(
-            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns
+            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events
         )
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
