@@ -168,7 +168,7 @@ class Client:
             replies = self.session.get(
                 self.key(name),
                 payload=payload,
-                attachment=self.name.encode(),
+                attachment=msgspec.msgpack.encode({"sender": self.name}),
                 timeout=REPLY_TIMEOUT_S,
             )
         except zenoh.ZError:

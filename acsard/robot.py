@@ -123,7 +123,8 @@ class Robot:
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
         changed, self._status = status != self._status, status
-        events += self._told.changes(self._life.mode, self._choice, status[1])
+        if changed or news:  # else neither the mode nor the commander is another
+            events += self._told.changes(self._life.mode, self._choice, status[1])
         return Outputs(
             now=inputs.now,
             due=due,

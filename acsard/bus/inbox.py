@@ -34,8 +34,8 @@ STOPS = 16
 QUERIES = 64
 """Queries held, and as many service calls; the next one is turned away with an error."""
 
-ATTACHMENT_BYTES = 64
-"""An rmw_zenoh attachment has 33; a longer one is cut, and refused by its length."""
+ATTACHMENT_BYTES = 256
+"""An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
 
 CDR = encoding_name("cdr")
 STOP = service_key("stop")

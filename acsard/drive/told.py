@@ -27,19 +27,23 @@ class Told:
     """The mode and the last commander, as far as the log has them."""
 
     def __init__(self, mode: Mode) -> None:
-        self._mode, self._commander = mode, ""
+        self._mode, self._commander = mode, ("", "")
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
         """Another mode, and `why`; another commander than the last, however long ago that was."""
-        drives = mode is Mode.DRIVING
-        by = f"{choice.source} ({choice.sender[:MAX_SENDER]})" if drives else ""
-        events = []
-        if mode is not self._mode:
-            text = chosen(choice) if drives else why
-            events.append(Event("mode", text, by=by, kind=f"{self._mode} -> {mode}"))
-            self._mode = mode
-        if drives and by != self._commander:
-            change = f"{self._commander or 'nobody'} -> {by}"
-            events.append(Event("commander", "", by=by, kind=change))
-            self._commander = by
+        drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
+        if drives:
+            self._commander = (choice.source, choice.sender)
+        self._mode, events = mode, []
+        if mode is not before:
+            text, by = (chosen(choice), _name(self._commander)) if drives else (why, "")
+            events.append(Event("mode", text, by=by, kind=f"{before} -> {mode}"))
+        if self._commander != last:
+            by = _name(self._commander)
+            events.append(Event("commander", "", by=by, kind=f"{_name(last)} -> {by}"))
         return events
+
+
+def _name(commander: tuple[str, str]) -> str:
+    source, sender = commander
+    return f"{source} ({sender[:MAX_SENDER]})" if source else "nobody"

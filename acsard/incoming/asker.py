@@ -1,11 +1,14 @@
 """Who asked or stopped, in words for the log: the name he gives himself, and the way it came.
 
 A claim, not a proof: Zenoh does not tell which connection a query came by, nor whose certificate
-that shows. A name is the attachment of the call, UTF-8; `client.py` sets it. ROS has none: by
-rmw_zenoh it is the client's GID, and a bridge tells nothing.
+that shows. The name is the `sender` of a map, JSON or msgpack, that is attached to the call or put;
+`client.py` sets it. ROS has none: by rmw_zenoh it is the client's GID, and a bridge tells nothing.
 """
 
 from __future__ import annotations
+
+import msgspec
+from msgspec import Struct
 
 from acsard.incoming.commands import Via
 from acsard.ros.attachments import GID_BYTES
@@ -15,6 +18,14 @@ MAX_NAME = 40
 
 MARKS = " @._-:/+"
 """What a name may have beside letters and digits: nothing that the words around it use."""
+
+
+class _Signed(Struct, frozen=True):
+    sender: str
+
+
+_json = msgspec.json.Decoder(_Signed)
+_msgpack = msgspec.msgpack.Decoder(_Signed)
 
 
 def asker(via: Via, attachment: bytes, stamped_by: str = "") -> str:
@@ -28,6 +39,9 @@ def asker(via: Via, attachment: bytes, stamped_by: str = "") -> str:
 
 
 def _name(attachment: bytes) -> str:
-    text = attachment.decode(errors="replace")[:MAX_NAME]
-    name = "".join(char if char.isalnum() or char in MARKS else "?" for char in text).strip()
-    return name or "unnamed"
+    try:
+        text = (_json if attachment[:1] == b"{" else _msgpack).decode(attachment).sender
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        text = ""
+    kept = (char if char.isalnum() or char in MARKS else "?" for char in text[:MAX_NAME])
+    return "".join(kept).strip() or "unnamed"

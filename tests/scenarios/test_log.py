@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import get_args
 
+import msgspec
 import pytest
 
 from acsard.incoming.commands import Arrival, Via
@@ -29,6 +30,11 @@ def told(world: World, name: EventName) -> list[Event]:
     return [event for event in world.events if event.name == name]
 
 
+def signed(name: str) -> bytes:
+    """The attachment of one who says who he is."""
+    return msgspec.json.encode({"sender": name})
+
+
 def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> None:
     """A service called by somebody, ahead of which a stop comes as the bus hands it over."""
     key, at_ns = f"srv/{service}", world.now_ns
@@ -48,17 +54,17 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
 @pytest.mark.parametrize("service", [key.removeprefix("srv/") for key in VERBS])
 def test_every_service_is_told_once_with_who_called_it(world: World, service: str) -> None:
     if service == "clear":
-        call(world, "stop", b"ann@desk")
-    call(world, service, b"joe@laptop patrol")
+        call(world, "stop", signed("ann@desk"))
+    call(world, service, signed("joe@laptop patrol"))
     (event,) = (event for event in world.events if event.name == service)
     assert event.by == "joe@laptop patrol (native)"
     assert event.count == 1
 
 
 def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
-    for name in (b"joe", b"ann"):
-        call(world, "stop", name)
-        call(world, "clear", name + b"@desk")
+    for name in ("joe", "ann"):
+        call(world, "stop", signed(name))
+        call(world, "clear", signed(name + "@desk"))
     asked = [(event.name, event.by) for event in world.events if event.by]
     assert asked == [
         ("stop", "joe (native)"),
@@ -69,8 +75,8 @@ def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
 
 
 def test_a_second_one_who_stops_is_told_too_a_second_later(world: World) -> None:
-    call(world, "stop", b"joe")
-    call(world, "stop", b"ann")
+    call(world, "stop", signed("joe"))
+    call(world, "stop", signed("ann"))
     assert [event.by for event in told(world, "stop")] == ["joe (native)"]
     world.run(1.0)
     assert [event.by for event in told(world, "stop")] == ["joe (native)", "ann (native)"]
@@ -87,7 +93,7 @@ def test_a_put_on_stop_is_told_with_its_name_or_the_session_that_stamped_it(worl
     world.put("stop", b"", stamp_ns=1)
     world.run(2.0)
     world.bus.arrivals.append(
-        Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=b"ann")
+        Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=signed("ann"))
     )
     world.run(0.1)
     assert [event.by for event in told(world, "stop")] == [
@@ -213,7 +219,7 @@ def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: 
 
 def test_a_thousand_names_are_a_short_line(world: World) -> None:
     for number in range(1000):
-        name = b"x" * 30 + str(number).encode()
+        name = signed("x" * 30 + str(number))
         world.bus.arrivals.append(
             Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=name)
         )

@@ -42,7 +42,7 @@ def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(tmp_path: Path) 
         bus.linked()
         with connect(daemon.endpoint) as robot:
             key, stamp = robot.key("stop"), robot.session.new_timestamp()
-            robot.session.put(key, b"", timestamp=stamp, attachment=b"ann")
+            robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann"}')
             (line,) = until(lambda: daemon.events("stop"), 5.0, "the stop is in the log")
     assert line["by"] == f"ann (native, session {stamp.get_id()})"
 

@@ -728,6 +728,18 @@ def test_missed_periods_are_told_with_their_number() -> None:
     assert bench.counters()["missed_periods"] == 4
 
 
+def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> None:
+    bench, told = Bench(), []
+    lost = Event("port_lost", "it is gone", "warning")
+    for _ in range(1000):
+        bench.now_ns += 10 * MS
+        told += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
+    assert told[0] == lost
+    lines = [event for event in told if event.name == "port_lost"]
+    assert len(lines) <= 15
+    assert sum(event.count for event in lines) > 900
+
+
 def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:
     bench = Bench().linked()
     bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))

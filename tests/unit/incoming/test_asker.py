@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,12 +10,22 @@ from hypothesis import strategies as st
 from acsard.incoming.asker import MAX_NAME, asker
 
 
+def signed(name: str) -> bytes:
+    return msgspec.json.encode({"sender": name})
+
+
 def test_a_native_call_has_the_name_it_gives() -> None:
-    assert asker("native", b"alice@laptop patrol") == "alice@laptop patrol (native)"
+    for form in (msgspec.json, msgspec.msgpack):
+        signature = form.encode({"sender": "alice@laptop patrol", "sequence": 7})
+        assert asker("native", signature) == "alice@laptop patrol (native)"
 
 
-def test_who_gives_no_name_is_unnamed() -> None:
-    assert asker("native", b"") == asker("native", b"  ") == "unnamed (native)"
+@pytest.mark.parametrize(
+    "attachment",
+    [b"", b"joe", b"{}", b'{"sender": 7}', b'{"sender": "\xff"}', b"\x81", signed(""), signed(" ")],
+)
+def test_who_gives_no_name_is_unnamed(attachment: bytes) -> None:
+    assert asker("native", attachment) == "unnamed (native)"
 
 
 def test_what_was_stamped_tells_the_session_that_stamped_it() -> None:
@@ -42,10 +53,10 @@ def test_a_bridge_tells_nothing() -> None:
     ],
 )
 def test_a_name_cannot_pass_for_the_words_around_it(name: str, kept: str) -> None:
-    assert asker("native", name.encode()) == f"{kept} (native)"
+    assert asker("native", signed(name)) == f"{kept} (native)"
 
 
-@given(st.binary(max_size=100))
+@given(st.binary(max_size=100) | st.text(max_size=100).map(signed))
 def test_any_attachment_makes_a_short_printable_name(attachment: bytes) -> None:
     who = asker("native", attachment)
     name = who.removesuffix(" (native)")
