@@ -729,7 +729,8 @@ def test_missed_periods_are_told_with_their_number() -> None:
 
 
 def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> None:
-    bench, told = Bench(), []
+    bench = Bench()
+    told: list[Event] = []
     lost = Event("port_lost", "it is gone", "warning")
     for _ in range(1000):
         bench.now_ns += 10 * MS
