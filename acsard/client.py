@@ -38,6 +38,7 @@ from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
+from acsard.host.own_name import own_name
 from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
@@ -77,6 +78,8 @@ class Client:
     def __init__(self, session: zenoh.Session, robot_id: str, source: str) -> None:
         self.session = session
         self._id, self._source = robot_id, source
+        self.name = own_name()
+        """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
         self._put_s = 0.0
         self._sender, self._sequence = _name(session), 0
@@ -171,7 +174,12 @@ class Client:
     def _ask(self, name: str, payload: bytes | None = None) -> list[tuple[str, bytes]]:
         found = []
         try:
-            replies = self.session.get(self.key(name), payload=payload, timeout=REPLY_TIMEOUT_S)
+            replies = self.session.get(
+                self.key(name),
+                payload=payload,
+                attachment=msgspec.msgpack.encode({"sender": self.name}),
+                timeout=REPLY_TIMEOUT_S,
+            )
         except zenoh.ZError:
             raise _no_key(name) from None
         for reply in replies:

@@ -17,6 +17,8 @@ from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger
 from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
+from acsard.drive.tally import Tally
+from acsard.drive.told import Told, missed, refused
 from acsard.drive.words import REFUSED, chosen
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
@@ -75,7 +77,10 @@ class Robot:
         adds what it alone sees (superseded lines, missed periods)."""
         self._refused = ""
         self._sanity = Sanity(config.feedback)
-        self._logged_ns: dict[str, int] = {}
+        self._tally = Tally()
+        self._asked: tuple[str, str, int | None] = ("", "", None)
+        """The request before; a stop comes twice, ahead of its query and with it."""
+        self._told = Told(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
@@ -95,13 +100,21 @@ class Robot:
             check=session.check.in_force,
         )
 
+    @property
+    def travelled(self) -> float:
+        """m by odometry since the start, forwards and backwards."""
+        return self._odometry.travelled
+
     def step(self, inputs: Inputs) -> Outputs:
         """Take all that happened since the last step; decide what happens now."""
-        events: list[Event] = []
+        events = list(inputs.events)
+        if inputs.missed:
+            self.counters["missed_periods"] += inputs.missed
+            events.append(missed(inputs.missed))
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
-        self._hear(inputs)
+        self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         self._life.fire(Trigger.NO_COMMAND if self._choice.twist is None else Trigger.COMMAND)
         news = self._news()
@@ -110,6 +123,8 @@ class Robot:
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
         changed, self._status = status != self._status, status
+        if changed or news:  # else neither the mode nor the commander is another
+            events += self._told.changes(self._life.mode, self._choice, status[1])
         return Outputs(
             now=inputs.now,
             due=due,
@@ -124,7 +139,7 @@ class Robot:
             source=status[3],
             command_ns=self._choice.arrived_ns,
             status_changed=changed,
-            events=tuple(events),
+            events=self._tally.lines(events, inputs.now.mono_ns),
             answers=answers,
             news=news,
         )
@@ -181,6 +196,7 @@ class Robot:
         why = self._sanity.impossible(line)
         if why:
             self.counters["line_impossible"] += 1
+            events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now_ns, events)
@@ -201,7 +217,6 @@ class Robot:
             self._fault(trip, inputs.now.mono_ns, events)
         if inputs.leaving and self._life.mode is not Mode.LEAVING:
             self._life.fire(Trigger.LEAVE)
-            events.append(Event("leaving", "ramping to zero, then STOP"))
         return tuple([self._answer(r, inputs.now.mono_ns, events) for r in inputs.requests])
 
     def _answer(self, request: Request, now_ns: int, events: list[Event]) -> Answer:
@@ -210,11 +225,11 @@ class Robot:
             message = self._obey(request, now_ns)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
-        last_ns = self._logged_ns.get(request.verb)
-        if self._life.mode is not before or last_ns is None or now_ns - last_ns > NS_PER_S:
-            # What is repeated as fast as it can be sent is still a line of log a second.
-            self._logged_ns[request.verb] = now_ns
-            events.append(Event(request.verb, message))
+        asked = (request.verb, request.by, request.asked_ns)
+        if asked != self._asked or request.asked_ns is None:
+            news = self._life.mode is not before
+            events.append(Event(request.verb, message, by=request.by, news=news))
+        self._asked = asked
         return Answer(request.id, True, message)
 
     def _obey(self, request: Request, now_ns: int) -> str:
@@ -249,9 +264,9 @@ class Robot:
 
     # commands
 
-    def _hear(self, inputs: Inputs) -> None:
+    def _hear(self, inputs: Inputs, events: list[Event]) -> None:
         for refusal in inputs.refusals:
-            self._refuse(refusal)
+            self._refuse(refusal, events)
             if refusal.source:
                 self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
@@ -259,13 +274,15 @@ class Robot:
                 self.counters["stamps_replaced"] += 1
             reason = self._arbiter.accept(command)
             if reason:
-                self._refuse(Refusal(reason, f"source {command.source}: {REFUSED[reason]}"))
+                text = f"source {command.source}: {REFUSED[reason]}"
+                self._refuse(Refusal(reason, text, command.source, command.sender), events)
             else:
                 self.counters["commands"] += 1
 
-    def _refuse(self, refusal: Refusal) -> None:
+    def _refuse(self, refusal: Refusal, events: list[Event]) -> None:
         self.counters[f"command_{refusal.reason}"] += 1
         self._refused = refusal.text[:MAX_TEXT]
+        events.append(refused(refusal))
 
     # limit, invert
 

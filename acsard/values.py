@@ -118,6 +118,8 @@ class Request(Struct, frozen=True):
     pose: Pose | None = None
     asked_ns: int | None = None
     """When it arrived, monotonic: a clear must not undo a stop that came after it."""
+    by: str = ""
+    """Who asked, as `incoming/asker.py` puts it."""
 
 
 class Answer(Struct, frozen=True):
@@ -139,12 +141,33 @@ class Refusal(Struct, frozen=True):
     """Whose command it would have been, as far as that is known."""
 
 
-class Event(Struct, frozen=True):
-    """Something worth a log line: `name` is from a closed set, `text` is for people."""
+EventName = Literal[
+    "started", "ended", "signal", "configuration", "real_time", "connecting",
+    "port_open", "port_waiting", "port_lost",
+    "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
+    "lines_rejected", "wheels_turned", "missed_periods",
+    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
+    "mode", "commander", "command_refused", "fault",
+]  # fmt: skip
+"""All that the log can be asked for; `deploy/systemd/README.md` says what each means."""
 
-    name: str
+Level = Literal["info", "warning", "error"]
+
+
+class Event(Struct, frozen=True):
+    """Something worth a log line; `text` is for people. `tally.py` keeps it to a line a second."""
+
+    name: EventName
     text: str
-    level: Literal["info", "warning", "error"] = "info"
+    level: Level = "info"
+    by: str = ""
+    """Who asked, sent or commands, "" when that is nobody."""
+    kind: str = ""
+    """What is counted apart when it repeats itself: a reason, a change."""
+    count: int = 1
+    """How many times, since the last line of this name."""
+    news: bool = True
+    """False for more of the same: that may wait for its second."""
 
 
 class Estimate(Struct, frozen=True):
@@ -205,6 +228,10 @@ class Inputs(Struct, frozen=True):
     """Why the guard replaced the previous line with STOP; latches a fault."""
     superseded: bool = False
     """The line of the step before did not go out: what it said never happened."""
+    missed: int = 0
+    """Periods that ended without a step, since the step before."""
+    events: tuple[Event, ...] = ()
+    """What the shell has to say, to be kept to a line a second with the rest."""
     at_once: bool = False
     leaving: bool = False
     """The daemon is going down: ramp to zero and stay there."""

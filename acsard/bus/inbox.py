@@ -144,7 +144,8 @@ class Inbox:
         arrived_ns = clock.now().mono_ns
         if topic == STOP:
             # The stop itself never waits in a line with other questions, nor is it turned away.
-            self._stop(Arrival("stop", True, b"", "", arrived_ns, None, ""))
+            by = _bytes(query.attachment, ATTACHMENT_BYTES)
+            self._stop(Arrival("stop", True, b"", "", arrived_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
             return

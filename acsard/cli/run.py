@@ -56,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
     import asyncio
     import faulthandler
 
+    from acsard import __version__
     from acsard.config.contradictions import warnings
     from acsard.host.logs import Log, Writer
     from acsard.runtime import daemon
@@ -71,6 +72,7 @@ def main(args: argparse.Namespace) -> int:
             screen.write(banner(config, where, device, trouble) + "\n")
         log.info(
             "started",
+            version=__version__,
             robot=config.robot.id,
             port=device,
             simulated=simulated,
@@ -87,7 +89,6 @@ def main(args: argparse.Namespace) -> int:
     try:
         asyncio.run(daemon.run(config, log, announce))
     finally:
-        log.info("ended")
         log.close()
         screen.close(0.2)
     return 0

@@ -35,6 +35,7 @@ class Choice(Struct, frozen=True):
     twist: Twist | None = None
     wait: Wait = COMMAND
     arrived_ns: int | None = None
+    sender: str = ""
 
 
 class _Source:
@@ -153,7 +154,7 @@ class Arbiter:
         self._holder = source
         if sender.state != "free":
             return Choice(source.name, None, source.neutral)
-        return Choice(source.name, sender.twist, NOTHING, sender.arrived_ns)
+        return Choice(source.name, sender.twist, NOTHING, sender.arrived_ns, sender.name)
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
         """What each source is doing and waiting for, highest priority first."""

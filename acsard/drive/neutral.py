@@ -42,6 +42,7 @@ class Sender:
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
         self.state = self._sure = state
         """Also by what does not count yet; and only by what does."""
+        self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Its last command that counted, since neutral was last required."""
@@ -100,7 +101,7 @@ class Sender:
             return
         if not self.live(now_ns):
             self.came_ns = now_ns
-        self._sure = self.state
+        self._sure, self.name = self.state, command.sender
         self.twist, self.arrived_ns, self.doubted_ns = command.twist, now_ns, None
 
     def _sign(self, command: Command) -> Sign:

@@ -47,6 +47,8 @@ class Odometry:
         """Twist of the last feedback."""
         self.speeds = STILL
         """Wheel speeds of the last feedback."""
+        self.travelled = 0.0
+        """m since the start, forwards and backwards."""
         self.set_pose(Pose())
 
     def set_pose(self, pose: Pose) -> None:
@@ -109,6 +111,7 @@ class Odometry:
         self._positions = _sum(self._positions, turned)
 
     def _advance(self, distance: float, turn: float) -> None:
+        self.travelled += abs(distance)
         self._covariance = self._propagate(distance, turn)
         self._pose = arc(self._pose, distance, turn)
 

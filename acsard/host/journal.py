@@ -28,9 +28,8 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
     """A structlog line in the journal's own protocol."""
-    event, text = str(line.get("event", "")), str(line.get("text", ""))
     fields = {
-        "MESSAGE": f"{event}: {text}" if text else _message(line, event),
+        "MESSAGE": _message(line),
         "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
         "SYSLOG_IDENTIFIER": "acsard",
     }
@@ -40,9 +39,10 @@ def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
     return "\n".join(f"{name}={value.replace(chr(10), ' ')}" for name, value in fields.items())
 
 
-def _message(line: Mapping[str, Any], event: str) -> str:
-    rest = [f"{k}={v}" for k, v in line.items() if k not in ("timestamp", "level", "event")]
-    return " ".join([event, *rest])
+def _message(line: Mapping[str, Any]) -> str:
+    event, text = str(line.get("event", "")), str(line.get("text", ""))
+    rest = [f"{k}={v}" for k, v in line.items() if k not in ("timestamp", "level", "event", "text")]
+    return " ".join([f"{event}: {text}" if text else event, *rest])
 
 
 class JournalStream(io.StringIO):

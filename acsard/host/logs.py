@@ -18,12 +18,15 @@ import structlog
 
 from acsard.config.settings import LogConfig
 from acsard.host.journal import JournalStream, is_journal, render
-from acsard.values import Event
+from acsard.values import Event, EventName
 
 Form = Literal["console", "json", "logfmt", "journal"]
 
 QUEUED_LINES = 1000
-"""More than the daemon says in an hour of trouble."""
+"""More than the daemon says in a minute of all troubles at once (`drive/tally.py`)."""
+
+MAX_VALUE = 500
+"""Characters of one value: a stranger's words may be in it."""
 
 
 class Writer:
@@ -94,6 +97,7 @@ class Log:
                 structlog.processors.add_log_level,
                 structlog.processors.TimeStamper(fmt="iso", utc=form != "console"),
                 _in_order,
+                _printable,
                 _renderer(form),
             ],
             wrapper_class=structlog.make_filtering_bound_logger(
@@ -104,9 +108,14 @@ class Log:
 
     def event(self, event: Event) -> None:
         """Write an event of the core or of a shell."""
-        self._logger.log(_LEVELS[event.level], event.name, text=event.text)
+        fields: dict[str, object] = {"text": event.text}
+        if event.by:
+            fields["by"] = event.by
+        if event.count > 1:
+            fields["count"] = event.count
+        self._logger.log(_LEVELS[event.level], event.name, **fields)
 
-    def info(self, name: str, **fields: object) -> None:
+    def info(self, name: EventName, **fields: object) -> None:
         """Write a line of the daemon's own."""
         self._logger.info(name, **fields)
 
@@ -122,6 +131,17 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
     """When, how bad and what come first in every format."""
     first = ("timestamp", "level", "event", "text")
     return {key: line[key] for key in first if key in line} | dict(line)
+
+
+def _printable(
+    logger: object, method: str, line: MutableMapping[str, Any]
+) -> MutableMapping[str, Any]:
+    """Nothing that moves a terminal's cursor or begins a line of its own."""
+    for key, value in line.items():
+        if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
+            cut = value[:MAX_VALUE]
+            line[key] = "".join(char if char.isprintable() else "?" for char in cut)
+    return line
 
 
 def _fitting(stream: TextIO) -> Form:

@@ -10,9 +10,11 @@ from collections.abc import Callable
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
+from acsard.incoming.asker import asker
 from acsard.incoming.commands import Receiver, Via
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
@@ -116,7 +118,8 @@ class Queries:
         verb = VERBS.get(query.topic)
         if verb is not None:
             self._waiting[query.ticket] = (query.topic, "cdr", asked)
-            return Request(verb, query.ticket, asked_ns=query.arrived_ns)
+            by = asker(query.via, query.attachment)
+            return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
         try:
             service = query.topic.removeprefix(PARAMETERS)
             payload = self._parameters.answer(service, query.payload)
@@ -141,7 +144,7 @@ class Queries:
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
         self._waiting[query.ticket] = (query.topic, form, None)
-        return request
+        return replace(request, by=asker(query.via, query.attachment))
 
     def _values(
         self, query: Query, current: Current, outputs: Outputs | None

@@ -19,7 +19,15 @@ from acsard.mcu.lines import LineReader
 from acsard.mcu.link import WORDS, Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
-from acsard.values import NS_PER_S, STILL, Event, Instant, Received, WheelSpeeds
+from acsard.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
+
+NAMES: dict[LinkState, EventName] = {
+    "down": "link_down",
+    "booting": "link_booting",
+    "up": "link_up",
+    "stale": "link_stale",
+}
+"""The event that a state of the link is when it comes about."""
 
 LONG_GAP_NS = 1 * NS_PER_S
 """A feedback gap this long means the MCU may have been reset: commanders start over."""
@@ -84,8 +92,9 @@ class McuSession:
                     got = self._line(line, piece.at, following)
                     if got is not None:
                         feedback.append(got)
-            if self._lines.too_long > self.rejects["too_long"]:
-                self.rejects["too_long"] = self._lines.too_long
+            more = self._lines.too_long - self.rejects["too_long"]
+            if more > 0:
+                self._reject("too_long", more)
                 self._bad()
             self._judge(now.mono_ns)
         self._announce()
@@ -165,6 +174,13 @@ class McuSession:
             check.begin()
         check.judge(now_ns)
 
+    def _reject(self, reason: str, more: int = 1, text: str = "") -> None:
+        """Count lines that were not taken."""
+        self.rejects[reason] += more
+        self.events.append(
+            Event("lines_rejected", text, "warning", kind=reason, count=more, news=False)
+        )
+
     def _bad(self) -> None:
         """A line came that is none; so many in a row that a check in force has to be asked anew."""
         if self._link.bad() and self.check.checked:
@@ -178,7 +194,7 @@ class McuSession:
         if link != before[0]:
             text = self.words() if self._damaged else WORDS[link]
             good = link in ("up", "booting")
-            self.events.append(Event(f"link_{link}", text, "info" if good else "warning"))
+            self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
             fallen = check.state == "plain" or (self._wants_samples and check.state == "checked")
             text = f"the serial lines are {check.in_force}"
@@ -198,7 +214,7 @@ class McuSession:
             return None
         check = self.check
         if check.asking and check.echoed(line):
-            self.rejects["echo"] += 1
+            self._reject("echo")
             self._link.missed()
             return None
         try:
@@ -210,7 +226,7 @@ class McuSession:
                 return replace(feedback, asked_ns=asked_ns)
             speeds = self.codec.decode(line)
         except FrameError as error:
-            self.rejects[error.reason] += 1
+            self._reject(error.reason, text=f"{line[:60]!r}")
             self._bad()
             return None
         if check.asking:
@@ -227,8 +243,9 @@ class McuSession:
             self.restarted = True
         gap = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, read_at, following, gap)
-        if self._timeline.leaps:
-            self.rejects["count_leap"] = self._timeline.leaps
+        more = self._timeline.leaps - self.rejects["count_leap"]
+        if more > 0:
+            self._reject("count_leap", more)
         if self._timeline.restarted:
             self._restart("has started again: its clock went back")
         return feedback

@@ -13,6 +13,7 @@ from acsard.config.settings import Config
 from acsard.config.wire_time import wire_ns
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
+from acsard.incoming.asker import asker
 from acsard.incoming.bus import Bus
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.queries import Queries
@@ -56,12 +57,16 @@ class ControlLoop:
         log: Callable[[Event], None],
         mono_ns: Callable[[], int],
         certificate_ends_ns: int | None = None,
+        others: list[Event] | None = None,
     ) -> None:
+        """`others` are the events of the daemon's other parts; each step takes what is there."""
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
+        self._start_ns = start.mono_ns
+        self._others = [] if others is None else others
         stop = self.robot.session.codec.stop
         self._guard = Guard(
             stop,
@@ -87,6 +92,12 @@ class ControlLoop:
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
+    def totals(self, now_ns: int) -> dict[str, float]:
+        """What there is to say at the end: s, m, and all that was counted."""
+        seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
+        shot = self.robot.snapshot(now_ns)
+        return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
+
     @property
     def retry_ns(self) -> int | None:
         """When to step again for a command that came too soon after a line; None for no need."""
@@ -102,8 +113,6 @@ class ControlLoop:
         ended, missed = period.expired > 0, max(0, period.expired - 1)
         if ended:
             self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns)
-        if missed:
-            self.robot.counters["missed_periods"] += missed
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self._pace
         inputs = Inputs(
@@ -119,8 +128,11 @@ class ControlLoop:
             refusals=refusals,
             guard_trip=self._trip,
             superseded=self._superseded,
+            missed=missed,
+            events=tuple(self._others),
             leaving=self.leaving,
         )
+        self._others.clear()
         outputs = self.outputs = self.robot.step(inputs)
         went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
@@ -140,7 +152,8 @@ class ControlLoop:
         for arrival in got.arrivals:
             if arrival.key == "stop":
                 if arrival.put:
-                    requests.append(Request("stop"))
+                    by = asker(arrival.via, arrival.attachment, arrival.sender)
+                    requests.append(Request("stop", asked_ns=arrival.arrived_ns, by=by))
                 else:
                     refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
                 continue

@@ -33,7 +33,7 @@ from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
 from acsard.serial.sim_pty import SimPty
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S
+from acsard.values import NS_PER_S, Event
 
 SWITCH_INTERVAL_S = 0.0005
 """How long another Python thread may hold up the loop; by default 5 ms, half a period."""
@@ -78,6 +78,8 @@ async def _run(
     manager: Systemd,
 ) -> None:
     async with AsyncExitStack() as stack:
+        totals: dict[str, object] = {}
+        stack.callback(lambda: log.info("ended", **totals))  # first in, last out
         path = config.mcu.port
         if path == SIMULATOR:
             mcu = FakeMcu(config, clock.now().mono_ns)
@@ -92,9 +94,10 @@ async def _run(
             access_control(config),
             wake,
         )
+        events: list[Event] = []
         period_ns = int(NS_PER_S / config.rate_hz)
         port = SerialPort(
-            path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, log.event
+            path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, events.append
         )
         if config.bus.tls:
             check_certificates(config.bus.tls)
@@ -105,8 +108,9 @@ async def _run(
         ends_ns = ends_ns_of(config.bus.tls) if config.bus.tls else None
         info = _info(config, path)
         control = ControlLoop(
-            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns
+            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events
         )
+        stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
         manager.ready()
         departure.started()

@@ -26,6 +26,7 @@ from acsard.values import (
     STILL,
     Answer,
     Command,
+    Event,
     Inputs,
     Instant,
     Outputs,
@@ -174,17 +175,18 @@ def test_each_change_of_the_link_is_an_event_once() -> None:
     bench = Bench()
     assert names(bench.step()) == ["link_booting"]
     assert names(bench.step()) == []
-    assert names(bench.step()) == ["link_up"]
+    assert names(bench.step()) == ["link_up", "mode"]
     bench.reply = None
-    assert names(bench.step(ms=101)) == ["link_stale"]
+    assert names(bench.step(ms=101)) == ["link_stale", "mode"]
     assert names(bench.unplug().step()) == ["link_down"]
     assert names(bench.step()) == []
 
 
 def test_a_lost_link_is_a_warning() -> None:
     bench = Bench().linked()
-    (event,) = bench.unplug().step().events
+    event, mode = bench.unplug().step().events
     assert (event.name, event.level) == ("link_down", "warning")
+    assert (mode.name, mode.level) == ("mode", "info")
 
 
 def test_a_port_that_opens_and_a_link_that_comes_up_are_no_warnings() -> None:
@@ -193,6 +195,7 @@ def test_a_port_that_opens_and_a_link_that_comes_up_are_no_warnings() -> None:
     assert [(event.name, event.level) for event in events] == [
         ("link_booting", "info"),
         ("link_up", "info"),
+        ("mode", "info"),
     ]
 
 
@@ -515,7 +518,7 @@ def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
 
 
 def test_a_stop_is_an_event() -> None:
-    assert names(Bench().driving().step(ask="stop")) == ["stop"]
+    assert names(Bench().driving().step(ask="stop")) == ["stop", "mode"]
 
 
 def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
@@ -620,9 +623,9 @@ def test_without_auto_activate_the_robot_starts_switched_off() -> None:
 
 def test_each_change_of_mode_by_request_is_an_event_however_soon_it_comes() -> None:
     bench = Bench().linked()
-    for _ in range(3):
-        assert names(bench.step(ask="stop")) == ["stop"]
-        assert names(bench.step(ask="clear")) == ["clear"]
+    for _ in range(2):
+        assert names(bench.step(ask="stop")) == ["stop", "mode"]
+        assert names(bench.step(ask="clear")) == ["clear", "mode"]
 
 
 # the pose
@@ -685,8 +688,69 @@ def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
 
 def test_a_service_called_as_fast_as_can_be_is_a_line_of_log_a_second() -> None:
     bench = Bench().linked()
-    said = [bench.step(ask="reset_odometry").events for _ in range(250)]
-    assert sum(map(len, said)) == 3
+    said = [event for _ in range(250) for event in bench.step(ask="reset_odometry").events]
+    assert [event.count for event in said] == [1, 100, 100]
+
+
+def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None:
+    bench = Bench().linked()
+    for number in (1, 2):
+        asked_ns = bench.now_ns
+        ahead = Request("stop", asked_ns=asked_ns, by="joe (native)")
+        bench.now_ns += 10 * MS
+        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(ahead,)))
+        told = [out.events]
+        bench.now_ns += 1500 * MS
+        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(replace(ahead, id=7),)))
+        assert out.answers[0].success
+        told.append(out.events)
+        stops = [event for events in told for event in events if event.name == "stop"]
+        assert [(event.by, event.count) for event in stops] == [("joe (native)", 1)], number
+        bench.now_ns += 1500 * MS
+
+
+# what the log is told
+
+
+def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> None:
+    (event,) = Bench().linked().step(REST, source="nobody").events
+    assert (event.name, event.level) == ("command_refused", "warning")
+    assert event.text == "unknown_source: source nobody: not one of commands.sources"
+    refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
+    bench = Bench().linked()
+    told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
+    first, second = told
+    assert first.text.startswith("malformed: cmd/app")
+    assert (first.by, first.count) == ("a" * 40, 1)
+    assert second.text.startswith("100 x malformed; the last: ")
+
+
+def test_missed_periods_are_told_with_their_number() -> None:
+    bench = Bench().linked()
+    bench.now_ns += 50 * MS
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
+    (event,) = (event for event in out.events if event.name == "missed_periods")
+    assert (event.text, event.count) == ("4 x missed: 4 in a row", 4)
+    assert bench.counters()["missed_periods"] == 4
+
+
+def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> None:
+    bench = Bench()
+    told: list[Event] = []
+    lost = Event("port_lost", "it is gone", "warning")
+    for _ in range(1000):
+        bench.now_ns += 10 * MS
+        told += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
+    assert told[0] == lost
+    lines = [event for event in told if event.name == "port_lost"]
+    assert len(lines) <= 15
+    assert sum(event.count for event in lines) > 900
+
+
+def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
+    assert names(bench.step())[0] == "lines_rejected"
 
 
 # fault
@@ -697,8 +761,9 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     out = bench.step(GO, guard_trip="a wheel is too fast")
     assert out.mode == "fault"
     assert out.reason == "the guard replaced a line: a wheel is too fast; call srv/clear"
-    (event,) = out.events
+    event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
+    assert mode.text.startswith("driving -> fault: the guard replaced a line: a wheel is too fast")
     for _ in range(50):
         bench.step(REST)
         bench.step(GO)
@@ -793,7 +858,8 @@ def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> Non
 def test_leaving_is_one_event() -> None:
     bench = Bench().driving()
     bench.leaving = True
-    assert names(bench.step()) == ["leaving"]
+    (event,) = bench.step().events
+    assert event == Event("mode", "driving -> leaving: the daemon is going down")
     assert names(bench.step()) == []
 
 

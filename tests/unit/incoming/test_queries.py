@@ -251,7 +251,8 @@ def payload_for(verb: str) -> bytes:
 @pytest.mark.parametrize("verb", SERVICES)
 def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
-    assert got == Request(verb, 7, Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None)
+    pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
+    assert got == Request(verb, 7, pose, by="unnamed (native)")
 
 
 @pytest.mark.parametrize("asked", WILDCARDS)
@@ -387,7 +388,8 @@ def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: A
 def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
     made = queries()
     got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
-    assert got == Request(verb, 7, asked_ns=99)  # type: ignore[arg-type]
+    by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
+    assert got == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
     assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(True, "done")

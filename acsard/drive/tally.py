@@ -1,0 +1,84 @@
+"""Events -> log lines: what happens again and again is a line a second, with how often.
+
+Of one name a few lines may come at once, and then one a second; what came meanwhile is counted
+and told with the next. So whoever floods the bus, and a wire that flaps, cannot flood the log.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import get_args
+
+from acsard.values import NS_PER_S, Event, EventName, Level
+
+BURST = 5
+"""Lines of one name that may come at once: as fast as people press buttons."""
+
+MOST = 8
+"""Kinds and names told apart in one line: a stranger may send under as many as he likes."""
+
+LEVELS: tuple[Level, ...] = get_args(Level)
+
+
+class _Held:
+    """Events of one name that wait for their line."""
+
+    def __init__(self) -> None:
+        self.count, self.news, self._level = 0, False, 0
+        self._kinds: Counter[str] = Counter()
+        self._by: Counter[str] = Counter()
+
+    def add(self, event: Event) -> None:
+        self.last = event
+        self.count += event.count
+        self.news = self.news or event.news
+        self._level = max(self._level, LEVELS.index(event.level))
+        _count(self._kinds, event.kind, event.count)
+        _count(self._by, event.by, event.count)
+
+    def line(self) -> Event:
+        """All of them in one, as bad as the worst; the words are the last one's."""
+        last, what = self.last, _numbered(self._kinds)
+        if self.count > last.count and last.text:
+            what = f"{what or f'{self.count} times'}; the last"
+        text = ": ".join(part for part in (what, last.text) if part)
+        level, by = LEVELS[self._level], ", ".join(self._by)
+        return Event(last.name, text, level, by, count=self.count)
+
+
+class Tally:
+    """How often each name has been told, and what waits."""
+
+    def __init__(self) -> None:
+        self._held: dict[EventName, _Held] = {}
+        self._free_ns: dict[EventName, int] = {}
+        """When each line of a name so far has had its second."""
+
+    def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
+        """What to write now, of these and of those that waited."""
+        for event in events:
+            self._held.setdefault(event.name, _Held()).add(event)
+        if not self._held:
+            return ()
+        told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
+        return tuple([self._held.pop(name).line() for name in told])
+
+    def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
+        """There is room for a line of this name; it is taken."""
+        free_ns = self._free_ns.get(name, now_ns)
+        if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
+            return False
+        self._free_ns[name] = max(free_ns, now_ns) + NS_PER_S
+        return True
+
+
+def _count(counts: Counter[str], what: str, times: int) -> None:
+    if what:
+        counts[what if what in counts or len(counts) < MOST else "others"] += times
+
+
+def _numbered(counts: Counter[str]) -> str:
+    """Like `12 x stale, 1 x not_finite`; what came once and alone without its number."""
+    if counts.total() == 1:
+        return next(iter(counts))
+    return ", ".join(f"{times} x {what}" for what, times in counts.most_common())

@@ -1,0 +1,265 @@
+"""What the log says of a day: who asked, what changed and why, and never too much of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import get_args
+
+import msgspec
+import pytest
+
+from acsard.incoming.commands import Arrival, Via
+from acsard.incoming.queries import Query
+from acsard.messages.topics import VERBS
+from acsard.values import NS_PER_S, Event, EventName
+from tests.scenarios.world import World
+
+LINES_A_SECOND = 6
+"""Of one name, at the worst: a burst of five, and the one that is due."""
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    world.events.clear()
+    return world
+
+
+def told(world: World, name: EventName) -> list[Event]:
+    return [event for event in world.events if event.name == name]
+
+
+def signed(name: str) -> bytes:
+    """The attachment of one who says who he is."""
+    return msgspec.json.encode({"sender": name})
+
+
+def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> None:
+    """A service called by somebody, ahead of which a stop comes as the bus hands it over."""
+    key, at_ns = f"srv/{service}", world.now_ns
+    if service == "stop":
+        world.bus.arrivals.append(
+            Arrival("stop", True, b"", "", at_ns, None, "", via=via, attachment=name)
+        )
+    payload = b'{"x": 1, "y": 2, "yaw": 0}' if service == "set_pose" else b""
+    query = Query(1, key, key, "", payload, "", at_ns, via, name)
+    world.bus.queries.append(query)
+    world.run(0.03)
+
+
+# who asked
+
+
+@pytest.mark.parametrize("service", [key.removeprefix("srv/") for key in VERBS])
+def test_every_service_is_told_once_with_who_called_it(world: World, service: str) -> None:
+    if service == "clear":
+        call(world, "stop", signed("ann@desk"))
+    call(world, service, signed("joe@laptop patrol"))
+    (event,) = (event for event in world.events if event.name == service)
+    assert event.by == "joe@laptop patrol (native)"
+    assert event.count == 1
+
+
+def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
+    for name in ("joe", "ann"):
+        call(world, "stop", signed(name))
+        call(world, "clear", signed(name + "@desk"))
+    asked = [(event.name, event.by) for event in world.events if event.by]
+    assert asked == [
+        ("stop", "joe (native)"),
+        ("clear", "joe@desk (native)"),
+        ("stop", "ann (native)"),
+        ("clear", "ann@desk (native)"),
+    ]
+
+
+def test_a_second_one_who_stops_is_told_too_a_second_later(world: World) -> None:
+    call(world, "stop", signed("joe"))
+    call(world, "stop", signed("ann"))
+    assert [event.by for event in told(world, "stop")] == ["joe (native)"]
+    world.run(1.0)
+    assert [event.by for event in told(world, "stop")] == ["joe (native)", "ann (native)"]
+
+
+def test_ros_says_less_of_who_calls_and_the_log_says_so(world: World) -> None:
+    call(world, "stop", bytes(16) + b"\x10" + bytes(range(16)), "rmw")
+    call(world, "clear", b"", "bridge")
+    assert told(world, "stop")[0].by == f"unnamed (rmw {bytes(range(16)).hex()})"
+    assert told(world, "clear")[0].by == "unnamed (bridge)"
+
+
+def test_a_put_on_stop_is_told_with_its_name_or_the_session_that_stamped_it(world: World) -> None:
+    world.put("stop", b"", stamp_ns=1)
+    world.run(2.0)
+    world.bus.arrivals.append(
+        Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=signed("ann"))
+    )
+    world.run(0.1)
+    assert [event.by for event in told(world, "stop")] == [
+        "unnamed (native, session peer)",
+        "ann (native)",
+    ]
+
+
+# what changed, and why
+
+
+def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
+    world.drive(0.5, seconds=0.5)
+    world.run(1.0)
+    assert [event.text for event in told(world, "mode")] == [
+        "ready -> driving: commanded by app",
+        "driving -> ready: no commands: no source has sent one within its timeout",
+    ]
+    assert [event.text for event in told(world, "commander")] == ["nobody -> app (native/app)"]
+
+
+def test_a_higher_priority_is_another_commander_and_so_is_going_back(world: World) -> None:
+    world.drive(0.5, seconds=0.3)
+    world.drive(0.3, seconds=0.3, source="teleop")
+    world.send(0.0, source="app")
+    world.run(1.0)
+    world.drive(0.5, seconds=0.3)
+    assert [event.by.partition(" ")[0] for event in told(world, "commander")] == [
+        "app",
+        "teleop",
+        "app",
+    ]
+
+
+def test_a_lost_cable_is_the_link_and_the_mode(world: World) -> None:
+    world.drive(0.5, seconds=0.5)
+    world.events.clear()
+    world.port.unplug()
+    world.run(0.1)
+    assert [event.name for event in world.events] == ["link_down", "mode"]
+    assert "driving -> waiting: the serial port is closed" in world.events[1].text
+
+
+# never too much
+
+
+def counted(events: list[Event]) -> int:
+    return sum(event.count for event in events)
+
+
+def test_refused_commands_are_a_line_a_second_by_reason_and_none_is_missing(world: World) -> None:
+    for step in range(500):
+        world.put("cmd/app" if step % 5 else "cmd/nobody", b'{"linear": {"x": 0.5}}')
+        world.send(0.1, source="stranger")
+        world.run(0.01)
+    world.run(1.1)
+    lines = told(world, "command_refused")
+    assert len(lines) <= 7
+    assert counted(lines) == 1000
+    assert "100 x unknown_source" in lines[2].text
+    assert "100 x wrong_shape" in lines[2].text
+
+
+def test_missed_periods_are_a_line_a_second_and_none_is_missing(world: World) -> None:
+    for _ in range(20):
+        world.stall(0.05)
+        world.run(0.05)
+    world.run(1.1)
+    lines = told(world, "missed_periods")
+    assert len(lines) <= 4
+    assert counted(lines) == world.state.counters["missed_periods"] > 60
+
+
+def test_a_wire_full_of_noise_is_a_line_a_second_and_none_is_missing(world: World) -> None:
+    with world.mcu.noise():
+        world.run(5.0)
+    world.run(1.1)
+    lines = told(world, "lines_rejected")
+    assert len(lines) <= 7
+    assert counted(lines) == world.state.counters["line_malformed"] > 20
+    assert lines[1].text.startswith(f"{lines[1].count} x malformed; the last: ")
+
+
+def most_lines(world: World) -> int:
+    """The most lines of one name since the last call."""
+    most = max(Counter(event.name for event in world.events).values(), default=0)
+    world.events.clear()
+    return most
+
+
+def test_a_cable_that_flaps_for_a_minute_is_some_lines_a_second(world: World) -> None:
+    most = []
+    for _ in range(60):
+        for _ in range(10):
+            world.port.unplug()
+            world.run(0.03)
+            world.port.plug(world.mcu)
+            world.run(0.07)
+        most.append(most_lines(world))
+    assert most[0] <= LINES_A_SECOND
+    assert max(most[LINES_A_SECOND:]) <= 2  # one is due each second, and a second has two ends
+
+
+def test_a_commander_slower_than_its_timeout_is_a_line_a_second(world: World) -> None:
+    most = []
+    for _ in range(20):
+        for _ in range(3):
+            world.send(0.0)
+            world.run(1 / 3)
+        most.append(most_lines(world))
+    assert max(most[LINES_A_SECOND:]) <= 2
+
+
+def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: World) -> None:
+    for turn in range(200):
+        world.send(0.0, source=("teleop", "app")[turn % 2])
+        world.run(0.3)
+    assert told(world, "commander")
+    # A turn every 0.3 s for 60 s.
+    assert len(told(world, "commander")) <= 60 + LINES_A_SECOND
+    assert counted(told(world, "commander")) == 200
+
+
+def test_a_thousand_names_are_a_short_line(world: World) -> None:
+    for number in range(1000):
+        name = signed("x" * 30 + str(number))
+        world.bus.arrivals.append(
+            Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=name)
+        )
+        world.run(0.001)
+    world.run(2.0)
+    assert len(told(world, "stop")) <= 3
+    assert max(len(event.by) + len(event.text) for event in told(world, "stop")) < 700
+
+
+def test_a_quiet_day_is_silent(world: World) -> None:
+    world.run(60.0)
+    assert world.events == []
+
+
+# at the end
+
+
+def test_the_totals_are_what_was_driven_and_counted(world: World) -> None:
+    world.drive(0.5, seconds=2.0)
+    world.send(0.0)
+    world.run(1.0)
+    world.drive(-0.5, seconds=2.0)
+    world.send(0.0)
+    world.run(1.0)
+    totals = world.loop.totals(world.now_ns)
+    assert totals["seconds"] == pytest.approx((world.now_ns - 5 * NS_PER_S) / 1e9, abs=0.1)
+    assert totals["metres"] == pytest.approx(2.0, rel=0.05)  # there and back
+    assert totals["commands"] == 84
+    assert totals["lines"] == world.state.counters["lines"]
+
+
+def test_every_name_is_one_of_the_set(world: World) -> None:
+    with world.mcu.noise():
+        world.drive(0.5, seconds=1.0)
+    world.mcu.reset(world.now_ns)
+    world.run(3.0)
+    for service in VERBS:
+        call(world, service.removeprefix("srv/"))
+    world.stall(0.5)
+    world.run(2.0)
+    names = {event.name for event in world.events}
+    assert len(names) > 10
+    assert names <= set(get_args(EventName))

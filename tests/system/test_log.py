@@ -1,0 +1,77 @@
+"""The log of the real process: who asked, what changed, how it began and ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from acsard import __version__
+from acsard.client import connect
+from tests.system.harness import Bus, Daemon, Peer, acsard, until
+
+
+def by(daemon: Daemon, name: str) -> list[Any]:
+    return [line["by"] for line in daemon.events(name)]
+
+
+def test_who_calls_is_told_by_the_name_he_gives_himself(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with connect(daemon.endpoint) as robot:
+            robot.call("set_pose", x=1.0, y=0.0, yaw=0.0)
+            robot.name = "patrol \x1b[2J(native)"
+            robot.call("stop")
+        call = acsard("call", "clear", "--connect", daemon.endpoint)
+        subprocess.run(call, check=True, capture_output=True)
+        bus.ask("srv/deactivate")
+        until(lambda: daemon.events("deactivate"), 5.0, "the last call is in the log")
+        (pose,), (stop,), (clear,) = (by(daemon, name) for name in ("set_pose", "stop", "clear"))
+    me = f"@{os.uname().nodename.partition('.')[0]}"
+    assert pose.endswith(f"{me} {Path(sys.argv[0]).stem.replace('__main__', 'pytest')} (native)")
+    assert stop == "patrol ??2J?native? (native)"
+    assert clear.endswith(f"{me} acsard (native)")
+    assert by(daemon, "deactivate") == ["unnamed (native)"]
+
+
+def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with connect(daemon.endpoint) as robot:
+            key, stamp = robot.key("stop"), robot.session.new_timestamp()
+            robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann"}')
+            (line,) = until(lambda: daemon.events("stop"), 5.0, "the stop is in the log")
+    assert line["by"] == f"ann (native, session {stamp.get_id()})"
+
+
+def test_a_day_is_told_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
+    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        bus.put("cmd/app", {"linear": {"x": 0.5}})
+        with bus.commanding(0.5):
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+        bus.ask("srv/stop")
+        until(lambda: daemon.events("command_refused"), 5.0, "what was refused is in the log")
+        daemon.signal(signal.SIGTERM)
+        assert daemon.ended(5.0) == 0
+        (started,), (ended,) = daemon.events("started"), daemon.events("ended")
+        modes = [line["text"].partition(":")[0] for line in daemon.events("mode")]
+        (commander,), (refused,) = daemon.events("commander"), daemon.events("command_refused")
+        last = daemon.err[-1]
+    assert (started["version"], started["robot"]) == (__version__, "acsar")
+    assert (started["port"], started["rate"]) == (str(peer.path), 100.0)
+    assert modes[:2] == ["waiting -> ready", "ready -> driving"]
+    assert modes[-2] in ("driving -> stopped", "ready -> stopped")
+    assert modes[-1] == "stopped -> leaving"
+    assert commander["text"].startswith("nobody -> app (")
+    assert refused["text"].startswith("wrong_shape: cmd/app: needs both")
+    assert refused["level"] == "warning"
+    assert '"ended"' in last
+    assert ended["seconds"] > 0.1
+    assert ended["metres"] > 0.01
+    assert ended["lines_sent"] > 10
+    assert ended["commands"] > 3
+    assert ended["command_wrong_shape"] == 1

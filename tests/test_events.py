@@ -1,0 +1,49 @@
+"""The names of events are a closed set, and the service's page has all of it."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import get_args
+
+from acsard.values import EventName, Verb
+
+ROOT = Path(__file__).parents[1]
+NAMES = get_args(EventName)
+
+
+def named() -> set[str]:
+    """The texts that stand where an event or a log line has its name."""
+    found = set()
+    for path in (ROOT / "acsard").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and node.args):
+                continue
+            called, first = ast.unparse(node.func), node.args[0]
+            events = called == "Event" or called.endswith("log.info")
+            if events and isinstance(first, ast.Constant):
+                found.add(str(first.value))
+    return found
+
+
+def test_each_name_in_the_code_is_in_the_set() -> None:
+    assert len(named()) > 15
+    assert named() <= set(NAMES)
+
+
+def test_each_name_of_the_set_is_in_the_code() -> None:
+    code = "".join(
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "acsard").rglob("*.py")
+        if path.name != "values.py"
+    )
+    plain = set(NAMES) - set(get_args(Verb))
+    assert not {name for name in plain if f'"{name}"' not in code}
+
+
+def test_the_page_lists_the_set_and_nothing_else() -> None:
+    page = (ROOT / "deploy/systemd/README.md").read_text(encoding="utf-8")
+    table = page.partition("| what | event |")[2].partition("\n\n")[0]
+    cells = [row.split("|")[2] for row in table.splitlines()[2:]]
+    assert re.findall(r"`(\w+)`", "".join(cells)) == list(NAMES)

@@ -1,0 +1,68 @@
+"""Modes, commanders and refused commands as the log has them."""
+
+from __future__ import annotations
+
+from acsard.drive.arbiter import Choice
+from acsard.drive.modes import Mode
+from acsard.drive.told import Told, missed, refused
+from acsard.values import REST, Event, Refusal, Twist, Wait
+
+NOBODY = Choice()
+
+
+def by(source: str, sender: str) -> Choice:
+    return Choice(source, REST, Wait("nothing"), 1, sender)
+
+
+def test_the_mode_it_starts_in_is_no_event() -> None:
+    assert Told(Mode.WAITING).changes(Mode.WAITING, NOBODY, "no link") == []
+
+
+def test_another_mode_is_told_once_with_why() -> None:
+    told = Told(Mode.WAITING)
+    assert told.changes(Mode.READY, NOBODY, "no commands") == [
+        Event("mode", "no commands", kind="waiting -> ready")
+    ]
+    assert told.changes(Mode.READY, NOBODY, "another reason") == []
+
+
+def test_who_begins_to_drive_is_told_with_the_mode_and_as_the_commander() -> None:
+    mode, commander = Told(Mode.READY).changes(Mode.DRIVING, by("app", "joe"), "driving: by app")
+    assert mode == Event("mode", "commanded by app", by="app (joe)", kind="ready -> driving")
+    assert commander == Event("commander", "", by="app (joe)", kind="nobody -> app (joe)")
+
+
+def test_another_commander_is_told_with_the_one_before() -> None:
+    told = Told(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+    (source,) = told.changes(Mode.DRIVING, by("nav", "joe"), "")
+    (sender,) = told.changes(Mode.DRIVING, by("nav", "ann"), "")
+    assert (source.kind, source.by) == ("app (joe) -> nav (joe)", "nav (joe)")
+    assert sender.kind == "nav (joe) -> nav (ann)"
+
+
+def test_who_drives_on_after_a_rest_is_no_other_commander() -> None:
+    told = Told(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+    told.changes(Mode.READY, NOBODY, "no commands")
+    (event,) = told.changes(Mode.DRIVING, by("app", "joe"), "")
+    assert event.name == "mode"
+
+
+def test_who_sends_to_a_stopped_robot_commands_nothing() -> None:
+    told = Told(Mode.STOPPED)
+    choice = Choice("app", Twist(1.0, 0.0), Wait("nothing"), 1, "joe")
+    assert told.changes(Mode.STOPPED, choice, "stopped") == []
+
+
+def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
+    event = refused(Refusal("stale", "source app: late", "app", "joe" * 100))
+    assert event == Event(
+        "command_refused", "source app: late", "warning", ("joe" * 100)[:40], "stale", news=False
+    )
+
+
+def test_missed_periods_are_counted_each() -> None:
+    assert missed(3) == Event(
+        "missed_periods", "3 in a row", "warning", kind="missed", count=3, news=False
+    )
