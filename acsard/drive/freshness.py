@@ -36,6 +36,9 @@ JITTER_NS = NS_PER_S // 200
 LONGEST_PROOF_NS = 2 * NS_PER_S
 """A proof takes the timeout of the source, but no longer than this."""
 
+JUMP_PROOF_NS = 3 * NS_PER_S // 2
+"""Who jumped takes so long: rather a backlog, let in by heaps, than a clock that was set."""
+
 GAP_NS = 2 * NS_PER_S
 """Who is silent for longer begins the proof again."""
 
@@ -66,14 +69,15 @@ class _Proof:
     """Whether delays are steady, from the one it began with on."""
 
     def __init__(self) -> None:
-        self._share = STEADY
-        self._first = self._delay = self._since_ns = self._heard_ns = 0
+        self._share, self._least_ns = STEADY, 0
+        self._first = self._delay = self._since_ns = 0
+        self._heard_ns = -GAP_NS - 1  # too long ago: the first one begins it
         self._met_ns: int | None = None
         """When a delay was first met again: what falls passes each but once."""
 
-    def begin(self, delay: int, at_ns: int, share: float = STEADY) -> Sign:
-        """From this command on."""
-        self._share, self._first = share, delay
+    def begin(self, delay: int, at_ns: int, share: float = STEADY, least_ns: int = 0) -> Sign:
+        """From this command on, for no less than that."""
+        self._share, self._least_ns, self._first = share, least_ns, delay
         self._look_from(delay, at_ns)
         return "wavering"
 
@@ -89,7 +93,7 @@ class _Proof:
         silence, self._heard_ns = at_ns - self._heard_ns, at_ns
         allowed = self._share * lasted_ns
         if more > timeout_ns or silence > GAP_NS or delay < self._first - EARLY_NS:
-            return self.begin(delay, at_ns, self._share)
+            return self.begin(delay, at_ns, self._share, self._least_ns)
         if more < -allowed:
             self._look_from(delay, at_ns)
             return "steady"
@@ -97,7 +101,7 @@ class _Proof:
             return "steady"  # jitter, unless none is as prompt again
         if self._met_ns is None:
             self._met_ns = at_ns
-        needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
+        needed_ns = max(self._least_ns, min(timeout_ns, LONGEST_PROOF_NS))
         met_again = at_ns - self._met_ns >= needed_ns // 2
         return "proven" if met_again and lasted_ns >= needed_ns else "steady"
 
@@ -113,13 +117,12 @@ class _Clock:
         """By how much the last one came later; by how much lately some came ever earlier."""
         self._heard_ns = at_ns
         self._proof = _Proof()
-        self._proof.begin(0, at_ns - GAP_NS - 1)  # too long ago: the first heard begins it
 
     def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
         """What to do with a command that took so long by the two clocks."""
         silence, self._heard_ns = at_ns - self._heard_ns, at_ns
         if silence > FORGET_NS:
-            self._state = "new"
+            self._state, self._proof = "new", _Proof()
         sign = self._sign(delay, at_ns, silence, timeout_ns)
         self._state, verdict = NEXT[self._state, sign]
         if sign == "proven":
@@ -138,7 +141,9 @@ class _Clock:
         if self._state == "stepped":
             return self._proof.add(delay, at_ns, timeout_ns)
         crept = abs(self._late - before) <= SLEWED * silence + JITTER_NS
-        return self._proof.begin(delay, at_ns, SLEWED if crept else STEADY)
+        if crept:
+            return self._proof.begin(delay, at_ns, SLEWED)
+        return self._proof.begin(delay, at_ns, STEADY, JUMP_PROOF_NS)
 
 
 class Freshness:

@@ -116,7 +116,7 @@ class Sender:
         usual = self._usual or 0.0
         enough = max(self._timeout_ns, min(1.5 * usual, self._pause_ns))
         if command.shared:  # whose zero it is, nobody knows
-            enough = self._longest_ns(usual)
+            enough = self._pause_ns + min(usual, self._pause_ns)
         return command.arrived_ns - self._moved_ns > enough
 
     def _paused(self, command: Command) -> bool:

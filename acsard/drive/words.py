@@ -32,8 +32,8 @@ def waiting(wait: Wait) -> str:
             return "a command"
         case "proof":
             return (
-                f"{wait.source} may be late: its delays must be steady for {wait.seconds:g} s, "
-                "since its clock is new here or was set"
+                f"{wait.source} may be late: its delays must be steady for {wait.seconds:g} s if "
+                "its clock is new here, for 1.5 s if that was set"
             )
         case "neutral":
             return (

@@ -209,7 +209,7 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     world.run(0.2)
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
-    assert "app may be late: its delays must be steady for 0.25 s" in world.state.reason
+    assert world.state.reason.startswith("app may be late: its delays must be steady")
     assert "app may be late" in {s.name: s.waits_for for s in world.state.sources}["app"]
     assert world.state.counters["command_unproven"] == 4
     client.hold(0.4, 0.3)

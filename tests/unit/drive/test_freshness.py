@@ -212,11 +212,11 @@ def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset
 
 
 @pytest.mark.parametrize("step", [300.0, 10_000.0, -100.0, -10_000.0])
-def test_a_clock_that_was_set_is_refused_until_its_delays_were_steady_for_a_timeout(
+def test_a_clock_that_was_set_is_refused_until_its_delays_were_steady_for_a_second_and_a_half(
     step: float,
 ) -> None:
-    verdicts = Clock().steadily(step, 400)
-    assert verdicts == [*["stale"] * 5, "set", *["fresh"] * 2]
+    verdicts = Clock().steadily(step, 1700)
+    assert verdicts == [*["stale"] * 30, "set", *["fresh"] * 3]
 
 
 @pytest.mark.parametrize("step", [200.0, -40.0])
@@ -261,8 +261,8 @@ def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
     assert bench.stamped(HIGH) == ""
     assert bench.driver() == "high"
     bench.offset_ns -= NS_PER_S
-    answers = [bench.wait(50).stamped(HIGH) for _ in range(10)]
-    assert answers == [*["stale"] * 5, *[""] * 5]
+    answers = [bench.wait(50).stamped(HIGH) for _ in range(35)]
+    assert answers == [*["stale"] * 30, *[""] * 5]
     assert bench.driver() == ""
     for _ in range(7):
         bench.wait(50).stamped(HIGH, twist=REST)

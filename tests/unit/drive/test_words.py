@@ -23,8 +23,8 @@ SENTENCES = [
     ),
     (
         Wait("proof", "high", 0.25),
-        "high may be late: its delays must be steady for 0.25 s, since its clock is new here or "
-        "was set",
+        "high may be late: its delays must be steady for 0.25 s if its clock is new here, for "
+        "1.5 s if that was set",
     ),
     (Wait("higher", "high"), "high has the higher priority: until it is silent"),
     (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),
@@ -48,8 +48,8 @@ def test_every_wait_has_its_sentence_above() -> None:
         (Choice(), "no commands: no source has sent one within its timeout"),
         (
             Choice(wait=Wait("proof", "app", 2.0)),
-            "app may be late: its delays must be steady for 2 s, since its clock is new here or "
-            "was set",
+            "app may be late: its delays must be steady for 2 s if its clock is new here, for "
+            "1.5 s if that was set",
         ),
         (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
         (
