@@ -326,7 +326,7 @@ def test_the_lists_of_certificates_are_the_subjects() -> None:
 @pytest.mark.parametrize("role", ROLES)
 def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
     """A subject without names could be anybody."""
-    access = Access(access=AccessConfig(**{f"{role}s": ()}))
+    access = Access(access=AccessConfig(**{f"{role}s": ()}))  # type: ignore[arg-type]
     assert role not in access.subjects
     assert set(access.subjects) == {*EVERYBODY} - {role}
     assert not any(role in policy["subjects"] for policy in access.value["policies"])
