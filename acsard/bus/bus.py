@@ -1,6 +1,6 @@
 """Owns the Zenoh session: declares every key, and hands on what came in and what goes out.
 
-Whatever may block (open, declare, reply, close) runs in a thread.
+Whatever may block (open, declare, put, reply, close) runs in a thread.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from functools import partial
 from types import TracebackType
 
 import zenoh
+from msgspec.structs import replace
 
 from acsard.bus.inbox import Inbox
 from acsard.bus.outlets import Outlets, direct
@@ -68,11 +69,17 @@ class ZenohBus:
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
-        return self._inbox.take(queries)
+        got = self._inbox.take(queries)
+        dropped, stuck = self._outlets.losses(clock.mono_ns())
+        return replace(got, dropped=dropped, stuck=stuck) if dropped or stuck else got
 
     def publish(self, key: str, message: Message) -> None:
-        """Send a message to its listeners."""
+        """Leave a message for its listeners, until `flush`."""
         self._outlets.publish(key, message)
+
+    def flush(self) -> None:
+        """Have what was published sent; never waits for it."""
+        self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:
         """Answer a query by its ticket."""
@@ -108,6 +115,7 @@ class ZenohBus:
             self._declare_ros(session, endpoint)
         for token in (self._alive, *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
+        self._outlets.start()
         return session
 
     def _declare_native(self, session: zenoh.Session) -> None:
@@ -152,9 +160,13 @@ class ZenohBus:
     ) -> None:
         self._replies.stop()
         try:
-            await in_thread(self._session.close, CLOSE_TIMEOUT_S)
+            await in_thread(self._close, CLOSE_TIMEOUT_S)
         except TimeoutError:
             pass  # a stuck remote; the process ends without its good-bye
+
+    def _close(self) -> None:
+        self._outlets.stop(CLOSE_TIMEOUT_S)
+        self._session.close()
 
 
 def _seen(session: zenoh.Session, token: str) -> bool:
