@@ -2,8 +2,9 @@
 
 Zenoh checks them at the daemon's own session, against the neighbour on the link: who is behind a
 router has the router's rights. A rule holds for a key expression that it includes, so what may be
-asked with a wildcard has to be allowed with one. What Zenoh lets pass is checked again in code
-(exact key, kind PUT, listed source).
+asked with a wildcard has to be allowed with one. Who comes by TLS gets exact keys only, since a few
+wildcards take Zenoh's time without bound. What Zenoh lets pass is checked again in code (exact
+key, kind PUT, listed source).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
+from acsard.messages.schema import MESSAGES
 from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
 from acsard.ros.transports import Endpoint, endpoints
 from acsard.values import ROOT, Verb
@@ -59,9 +61,16 @@ GRANTS: dict[Role, tuple[str, ...]] = {
         "maintain",
     ),
 }
-"""The rules each role has. A router is a maintainer, and tells of other robots that are alive."""
+"""The rules each role has. A router is a maintainer, and tells of a twin that is alive."""
 
-LOCAL = (*GRANTS["maintainer"], "look", "overhear", "err", "forge")
+WIDE: dict[Role, tuple[str, ...]] = {
+    "viewer": ("roam", "recall"),
+    "operator": ("roam", "recall"),
+    "maintainer": ("roam", "recall", "browse", "attend"),
+}
+"""What each role has besides with `access.wildcards`."""
+
+LOCAL = (*GRANTS["maintainer"], *WIDE["maintainer"], "look", "overhear", "err", "forge")
 """Who is at the machine may also look with any wildcard, hear commands, and be wrong: what is put
 on other keys is refused in code, which says why and counts it; but nobody speaks in the robot's
 place."""
@@ -110,6 +119,8 @@ class _Keys:
         """What listed sources send on."""
         asked = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "query"]
         self.questions = [key for key in asked if key != self.config]
+        self.exact_questions = [key for key in self.questions if "*" not in key]
+        self.exact_questions += [full_key(robot, f"schema/{name}") for name in MESSAGES]
         self.parameters = _of(ros, "query")
 
     def of(self, verb: Verb) -> list[str]:
@@ -134,7 +145,9 @@ def access_control(config: Config) -> dict[str, object]:
         for role, held in names.items()
         if held
     }
-    granted: dict[str, tuple[str, ...]] = {"local": LOCAL, **{r: GRANTS[r] for r in GRANTS}}
+    wide = WIDE if access.wildcards else dict.fromkeys(GRANTS, ())
+    granted: dict[str, tuple[str, ...]] = {"local": LOCAL}
+    granted |= {role: (*GRANTS[role], *wide[role]) for role in GRANTS}
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -158,24 +171,26 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
     answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
     watching = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
-    seen = [f"{ROOT}/**", *keys.published, *tokens]
-    maintained = [*services("maintainer"), keys.config, *keys.parameters, keys.all]
+    asked = [*keys.published, *keys.exact_questions, *services("viewer")]
+    maintained = [*services("maintainer"), keys.config, *keys.parameters]
     rules = (
         _rule("speak", "egress", SPOKEN, [*answered, *keys.heard, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
         _rule("overhear", "egress", ["put"], keys.heard),
-        _rule("watch", "ingress", watching, seen),
-        _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.kept]),
-        _rule(
-            "ask",
-            "ingress",
-            ["query"],
-            [*keys.published, *keys.kept, *keys.questions, *services("viewer")],
-        ),
+        # exact keys
+        _rule("watch", "ingress", watching, [*keys.published, keys.alive]),
+        _rule("appear", "ingress", ["liveliness_token"], [keys.alive]),
+        _rule("ask", "ingress", ["query"], asked),
         _rule("halt", "ingress", ["put"], [keys.stop]),
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("operate", "ingress", ["query"], services("operator")),
         _rule("maintain", "ingress", ["query"], maintained),
+        # wildcards: all robots at once, the discovery of ROS, what is kept for who comes late
+        _rule("roam", "ingress", watching, [f"{ROOT}/**", *tokens]),
+        _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),
+        _rule("browse", "ingress", ["query"], [keys.all]),
+        _rule("attend", "ingress", ["liveliness_token"], keys.kept),
+        # at the machine
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*answered, *tokens], "deny"),

@@ -1,6 +1,6 @@
 """Owns the Zenoh session: declares every key, and hands on what came in and what goes out.
 
-Whatever may block (open, declare, reply, close) runs in a thread.
+Whatever may block (open, declare, put, reply, close) runs in a thread.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ from functools import partial
 from types import TracebackType
 
 import zenoh
+from msgspec.structs import replace
 
 from acsard.bus.inbox import Inbox
 from acsard.bus.outlets import Outlets, direct
 from acsard.bus.replies import Replies
 from acsard.bus.session import daemon_session
 from acsard.config.settings import BusConfig, RosConfig
-from acsard.host import clock
+from acsard.host import clock, real_time
 from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
 from acsard.incoming.bus import BusInput, Waker
@@ -68,11 +69,17 @@ class ZenohBus:
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
-        return self._inbox.take(queries)
+        got = self._inbox.take(queries)
+        dropped, stuck = self._outlets.losses(clock.mono_ns())
+        return replace(got, dropped=dropped, stuck=stuck) if dropped or stuck else got
 
     def publish(self, key: str, message: Message) -> None:
-        """Send a message to its listeners."""
+        """Leave a message for its listeners, until `flush`."""
         self._outlets.publish(key, message)
+
+    def flush(self) -> None:
+        """Have what was published sent; never waits for it."""
+        self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:
         """Answer a query by its ticket."""
@@ -91,6 +98,7 @@ class ZenohBus:
         return self
 
     def _open(self) -> zenoh.Session:
+        real_time.hasten()
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
         if settings.connect and _seen(session, self._alive):
@@ -108,6 +116,7 @@ class ZenohBus:
             self._declare_ros(session, endpoint)
         for token in (self._alive, *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
+        self._outlets.start()
         return session
 
     def _declare_native(self, session: zenoh.Session) -> None:
@@ -152,9 +161,13 @@ class ZenohBus:
     ) -> None:
         self._replies.stop()
         try:
-            await in_thread(self._session.close, CLOSE_TIMEOUT_S)
+            await in_thread(self._close, CLOSE_TIMEOUT_S)
         except TimeoutError:
             pass  # a stuck remote; the process ends without its good-bye
+
+    def _close(self) -> None:
+        self._outlets.stop(CLOSE_TIMEOUT_S)
+        self._session.close()
 
 
 def _seen(session: zenoh.Session, token: str) -> bool:

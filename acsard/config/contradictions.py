@@ -48,6 +48,8 @@ def warnings(config: Config) -> list[str]:
         )
     if config.bus.insecure:
         found.append("bus.insecure = true: everyone who reaches the bus can drive this robot")
+    if config.access.wildcards:
+        found.append("access.wildcards = true: everyone with a certificate can stall the bus")
     hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
     if config.robot.id == Config().robot.id and not all(_is_loopback(h) for h in hosts if h):
         found.append(

@@ -223,6 +223,7 @@ class AccessConfig(Struct, frozen=True):
     viewers: tuple[CommonName, ...] = ("viewer",)
     operators: tuple[CommonName, ...] = ("operator",)
     maintainers: tuple[CommonName, ...] = ("maintainer",)
+    wildcards: bool = False
 
 
 class RosConfig(Struct, frozen=True):

@@ -19,6 +19,10 @@ class BusInput(Struct, frozen=True):
     queries: tuple[Query, ...] = ()
     overrun: int = 0
     """Samples dropped because they came faster than they could be taken."""
+    dropped: int = 0
+    """Messages of ours dropped because the bus did not take them in time."""
+    stuck: bool = False
+    """The bus has just been found not to take them at all."""
 
 
 class Waker(Protocol):
@@ -42,7 +46,10 @@ class Bus(Protocol):
         """What came in since the last call, at most so many queries."""
 
     def publish(self, key: str, message: Message) -> None:
-        """Send a message to its listeners."""
+        """Leave a message for its listeners, until `flush`."""
+
+    def flush(self) -> None:
+        """Have what was published sent; never waits for it."""
 
     def reply(self, reply: Reply) -> None:
         """Answer a query by its ticket."""

@@ -243,7 +243,8 @@ class Report:
                     for name, one in figures.items()
                     for when, spread in (("", one.since_start), ("_minute", one.last_minute))
                     for share in ("p50", "p99", "max")
-                },
+                }
+                | {k: str(v) for k, v in counters.items() if k.startswith("bus")},
             ),
             (
                 "commands",

@@ -44,6 +44,9 @@ QUERIES_PER_STEP = 8
 """Replies built in one step; a crowd of questions waits its turn instead of costing a period."""
 
 
+BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
+
+
 class ControlLoop:
     """One robot between its port and its bus."""
 
@@ -149,6 +152,11 @@ class ControlLoop:
         commands, refusals, requests = [], [], []
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
+        if got.dropped:
+            self.robot.counters["bus_dropped"] += got.dropped
+        if got.stuck:
+            self.robot.counters["bus_stuck"] += 1
+            self._log(BUS_STUCK)
         for arrival in got.arrivals:
             if arrival.key == "stop":
                 if arrival.put:
@@ -208,6 +216,7 @@ class ControlLoop:
             bus.publish(key, message)
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
+        bus.flush()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
         for answer in outputs.answers:

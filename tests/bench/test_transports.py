@@ -202,8 +202,11 @@ def encoded(
         async with bus:
             with listening(one, keys, 1 if keys else 0):
                 made.clear()  # what is kept for late comers
-                for _ in range(count):
+                for number in range(1, count + 1):
                     bus.publish("odom", odometry("odom", "base_link"))
+                    bus.flush()
+                    while keys and max(made.values(), default=0) < number:
+                        await asyncio.sleep(0.0005)
 
     asyncio.run(publish())
     return made

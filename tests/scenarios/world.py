@@ -96,6 +96,8 @@ class MemoryBus:
     def publish(self, key: str, message: Message) -> None:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
 
+    def flush(self) -> None: ...
+
     def reply(self, reply: Reply) -> None:
         self.replies.setdefault(reply.ticket, []).append(reply)
 

@@ -54,7 +54,11 @@ class Certificates:
         """The settings of a client that comes as `who`; all of them know the robot's CA."""
         if who == "local":
             return client_config(plain)
-        return self.shown(tls, self._client.get(who))
+        return self.shown(tls, self.own(who))
+
+    def own(self, who: Identity) -> Path | None:
+        """The directory of their certificate."""
+        return self._client.get(who)
 
     def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
         """The settings of a client that shows the certificate in `own`, or none."""

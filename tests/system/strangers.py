@@ -193,3 +193,66 @@ BUSY = "while True: pass"
 def words(program: str, *arguments: object) -> list[str]:
     """The words that run such a program."""
     return [sys.executable, "-c", program, *map(str, arguments)]
+
+
+HOSTILE = """\
+import json, os, sys, time
+import zenoh
+form, door, settings, seconds = sys.argv[1:]
+os.nice(19)
+
+def session():
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", json.dumps([door]))
+    config.insert_json5("transport/link/tls", settings)
+    return zenoh.open(config)
+
+def deep(end, before="acsard/"):
+    return before + "**/a/" * 11 + end
+
+def chunk(end):
+    return "acsard/" + "$*a" * 11 + "$*" + end
+
+adv, lv = "acsard/acsar/tf_static/@adv/", "@ros2_lv/"
+# Each of the two in a session of its own, which does not have to compare them.
+one, two = session(), session()
+hold = lambda sample: None
+pair = {
+    "subscribe": lambda s, end: s.declare_subscriber(deep(end), hold),
+    "chunk": lambda s, end: s.declare_subscriber(chunk(end), hold),
+    "late": lambda s, end: s.declare_subscriber(deep(end, adv), hold),
+    "ros": lambda s, end: s.liveliness().declare_subscriber(deep(end, lv), hold),
+    "alive": lambda s, end: s.liveliness().declare_subscriber(deep(end), hold),
+    "token": lambda s, end: s.liveliness().declare_token(deep(end)),
+    "ask": lambda s, end: s.get(deep(end)),
+    "serve": lambda s, end: s.declare_queryable(deep(end), hold),
+    "name": lambda s, end: s.declare_keyexpr(deep(end)),
+    "publish": lambda s, end: s.declare_publisher(deep(end)),
+    "querier": lambda s, end: s.declare_querier(deep(end)),
+}
+many = {
+    "many": "acsard/**/x%d/**/odom",
+    "many_chunks": "acsard/$*x%d$*",
+    "many_exact": "acsard/acsar/x%d",
+}
+print("begun", flush=True)
+end = time.monotonic() + float(seconds)
+if form == "sessions":
+    kept = [one, two]
+    while time.monotonic() < end:
+        try:
+            kept.append(session())
+        except zenoh.ZError:
+            time.sleep(0.01)
+elif form in many:
+    kept = [one.declare_subscriber(many[form] % i, hold) for i in range(700)]
+else:
+    kept = [pair[form](one, "b"), pair[form](two, "c")]
+print("declared", flush=True)
+time.sleep(max(0.0, end - time.monotonic()))
+os._exit(0)
+"""
+"""Somebody who is let in with some certificate: key expressions that take long to compare, many
+that take long to forget, or all the sessions there are; goes after so many seconds."""

@@ -123,12 +123,12 @@ def _ros_commands() -> Iterator[Try]:
 
 
 def _questions() -> Iterator[Try]:
-    asked = (*VALUES, "info", "topics", "interfaces", "schema/Twist", "schema/*")
+    asked = (*VALUES, "info", "topics", "interfaces", "schema/Twist")
     yield from (Try(f"{ME}/{key}", ANYBODY) for key in asked)
-    yield from (
-        Try(f"{key}/@adv/**", ANYBODY) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC)
-    )
-    yield from (Try(f"{ME}/{key}", KEEPERS) for key in ("config", "*", "**"))
+    # By wildcard at the machine only.
+    yield from (Try(f"{key}/@adv/**", HERE) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC))
+    yield Try(f"{ME}/config", KEEPERS)
+    yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
     yield from (Try(f"{ME}/{key}", NOBODY) for key in services)
     wilder = ("acsard/*/state", "acsard/*/srv/stop", "acsard/**", "**")
@@ -155,19 +155,19 @@ def _services() -> Iterator[Try]:
 
 def _subscriptions() -> Iterator[Try]:
     often = [value for value in VALUES if value != "tf_static"]
-    yield from (Try(f"{ME}/{key}", ANYBODY) for key in (*often, "*", "**"))
+    yield from (Try(f"{ME}/{key}", ANYBODY) for key in often)
     for name, (kind, _, late) in ros.PUBLISHED.items():
         how: Literal["plain", "late"] = "late" if late else "plain"
         yield Try(name, ANYBODY, how=how)
         yield Try(ros.rmw_key(name, kind), ANYBODY, how=how)
     yield Try(f"{ME}/tf_static", ANYBODY, how="late")
-    tokens = (f"{ME}/alive", "acsard/*/alive", "@ros2_lv/**", "@ros2_lv/0/**", "@/*/@ros2_lv/**")
-    yield from (Try(key, ANYBODY, how="token") for key in tokens)
+    yield Try(f"{ME}/alive", ANYBODY, how="token")
+    tokens = ("acsard/*/alive", "@ros2_lv/**", "@ros2_lv/0/**", "@/*/@ros2_lv/**")
+    yield from (Try(key, HERE, how="token") for key in tokens)
     yield from (Try(key, NOBODY, how="token") for key in ("**", f"{OTHER}/alive"))
-    # Who watches a fleet writes this, and gets what each robot publishes.
-    yield from (Try(key, ANYBODY) for key in ("acsard/*/odom", "acsard/**"))
     # At the machine any wildcard will do: what is published there is no secret there.
-    yield from (Try(key, HERE) for key in ("**", "*", "0/**", "0/odom/**"))
+    wild = (f"{ME}/*", f"{ME}/**", "acsard/*/odom", "acsard/**", "**", "*", "0/**", "0/odom/**")
+    yield from (Try(key, HERE) for key in wild)
     others = (f"{OTHER}/odom", f"{OTHER}/**", "other/odom", "0/other/odom/**", "1/odom/**")
     yield from (Try(key, NOBODY) for key in others)
     commands = (f"{ME}/cmd/app", f"{ME}/cmd/*", f"{ME}/cmd/**", "cmd_vel", RMW_CMD)
@@ -301,7 +301,10 @@ class Visitor:
 
     def _patience(self, rows: Sequence[Try]) -> int:
         """Control periods to wait for: what should come is given the time a busy machine takes."""
-        return 200 if all(self._who in row.who for row in rows) else 5
+        if not all(self._who in row.who for row in rows):
+            return 5
+        # What was before is said again every 5 s, for those who cannot ask for it.
+        return 700 if any(row.how == "late" for row in rows) else 200
 
     def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
         """Whether any of these puts or deletes had an effect."""

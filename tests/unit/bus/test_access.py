@@ -59,6 +59,7 @@ class Access:
 
 
 DEFAULT = Access()
+TRUSTING = Access(access=AccessConfig(wildcards=True))
 FROM: dict[Role, set[str]] = {
     "viewer": {"viewer", "operator", "maintainer", "local"},
     "operator": {"operator", "maintainer", "local"},
@@ -122,8 +123,17 @@ def test_everybody_admitted_may_follow_and_ask_for_what_is_published(topic: Any)
 
 
 @pytest.mark.parametrize("below", ["*", "**", "cmd_v$*"])
-def test_everybody_admitted_may_follow_the_robot_by_wildcard(below: str) -> None:
-    assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == FROM["viewer"]
+def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
+    assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
+    assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
+    heard = [rule for rule in DEFAULT.rules_of(role) if "ingress" in rule["flows"]]
+    named = [key for rule in heard for key in rule["key_exprs"]]
+    assert named
+    assert not [key for key in named if "*" in key]
 
 
 LEAST: dict[str, Role] = {
@@ -157,9 +167,10 @@ def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic:
 
 
 def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
-    for key in (DEFAULT.key("alive"), "acsard/*/alive"):
-        assert DEFAULT.who("declare_liveliness_subscriber", key) == FROM["viewer"]
-        assert DEFAULT.who("liveliness_query", key) == FROM["viewer"]
+    for message in ("declare_liveliness_subscriber", "liveliness_query"):
+        assert DEFAULT.who(message, DEFAULT.key("alive")) == FROM["viewer"]
+        assert DEFAULT.who(message, "acsard/*/alive") == {"local"}
+        assert TRUSTING.who(message, "acsard/*/alive") == FROM["viewer"]
     for who in EVERYBODY:
         assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
 
@@ -168,7 +179,8 @@ def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:
     ros = endpoints(RosConfig(), ZID)
     for key in (DEFAULT.key("tf_static"), *(e.key for e in ros if e.latched)):
         for message in ("query", "declare_subscriber"):
-            assert DEFAULT.who(message, f"{key}/@adv/**") == FROM["viewer"]
+            assert DEFAULT.who(message, f"{key}/@adv/**") == {"local"}
+            assert TRUSTING.who(message, f"{key}/@adv/**") == FROM["viewer"]
         for who in EVERYBODY:
             assert DEFAULT.lets(who, "reply", f"{key}/@adv/**", "egress")
 
@@ -205,7 +217,7 @@ def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> 
     """A wildcard that meets a service is not let through, so neither is one that includes it."""
     services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
     services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
-    for rule in DEFAULT.rules_of(role):
+    for rule in TRUSTING.rules_of(role):
         if "ingress" in rule["flows"] and "query" in rule["messages"]:
             for held in map(zenoh.KeyExpr, rule["key_exprs"]):
                 met = [service for service in services if held.intersects(zenoh.KeyExpr(service))]
@@ -214,7 +226,7 @@ def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> 
 
 def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
     for key in ("acsard/*/config", "acsard/**", "**", "acsard/*", "0/**", "acsard/other/srv/stop"):
-        assert DEFAULT.who("query", key) == set()
+        assert DEFAULT.who("query", key) == TRUSTING.who("query", key) == set()
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -314,7 +326,7 @@ def test_the_lists_of_certificates_are_the_subjects() -> None:
 @pytest.mark.parametrize("role", ROLES)
 def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
     """A subject without names could be anybody."""
-    access = Access(access=AccessConfig(**{f"{role}s": ()}))
+    access = Access(access=AccessConfig(**{f"{role}s": ()}))  # type: ignore[arg-type]
     assert role not in access.subjects
     assert set(access.subjects) == {*EVERYBODY} - {role}
     assert not any(role in policy["subjects"] for policy in access.value["policies"])
