@@ -145,7 +145,7 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "wheels_turned", "missed_periods",
+    "lines_rejected", "wheels_turned", "bus_stuck", "missed_periods",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
 ]  # fmt: skip

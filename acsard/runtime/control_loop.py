@@ -156,7 +156,7 @@ class ControlLoop:
             self.robot.counters["bus_dropped"] += got.dropped
         if got.stuck:
             self.robot.counters["bus_stuck"] += 1
-            self._log(BUS_STUCK)
+            self._others.append(BUS_STUCK)
         for arrival in got.arrivals:
             if arrival.key == "stop":
                 if arrival.put:
