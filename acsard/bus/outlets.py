@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from acsard.host import clock
+from acsard.host import clock, real_time
 from acsard.messages.encodings import Format, encode
 from acsard.messages.schema import Message
 from acsard.ros.attachments import Attachment
@@ -132,6 +132,7 @@ class Outlets:
             self._bell.release()
 
     def _run(self) -> None:
+        real_time.follow()
         try:
             leaving = False
             while not leaving:
