@@ -33,8 +33,8 @@ OPTIONS: dict[str, Any] = {
 HELD = 4
 """Messages of one topic that wait for the thread, the newest: a step may fold a few lines."""
 
-STUCK_NS = NS_PER_S // 10
-"""A round of puts takes 0.1 ms; one that takes longer than this is held up by somebody."""
+STUCK_NS = NS_PER_S // 4
+"""A round of puts takes 0.1 ms, a few more on a busy machine; longer, and somebody holds it up."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """As rmw_zenoh has it for what is kept for late comers."""
