@@ -17,7 +17,7 @@ from acsard.bus.outlets import Outlets, direct
 from acsard.bus.replies import Replies
 from acsard.bus.session import daemon_session
 from acsard.config.settings import BusConfig, RosConfig
-from acsard.host import clock, real_time
+from acsard.host import clock
 from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
 from acsard.incoming.bus import BusInput, Waker
@@ -98,7 +98,6 @@ class ZenohBus:
         return self
 
     def _open(self) -> zenoh.Session:
-        real_time.hasten()
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
         if settings.connect and _seen(session, self._alive):

@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from acsard.host import clock
+from acsard.host import clock, real_time
 from acsard.messages.encodings import Format, encode
 from acsard.messages.schema import Message
 from acsard.ros.attachments import Attachment
@@ -33,8 +33,8 @@ OPTIONS: dict[str, Any] = {
 HELD = 4
 """Messages of one topic that wait for the thread, the newest: a step may fold a few lines."""
 
-STUCK_NS = NS_PER_S // 10
-"""A round of puts takes 0.1 ms; one that takes longer than this is held up by somebody."""
+STUCK_NS = NS_PER_S // 4
+"""A round of puts takes 0.1 ms, a few more on a busy machine; longer, and somebody holds it up."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """As rmw_zenoh has it for what is kept for late comers."""
@@ -132,6 +132,7 @@ class Outlets:
             self._bell.release()
 
     def _run(self) -> None:
+        real_time.follow()
         try:
             leaving = False
             while not leaving:

@@ -1,7 +1,8 @@
 """What the operating system can do for punctuality: asked for once, before any thread starts.
 
-Only the control loop's own thread becomes real-time. The bus's threads are ahead of the rest and no
-more, so that no flood on the bus competes with the loop or takes the machine; children get nothing.
+Only the control loop's own thread becomes real-time, and behind it the one that sends what the loop
+publishes: what it starts (the bus's threads, children) does not inherit it, so that no flood on the
+bus competes with the loop.
 """
 
 from __future__ import annotations
@@ -9,15 +10,11 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-import threading
 from contextlib import suppress
 from pathlib import Path
 
 PRIORITY = 10
 """Ahead of everything that is not real-time, behind the kernel's own interrupt threads (50)."""
-
-NICE = -10
-"""Of the bus's threads: on a busy machine they get nine tenths of a core, the others the rest."""
 
 SPIN_S = 1
 """How long the loop may run in one go before the kernel ends it: it is ahead of everything else
@@ -42,20 +39,21 @@ def ask() -> str:
         return ""
     return (
         f"no permission for {', '.join(refused)}: a period or a command can be late; the service "
-        "(acsard service install) has it, or give the user rtprio 10, nice -10 and memlock "
-        "unlimited in /etc/security/limits.conf, or set control.real_time = false to do without"
+        "(acsard service install) has it, or give the user rtprio 10 and memlock unlimited in "
+        "/etc/security/limits.conf, or set control.real_time = false to do without"
     )
 
 
-def hasten() -> None:
-    """For the thread that opens the bus, whose threads inherit it: ahead of what is not real-time.
+def follow() -> None:
+    """For a thread that the loop hands work to: behind the loop, ahead of all that is not so.
 
-    Not real-time themselves: a flood keeps them busy, and the rest of the machine must have its
-    share. With the loop they have the permission or go without it.
+    Without the permission, or when the loop has not got it either, it stays as it is.
     """
-    if os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+    if os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        return
+    behind = os.sched_param(os.sched_getparam(os.getpid()).sched_priority - 1)
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, behind)
 
 
 def _schedule() -> bool:

@@ -26,7 +26,7 @@ step_time        from the start of a step to the end of its work
 command_age      from a command's arrival here to each line that follows it
 command_to_wire  from a command's arrival here to the line that first follows it, handed to the
                  port; one that first waited for its source's turn is not counted
-feedback_to_bus  from the read of a feedback line's end to its messages handed to the bus; before
+feedback_to_bus  from the read of a feedback line's end to its messages left for the bus; before
                  that it may have waited in the kernel, for no longer than the loop stood still
 mcu_round_trip   from a line to the end of its answer, where a checked reply tells which line it
                  answers; lines are pipelined, and nothing else does

@@ -14,8 +14,9 @@ from statistics import median
 
 import pytest
 
+from acsard.bench.matching import staircase
 from acsard.bench.record import feedback_fates
-from acsard.bench.rig import ACSARD
+from acsard.bench.rig import ACSARD, SPACING_S
 from tests.bench.rigs import (
     DRAINING,
     POLLED,
@@ -77,6 +78,23 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
     if min(asserted) < PROMISED:
         print(f"below the {PROMISED:g} times of a quiet machine")
     assert min(asserted) >= ASSERTED
+
+
+def test_what_a_commanded_robot_costs_beside_polled() -> None:
+    costs: dict[str, list[float]] = {"acsard": [], "polled": []}
+    for number in range(ROUNDS):
+        for name, words in (("acsard", ACSARD), ("polled", POLLED)):
+            with rig(config(), words) as running:
+                costs[name].append(running.command(SECONDS, staircase, number))
+                running.end()
+    ratios = [ours / theirs for ours, theirs in zip(*costs.values(), strict=True)]
+    print(f"\none subscriber, {1 / SPACING_S[1]:.0f} to {1 / SPACING_S[0]:.0f} commands a second:")
+    for name, shares in costs.items():
+        print(f"  {name:8}{100 * median(shares):.1f} % of a core")
+    print(
+        f"  {median(ratios):.2f} times as much (by round {', '.join(f'{r:.2f}' for r in ratios)})"
+    )
+    assert median(ratios) < 5.0
 
 
 def standing(waiting: list[int], per_second: int) -> list[int]:
