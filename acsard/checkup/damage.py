@@ -10,8 +10,7 @@ from acsard.checkup import manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import GLANCE_S, SPEED
-from acsard.checkup.motion import ZERO
-from acsard.checkup.wheels import moving
+from acsard.checkup.motion import ZERO, moving
 from acsard.mcu.check import seal
 from acsard.mcu.frames import LETTERS
 
@@ -65,6 +64,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if not motors:
         return manual.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
+    board.listen(GLANCE_S)  # a coarse encoder may show the last of what they ran on only now
     took = [broken for broken in lines if _moves(board, broken.line)]
     if not took:
         return manual.find("damaged lines: right", lines=len(lines))

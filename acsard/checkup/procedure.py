@@ -73,7 +73,7 @@ def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], No
     for channel in turning.channels(board, operator):
         channels.append(channel)
         tell(encoder_finding(board.mcu, channel))
-    tell(turning.comma(board, channels[-1]))
+    tell(dialect.comma(board, channels[-1].kind == "dead"))
     tell(wheel_map(board.mcu, channels))
     right = [channel.motor for channel in channels if channel.kind == "right"]
     tell(counts.finding(board, right))
