@@ -27,16 +27,12 @@ LEAST_S = 0.001
 FAREWELL = 5
 """How many times the last zeros go out, in each form."""
 
-Answer = tuple[float, Reply]
-"""After how many seconds, and what."""
-
 
 class Board:
-    """One wire; enter it to begin, leaving sends zeros and falls silent, whatever happened."""
+    """One wire; entering opens it, leaving sends zeros and falls silent, whatever happened."""
 
     def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
-        self.is_open = False
         self.armed = False
         """The motors have been seen to stand: from now on a runaway ends the check."""
         # its language, as it is found out
@@ -72,16 +68,15 @@ class Board:
     def open(self, baud_rate: int) -> None:
         """Open the line at this rate; what was half received is forgotten."""
         self.wire.open(baud_rate)
-        self.is_open, self.baud_rate, self.heard_bytes = True, baud_rate, 0
+        self.baud_rate, self.heard_bytes = baud_rate, 0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
 
     def __enter__(self) -> Board:
+        self.open(self.mcu.baud_rate)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if not self.is_open:
-            return
         try:
             self._farewell()
         except BaseException:
@@ -145,17 +140,18 @@ class Board:
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
-        self.sent_s = self.now_s
 
     def ask(self, motors: Motors = ZERO, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """One command, and its answer waited for, a period at the least."""
         self.send(motors, comma)
         self.listen(max(wait_s, self.period_s))
 
-    def answers(self, lines: int, wait_s: float, comma: bool | None = None) -> list[Answer]:
+    def answers(
+        self, lines: int, wait_s: float, comma: bool | None = None
+    ) -> list[tuple[float, Reply]]:
         """The first reply to each of so many lines, sent one by one, and how soon it came."""
         self.listen(max(limits.GLANCE_S / 4, wait_s))  # one to an earlier line is none to these
-        got: list[Answer] = []
+        got: list[tuple[float, Reply]] = []
         for _ in range(lines):
             self.ask(ZERO, max(wait_s, 1.5 * self.period_s), comma)
             first = motion.since(self.replies, self.sent_s)[:1]

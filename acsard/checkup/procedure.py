@@ -45,7 +45,6 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
 
     try:
         with Board(wire, config.mcu, config.rate_hz) as board:
-            board.open(config.mcu.baud_rate)
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(manual.find("wheels: not lifted"))

@@ -104,11 +104,9 @@ def probe(board: Board, motor: int) -> Motors | None:
     """
     began_s = board.now_s
     shown = _probe(board, motor, limits.SPEED / 2)
-    if shown is None:
-        return None
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
-    if len(seen) >= 3 and max(seen) < 0:
+    if shown is None or (len(seen) >= 3 and max(seen) < 0):
         return shown  # no need to drive a reversed one away twice
     if not moving(shown, limits.PROBE_MOVES):
         return _probe(board, motor, limits.SPEED)

@@ -11,23 +11,14 @@ does not say how far: it is asked after silences of different lengths whether it
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import cycle
 
 from msgspec import Struct
 
-from acsard.checkup import counts, manual, motion
+from acsard.checkup import counts, damage, limits, manual, motion
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.checkup.limits import (
-    CUT_S,
-    PATIENCE_S,
-    PERIOD_S,
-    RUNAWAY,
-    SPEED,
-    STOOD_S,
-    WATCHDOG_LEAST_S,
-    WATCHDOG_MOST_S,
-)
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.turning import run_up
 from acsard.config.baud import FIELD
@@ -35,6 +26,9 @@ from acsard.mcu.frames import LETTERS, Motors
 
 FED = 0.75
 """Of the full speed, over all of that time: a watchdog that is right leaves less."""
+
+FEEDING = ("a wrong letter", "neither p nor n", "cut short")
+"""Broken lines that a watchdog may be fed by."""
 
 FINE_S = 0.03
 """How finely it is found by asking."""
@@ -78,7 +72,9 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     judged = _judged(least_s, most_s)
     if judged.verdict == "FAIL":
         return judged
-    fed = run(board, motors, max(CUT_S, 2 * most_s) + stop.slow_s, _broken(board, motors))
+    lines = damage.broken_lines(board.comma, board.sealed, motors)
+    broken = cycle(line for what, line in lines if what in FEEDING)
+    fed = run(board, motors, max(limits.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= FED * fed.silent_s:
         return manual.find("watchdog: fed", figure=judged.figure)
     return judged
@@ -90,11 +86,11 @@ def _judged(least_s: float, most_s: float) -> Finding:
     middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
     least_s, most_s = round(least_s, 2), round(most_s, 2)  # it is measured no finer
-    if least_s > WATCHDOG_MOST_S:
+    if least_s > limits.WATCHDOG_MOST_S:
         outcome = "late"
-    elif most_s < WATCHDOG_LEAST_S:
+    elif most_s < limits.WATCHDOG_LEAST_S:
         outcome = "early"
-    elif most_s > WATCHDOG_MOST_S:
+    elif most_s > limits.WATCHDOG_MOST_S:
         outcome = "unclear"
     else:
         outcome = "right"
@@ -104,14 +100,14 @@ def _judged(least_s: float, most_s: float) -> Finding:
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     """How long these motors, which turn as told and `stop` so, run on in a silence."""
     least_s = 0.0
-    for length_s in (CUT_S + stop.slow_s, STOOD_S + stop.slow_s):
+    for length_s in (limits.CUT_S + stop.slow_s, limits.STOOD_S + stop.slow_s):
         found = run(board, motors, length_s)
         ran_on_s = found.ran_s - stop.ran_s
         if ran_on_s < 0.95 * found.silent_s:
             break
         least_s = found.silent_s
     else:
-        return STOOD_S, UNKNOWN
+        return limits.STOOD_S, UNKNOWN
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
@@ -131,16 +127,16 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
         else:
             most_s = min(most_s, answer.silent_s)
     # The reply that tells is of a moment after the silence, as the ordinary stop's is.
-    late_s, about_s = stop.slow_s - board.period_s, PERIOD_S / 2 + 2 * stop.grain_s
-    late_s -= PERIOD_S / 2
-    return max(0.0, least_s - late_s - about_s), max(0.0, most_s - late_s + about_s)
+    least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
+    most_s -= stop.slow_s - board.period_s - limits.PERIOD_S - 2 * stop.grain_s
+    return max(0.0, least_s), max(0.0, most_s)
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, say nothing for so long (or something else instead), and stop."""
     began_s = board.now_s
     full = run_up(board, command(motors))
-    if max(abs(full[motor]) for motor in motors) < SPEED / 2:
+    if max(abs(full[motor]) for motor in motors) < limits.SPEED / 2:
         board.rest()
         letters = ", ".join(LETTERS[motor] for motor in motors)
         raise StoppedError(manual.find("watchdog: weak", letters=letters))
@@ -157,38 +153,32 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     board.rest()
     first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
     course = motion.since(board.replies, told_s)
-    slow_s = next((r.at_s - told_s for r in course if _share(r, motors) < STOPPED), PATIENCE_S)
+    slow_s = next(
+        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), limits.PATIENCE_S
+    )
     # The reply to the last line has what was measured when it took effect.
-    answered = not board.own_clock and course[0].at_s < told_s + PERIOD_S + 2 * board.gap_s
+    answered = not board.own_clock and course[0].at_s < told_s + limits.PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
-    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= SPEED / 2)
+    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= limits.SPEED / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
 
 
 def command(motors: Sequence[int]) -> Motors:
     """All of these at once."""
-    return motion.each(lambda motor: SPEED if motor in motors else 0.0)
-
-
-def _broken(board: Board, motors: Sequence[int]) -> Iterator[bytes]:
-    """Commands with a fault, another each time; no way to read them tells more than `SPEED`."""
-    while True:
-        yield board.line(command(motors))[:20] + b"\r\n"
-        yield board.line(command(motors)).replace(b"b", b"x", 1)
-        yield board.line(command(motors)).replace(b"p", b"q", 1)
+    return motion.each(lambda motor: limits.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
     """Counts that tell how far they ran; 0 where they stand, or can wrap in the longest silence."""
     per_turn = counts.per_turn(board.replies, motors) or 0.0
-    wraps = per_turn * RUNAWAY / math.tau * STOOD_S >= FIELD / 2
+    wraps = per_turn * limits.RUNAWAY / math.tau * limits.STOOD_S >= FIELD / 2
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
     """The fastest of these motors, as a share of the speed they were told."""
-    return max(abs(reply.motors[motor]) for motor in motors) / SPEED
+    return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED
 
 
 def _grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
@@ -198,4 +188,4 @@ def _grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
     between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
     speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
     # One that is damaged is no jump.
-    return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
+    return max(course[-2] - course[1] for course in speeds) * between_s / limits.SPEED

@@ -9,13 +9,18 @@ from acsard.checkup.findings import StoppedError
 from acsard.checkup.limits import MOTOR_S, PATIENCE_S, SPEED
 from acsard.checkup.motion import ZERO
 from acsard.config.settings import Config, McuConfig, SimConfig
+from acsard.host.errors import MendableError
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Robot
 
 
-def test_a_board_that_never_opened_its_line_sends_nothing_when_left() -> None:
-    robot = Robot()
-    with Board(robot, McuConfig(), 100.0):
+def test_a_line_that_does_not_open_is_sent_nothing() -> None:
+    class Held(Robot):
+        def open(self, baud_rate: int) -> None:
+            raise MendableError("held")
+
+    robot = Held()
+    with pytest.raises(MendableError), Board(robot, McuConfig(), 100.0):
         pass
     assert robot.sent == []
 
