@@ -244,11 +244,11 @@ class Board:
         force from then on.
         """
         began_s = self.now_s
-        if self._settles(self.comma):
+        if self.settles(self.comma):
             return
         turning = self.turning()
         kept = turning == [3] and not self._slows()
-        if self._settles(not self.comma):
+        if self.settles(not self.comma):
             if kept:
                 self.latched, self.comma = True, not self.comma
             return
@@ -257,7 +257,7 @@ class Board:
         seconds = round(self.now_s - began_s, 1)
         raise StoppedError(manual.find("stop: turns", motors=motors, seconds=seconds))
 
-    def _settles(self, comma: bool) -> bool:
+    def settles(self, comma: bool) -> bool:
         """Zeros until two replies say that every motor stands; False when none of them does, and
         no motor slows down any more."""
         began_s = self.now_s

@@ -147,11 +147,9 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
     if channel.probed or dead.motor not in moving(channel.forth):
         board.comma = configured
         return dead
-    # Is it only that lines without it leave the motor what it was told before?
     turn(board, dead.motor, limits.SPEED)
-    board.comma = configured
+    board.latched = not board.settles(configured)
     board.rest()
-    board.comma = not configured
     return channel
 
 
