@@ -60,7 +60,7 @@ class Board:
         """Zeros do not stop a motor, or make it run: silence, and the MCU's watchdog, may."""
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """For how long lines have gone out, but for pauses, since the last reply."""
+        """For how long `drive` has had no reply; what this host paused does not count."""
         self._sequence = 0
         self._lines = LineReader()
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
@@ -141,9 +141,9 @@ class Board:
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
 
-    def ask(self, motors: Motors = ZERO, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """One command, and its answer waited for, a period at the least."""
-        self.send(motors, comma)
+    def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
+        """Zeros once, and their answer waited for, a period at the least."""
+        self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
@@ -153,7 +153,7 @@ class Board:
         self.listen(max(limits.GLANCE_S / 4, wait_s))  # one to an earlier line is none to these
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
-            self.ask(ZERO, max(wait_s, 1.5 * self.period_s), comma)
+            self.ask(max(wait_s, 1.5 * self.period_s), comma)
             first = motion.since(self.replies, self.sent_s)[:1]
             got += [(reply.at_s - self.sent_s, reply) for reply in first]
         return got
@@ -171,10 +171,10 @@ class Board:
             answers = self.listen(min(period_s, end_s - began_s))
             took_s = self.now_s - began_s
             self.paused |= took_s >= max(limits.WATCHDOG_LEAST_S, 2 * period_s)
-            self._unanswered_s = 0.0 if answers else self._unanswered_s + min(took_s, period_s)
+            self._unanswered_s += 0.0 if answers else min(took_s, period_s)
             if self.armed and self._unanswered_s > limits.WATCHDOG_S + 4 * self.gap_s:
                 self.zeros()
-                names = motor_names(self.mcu, motion.moving(motors, LEAST_S)) or "nothing"
+                names = motor_names(self.mcu, [m for m in range(4) if motors[m]]) or "nothing"
                 found = manual.find("link: silent", motors=names, seconds=self._unanswered_s)
                 raise StoppedError(found)
             got += answers
@@ -198,8 +198,10 @@ class Board:
                 if reply is not None:
                     got.append(reply)
         self.replies += got
-        if self.armed and got:
-            self._guard()
+        if got:
+            self._unanswered_s = 0.0
+            if self.armed:
+                self._guard()
         return got
 
     def _reply(self, line: bytes, at_s: float) -> Reply | None:
@@ -268,7 +270,7 @@ class Board:
             patience_s = limits.PATIENCE_S if self._slows() else limits.MOTOR_S
             if self.now_s - began_s >= patience_s:
                 return False
-            self.ask(ZERO, comma=comma)
+            self.ask(comma=comma)
 
     def _slows(self) -> bool:
         """Some motor slows down."""

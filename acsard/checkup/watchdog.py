@@ -19,7 +19,7 @@ from msgspec import Struct
 from acsard.checkup import counts, damage, limits, manual, motion
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import Reply
 from acsard.checkup.turning import run_up
 from acsard.config.baud import FIELD
 from acsard.mcu.frames import LETTERS, Motors
@@ -148,7 +148,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
             board.wire.send(line)
         board.listen(min(left_s, board.period_s) if line else left_s)
     silent_s, before = board.now_s - told_s, len(board.replies)
-    board.ask(ZERO)
+    board.ask()
     told_s = told_s if length_s else board.sent_s
     board.rest()
     first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])

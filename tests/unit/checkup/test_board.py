@@ -126,6 +126,22 @@ def test_silence_ends_it_only_while_somebody_drives() -> None:
     assert robot.later() == [0.0] * 4
 
 
+def test_short_drives_that_nobody_answers_add_up_unless_an_answer_comes_between() -> None:
+    robot = Robot("plain_only")
+    with robot.board() as board:
+        for _ in range(10):
+            with robot.mcu.mute():
+                board.drive(ZERO, 0.2)
+            board.ask()
+        with robot.mcu.mute():
+            for _ in range(2):
+                board.drive(ZERO, 0.14)
+                board.listen(1.0)
+            with pytest.raises(StoppedError) as end:
+                board.drive(ZERO, 0.14)
+    assert end.value.finding.figure == "silent for 0.3 s"
+
+
 @pytest.mark.parametrize("sent", [False, True])
 def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool) -> None:
     config = Config(sim=SimConfig(motor_time_constant=1.5))
