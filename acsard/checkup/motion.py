@@ -23,9 +23,6 @@ TREND_S = 0.5
 FALLS = 0.97
 """Below this share of what it was, a speed falls; above its inverse, it rises."""
 
-NEAR = 256
-"""So many replies are a second or more."""
-
 
 class Reply(Struct, frozen=True):
     """A good line of the MCU, complete at `at_s`."""
@@ -98,9 +95,9 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
     """By which share each motor's speed is of what it was a moment before; 1 where it stands."""
-    span_s, near = max(TREND_S, 4 * gap_s), replies[-NEAR:]
-    before = mean(since(near, now_s - 2 * span_s, now_s - span_s))
-    now = mean(since(near, now_s - span_s, now_s))
+    span_s = max(TREND_S, 4 * gap_s)
+    before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
+    now = mean(since(replies, now_s - span_s, now_s))
     turn = [min(abs(one), abs(other)) > 0.1 for one, other in zip(before, now, strict=True)]
     return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
 
@@ -113,7 +110,7 @@ def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
     sooner, a longer one tells it by a coarse encoder.
     """
     for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
-        near = since(replies[-NEAR:], replies[-1].at_s - span_s)
+        near = since(replies, replies[-1].at_s - span_s)
         course = list(steps(max(near, replies[-4:], key=len)))
         for motor in range(4):
             pieces = [(min(GLANCE_S, step.seconds), step.speeds[motor]) for step in course]
