@@ -55,7 +55,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if not motors:
         return manual.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
-    board.listen(GLANCE_S)  # a coarse encoder may show the last of what they ran on only now
+    board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that they ran on
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return manual.find("damaged lines: right", lines=len(lines))
