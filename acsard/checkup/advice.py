@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import attrgetter, getitem
+from typing import Any
 
 from msgspec import ValidationError
 
@@ -29,39 +32,32 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys
-    differing = {key: value for key, value in wanted.items() if _value(config, key) != value}
+    differing = {key: value for key, value in wanted.items() if attrgetter(key)(config) != value}
+
+    def fits(given: Changes) -> bool:
+        changed = applied(given, config)
+        return changed is not None and not contradictions(changed)
+
     # What makes lines longer or slower can leave no room for the rate: give up the least first.
     for optional in ("", *OPTIONAL):
-        if optional and _value(config, optional) in (0, "off"):
+        if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
-        if _fits(differing, config):
+        if fits(differing):
             return differing
     slower: Changes = {**differing, "control.rate": "auto"}
-    return slower if _fits(slower, config) else differing
-
-
-def _fits(given: Changes, config: Config) -> bool:
-    changed = applied(given, config)
-    return changed is not None and not contradictions(changed)
+    return slower if fits(slower) else differing
 
 
 def applied(given: Changes, config: Config) -> Config | None:
     """The configuration with these keys; None when they cannot be its values."""
-    plain = effective(config)
+    plain: Any = effective(config)
     for key, value in given.items():
-        *path, name = key.split(".")
-        table = plain
-        for part in path:
-            inner = table[part]
-            assert isinstance(inner, dict)
-            table = inner
-        table[name] = value
+        where, _, name = key.rpartition(".")
+        reduce(getitem, where.split("."), plain)[name] = value
     try:
-        result = from_builtins(plain)
+        return from_builtins(plain)
     except ValidationError:
         return None
-    assert isinstance(result, Config)
-    return result
 
 
 def lines(given: Changes) -> list[str]:
@@ -75,10 +71,3 @@ def lines(given: Changes) -> list[str]:
             table = where
         found.append(f"{name} = {write(value)}")
     return found
-
-
-def _value(config: Config, key: str) -> object:
-    value: object = config
-    for name in key.split("."):
-        value = getattr(value, name)
-    return value

@@ -1,8 +1,9 @@
-"""The robot on its blocks: commands to the motors a to d, their answers, and what keeps it safe.
+"""The robot on its blocks: what goes out to the motors a to d, what came back, what keeps it safe.
 
-Every step of the check speaks through here. Speeds are the motors', not the wheels': which wheel a
-motor turns is what the check has to find out. A motor that runs away, or an MCU that falls silent
-while one turns, ends the check at once: zeros, then silence.
+Every step of the check is an experiment: lines go out for some time, all that comes back is one
+recording, `replies`, and the step judges what it holds. Speeds are the motors', not the wheels':
+which wheel a motor turns is what the check has to find out. A motor that runs away, or an MCU that
+falls silent while one turns, ends any experiment at once: zeros, then silence.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
-from acsard.values import NS_PER_S, STILL, WheelSpeeds
+from acsard.values import NS_PER_S, WheelSpeeds
 
 LEAST_S = 0.001
 """No line goes out for less than this."""
@@ -28,39 +29,38 @@ FAREWELL = 5
 
 
 class Board:
-    """One wire; enter it to begin, leaving sends zeros and falls silent, whatever happened."""
+    """One wire; entering opens it, leaving sends zeros and falls silent, whatever happened."""
 
     def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
-        self.is_open = False
+        self.armed = False
+        """The motors have been seen to stand: from now on a runaway ends the check."""
+        # its language, as it is found out
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         self.latched = False
         """Zeros without what is `comma` now left the last motor turning."""
         self.sealed = self.sampled = False
         """Lines go out with the check, and ask for the sample fields."""
+        self.identity: dict[str, str] = {}
         self.own_clock = False
         """It reports by its own clock."""
         self.gap_s = 0.0
         """Between two replies while lines go out."""
-        self.armed = False
-        """The motors have been seen to stand: from now on a runaway ends the check."""
-        self.identity: dict[str, str] = {}
+        # the recording
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Lines that are no good replies."""
-        self.heard_bytes = 0
+        self.heard_bytes = self.sent_lines = 0
         self.sent_s = 0.0
-        self.sent_lines = 0
-        self.longest_pause_s = 0.0
-        """Between two lines of ours while driving: too long, and the watchdog strikes."""
-        self.slowest_rest_s = 0.0
-        """The longest that the motors took to come to rest after zeros."""
+        self.paused = False
+        """This host paused while driving, for so long that the watchdog may have struck."""
+
         self._fled = False
         """Zeros do not stop a motor, or make it run: silence, and the MCU's watchdog, may."""
         self._commanded = ZERO
-        self._excused_s = 0.0
-        """Up to then nobody was driving, and the MCU may have been silent."""
+        self._unanswered_s = 0.0
+        """For how long `drive` has had no reply; what this host paused does not count."""
         self._sequence = 0
         self._lines = LineReader()
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
@@ -68,18 +68,15 @@ class Board:
     def open(self, baud_rate: int) -> None:
         """Open the line at this rate; what was half received is forgotten."""
         self.wire.open(baud_rate)
-        self.is_open, self.baud_rate = True, baud_rate
-        self._lines.clear()
-        self.replies.clear()
-        self.others.clear()
-        self.heard_bytes = 0
+        self.baud_rate, self.heard_bytes = baud_rate, 0
+        for heard in (self._lines, self.replies, self.others):
+            heard.clear()
 
     def __enter__(self) -> Board:
+        self.open(self.mcu.baud_rate)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if not self.is_open:
-            return
         try:
             self._farewell()
         except BaseException:
@@ -100,12 +97,10 @@ class Board:
                 if self._fled:
                     break
                 self.zeros()
-                self._listen(2 * self.period_s)
-                self._fled = self._fastest() is not None
+                self.listen(2 * self.period_s)
+                self._fled = motion.fastest(self.replies, limits.RUNAWAY) is not None
         except WireLostError:
             pass  # nothing reaches the motors any more; the MCU's own watchdog has to
-
-    # time
 
     @property
     def now_s(self) -> float:
@@ -123,13 +118,11 @@ class Board:
         """Between two lines."""
         return max(limits.PERIOD_S, self.line_s)
 
-    # sending
+    # what goes out
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
         """The command for these speeds in the form in force, or with or without its last comma."""
-        codec = self._codecs[self.comma if comma is None else comma]
-        speeds = WheelSpeeds(*motors)
-        line = codec.stop if speeds == STILL else codec.encode(speeds)
+        line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line
         self._sequence = (self._sequence + 1) % SEQUENCES
@@ -146,24 +139,56 @@ class Board:
         """Zeros that any firmware takes: on a line of their own, with the comma and without."""
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
-        sealed = self.line(ZERO) if self.sealed else b""
-        self.wire.send(b"\r\n" + plain + sealed)
-        self.sent_s = self.now_s
+        self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
 
-    def ask(self, motors: Motors = ZERO, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """One command, and its answer waited for, a period at the least."""
-        self.send(motors, comma)
+    def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
+        """Zeros once, and their answer waited for, a period at the least."""
+        self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
-    # listening
-
-    def listen(self, seconds: float) -> list[Reply]:
-        """What the MCU answers in the next so many seconds, in which nothing need come."""
-        got = self._listen(seconds)
-        self._excused_s = self.now_s
+    def answers(
+        self, lines: int, wait_s: float, comma: bool | None = None
+    ) -> list[tuple[float, Reply]]:
+        """The first reply to each of so many lines, sent one by one, and how soon it came."""
+        self.listen(max(limits.GLANCE_S / 4, wait_s))  # one to an earlier line is none to these
+        got: list[tuple[float, Reply]] = []
+        for _ in range(lines):
+            self.ask(max(wait_s, 1.5 * self.period_s), comma)
+            first = motion.since(self.replies, self.sent_s)[:1]
+            got += [(reply.at_s - self.sent_s, reply) for reply in first]
         return got
 
-    def _listen(self, seconds: float) -> list[Reply]:
+    def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
+        """Command these speeds for so long, line after line; the answers of that time.
+
+        Ends the check when the MCU falls silent meanwhile: nobody would see a runaway.
+        """
+        period_s = period_s or self.period_s
+        end_s = self.now_s + seconds
+        got: list[Reply] = []
+        while (began_s := self.now_s) < end_s - LEAST_S:
+            self.send(motors)
+            answers = self.listen(min(period_s, end_s - began_s))
+            took_s = self.now_s - began_s
+            self.paused |= took_s >= max(limits.WATCHDOG_LEAST_S, 2 * period_s)
+            self._unanswered_s += 0.0 if answers else min(took_s, period_s)
+            if self.armed and self._unanswered_s > limits.WATCHDOG_S + 4 * self.gap_s:
+                self.zeros()
+                names = motor_names(self.mcu, [m for m in range(4) if motors[m]]) or "nothing"
+                found = manual.find("link: silent", motors=names, seconds=self._unanswered_s)
+                raise StoppedError(found)
+            got += answers
+        return got
+
+    def let_go(self, silent_s: float) -> None:
+        """Zeros once, then silence: it is the watchdog that cuts a motor that zeros do not stop."""
+        self.zeros()
+        self.listen(silent_s)
+
+    # what comes back
+
+    def listen(self, seconds: float) -> list[Reply]:
+        """What the MCU answers in the next so many seconds; a runaway in it ends the check."""
         got = []
         for at_ns, data in self.wire.listen(self.wire.now_ns() + ceil(seconds * NS_PER_S)):
             self.heard_bytes += len(data)
@@ -173,8 +198,10 @@ class Board:
                 if reply is not None:
                     got.append(reply)
         self.replies += got
-        if self.armed and any(abs(v) > limits.RUNAWAY for r in got for v in r.motors):
-            self._guard()
+        if got:
+            self._unanswered_s = 0.0
+            if self.armed:
+                self._guard()
         return got
 
     def _reply(self, line: bytes, at_s: float) -> Reply | None:
@@ -188,34 +215,29 @@ class Board:
             self.others.append(line)
             return None
 
-    def drive(
-        self, motors: Motors, seconds: float, period_s: float = 0.0, comma: bool | None = None
-    ) -> list[Reply]:
-        """Command these speeds for so long, line after line; the answers of that time."""
-        period_s = period_s or self.period_s
-        end_s = self.now_s + seconds
-        got: list[Reply] = []
-        while (now_s := self.now_s) < end_s - LEAST_S:
-            self.longest_pause_s = max(self.longest_pause_s, now_s - self.sent_s)
-            self.send(motors, comma)
-            got += self._listen(min(period_s, end_s - now_s))
-            if self.now_s - now_s > period_s + limits.WATCHDOG_LEAST_S:
-                self._excused_s = self.now_s  # it was the host that paused
-            self._present()
-        return got
+    def _guard(self) -> None:
+        fastest = motion.fastest(self.replies, limits.RUNAWAY)
+        if fastest is None:
+            return
+        motor, seen = fastest
+        told = self._commanded[motor]
+        self._flee()
+        outcome = "runaway: against" if told * seen < 0 else "runaway: along"
+        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], limits.RUNAWAY
+        found = manual.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
+        raise StoppedError(found)
 
-    def begin(self) -> float:
-        """Motors are to turn from here on: what was before it, a question say, does not count."""
-        self._excused_s = self.sent_s = self.now_s
-        self.longest_pause_s = 0.0
-        return self.now_s
+    def _flee(self) -> None:
+        """Zeros once, and none after them."""
+        self._fled = True
+        self.zeros()
 
     # standing
 
-    def standing(self, since_s: float) -> bool:
-        """The last two replies since then say that every motor stands."""
-        last = motion.since(self.replies[-2:], since_s)
-        return len(last) == 2 and all(abs(v) < limits.STANDING for r in last for v in r.motors)
+    def turning(self) -> list[int]:
+        """The motors that turn by the last reply."""
+        last = self.replies[-1].motors if self.replies else ZERO
+        return motion.moving(last, limits.STANDING)
 
     def rest(self) -> None:
         """Stop, and wait until everything stands; ends the check when nothing does that.
@@ -224,77 +246,32 @@ class Board:
         force from then on.
         """
         began_s = self.now_s
-        if self._settles(self.comma):
+        if self.settles(self.comma):
             return
         turning = self.turning()
         kept = turning == [3] and not self._slows()
-        if self._settles(not self.comma):
+        if self.settles(not self.comma):
             if kept:
                 self.latched, self.comma = True, not self.comma
             return
-        self._let_go()
+        self._flee()
         motors = motor_names(self.mcu, turning, ", ") or "something"
         seconds = round(self.now_s - began_s, 1)
         raise StoppedError(manual.find("stop: turns", motors=motors, seconds=seconds))
 
-    def _settles(self, comma: bool) -> bool:
-        """Zeros until everything stands; False when it does not, be it that no motor slows down
-        any more."""
+    def settles(self, comma: bool) -> bool:
+        """Zeros until two replies say that every motor stands; False when none of them does, and
+        no motor slows down any more."""
         began_s = self.now_s
-        while not self.standing(began_s):
-            waited_s = self.now_s - began_s
-            if waited_s >= limits.PATIENCE_S or (waited_s >= limits.MOTOR_S and not self._slows()):
+        while True:
+            last = motion.since(self.replies[-2:], began_s)
+            if len(last) == 2 and not any(motion.moving(r.motors, limits.STANDING) for r in last):
+                return True
+            patience_s = limits.PATIENCE_S if self._slows() else limits.MOTOR_S
+            if self.now_s - began_s >= patience_s:
                 return False
-            self.ask(ZERO, comma=comma)
-        self.slowest_rest_s = max(self.slowest_rest_s, self.now_s - began_s)
-        return True
+            self.ask(comma=comma)
 
     def _slows(self) -> bool:
         """Some motor slows down."""
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS
-
-    def turning(self) -> list[int]:
-        """The motors that turn by the last reply."""
-        speeds = self.replies[-1].motors if self.replies else ()
-        return [motor for motor, speed in enumerate(speeds) if abs(speed) >= limits.STANDING]
-
-    # safety
-
-    def _guard(self) -> None:
-        fastest = self._fastest()
-        if fastest is None:
-            return
-        motor, seen = fastest
-        told = self._commanded[motor]
-        self._let_go()
-        outcome = "runaway: against" if told * seen < 0 else "runaway: along"
-        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], limits.RUNAWAY
-        found = manual.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
-        raise StoppedError(found)
-
-    def _let_go(self) -> None:
-        """Zeros once, and none after them."""
-        self._fled = True
-        self.zeros()
-
-    @property
-    def named_counts(self) -> int:
-        """Encoder counts per turn by the identification, 0 when it does not say."""
-        named = self.identity.get("counts", "")
-        return int(named) if named.isdigit() and len(named) < 9 else 0
-
-    def _fastest(self) -> tuple[int, float] | None:
-        """A motor that runs away, and its speed."""
-        per_turn = self.named_counts or self.mcu.encoder_counts
-        return motion.fastest(self.replies, limits.RUNAWAY, per_turn)
-
-    def _present(self) -> None:
-        """Ends the check when the MCU has fallen silent: nobody would see a runaway."""
-        last_s = self.replies[-1].at_s if self.replies else 0.0
-        silent_s = self.now_s - max(last_s, self._excused_s)
-        if not self.armed or silent_s <= limits.WATCHDOG_S + 4 * self.gap_s:
-            return
-        asked = [motor for motor, speed in enumerate(self._commanded) if speed]
-        self.zeros()
-        motors = motor_names(self.mcu, asked) or "nothing"
-        raise StoppedError(manual.find("link: silent", motors=motors, seconds=silent_s))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
-from acsard.checkup import manual, motion
+from acsard.checkup import manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import GLANCE_S
-from acsard.checkup.motion import Reply
+from acsard.checkup.motion import Reply, steps
 
 LEAST_ANGLE = 2.0
 """rad; over less the speeds' own rounding spoils the figure."""
@@ -25,16 +24,12 @@ MOST_COUNTS = 100_000
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Counts per turn of these motors' encoders, by the speeds the MCU says; None: too little."""
     counts = angle = 0.0
-    for before, after in pairwise(replies):
-        leg = motion.leg(before, after)
-        if leg is None or leg[1] > GLANCE_S:
-            continue
-        made, seconds = leg
-        for motor in motors:
-            speed = after.motors[motor]
-            if abs(speed) >= 1.0:
-                counts += math.copysign(1.0, speed) * made[motor]
-                angle += abs(speed) * seconds
+    for step in steps(replies):
+        for motor in motors if step.counts and step.mcu_s <= GLANCE_S else ():
+            speed = step.speeds[motor]
+            if step.counts and abs(speed) >= 1.0:
+                counts += math.copysign(1.0, speed) * step.counts[motor]
+                angle += abs(speed) * step.mcu_s
     return counts / angle * math.tau if angle >= LEAST_ANGLE else None
 
 
@@ -42,36 +37,32 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     """`mcu.encoder_counts`, from the identification or measured; `motors` have moved right."""
     if not board.sampled:
         return manual.find("encoder counts: none")
-    measured, named = per_turn(board.replies, motors), board.named_counts
-    configured = board.mcu.encoder_counts
+    said = board.identity.get("counts", "")
+    named = int(said) if said.isdigit() and len(said) < 9 else 0
+    measured, configured = per_turn(board.replies, motors), board.mcu.encoder_counts
+    unused: dict[str, object] = {"mcu.encoder_counts": 0} if configured else {}
+    if measured is None and not named:
+        return manual.find("encoder counts: not turned")
+    if measured is not None and measured < 1:
+        return manual.find("encoder counts: backward", unused, measured=measured)
     if measured is None:
-        if not named:
-            return manual.find("encoder counts: not turned")
-        return _stated(configured, named, "by its identification; not measured")
-    if measured < 1:
-        return manual.find("encoder counts: backward", _off(configured), measured=measured)
-    if not named:
-        how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
+        counts, how = named, "by its identification; not measured"
+    elif not named:
         near = abs(measured - configured) <= AGREES * configured
-        return _stated(configured, configured if near else round(measured), how)
-    if abs(measured - named) <= AGREES * named:
-        return _stated(configured, named, f"by its identification; measured {measured:.0f}")
-    return manual.find("encoder counts: misnamed", named=named, measured=measured)
-
-
-def _stated(configured: int, counts: int, how: str) -> Finding:
+        counts = configured if near else round(measured)
+        how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
+    elif abs(measured - named) > AGREES * named:
+        return manual.find("encoder counts: misnamed", named=named, measured=measured)
+    else:
+        counts, how = named, f"by its identification; measured {measured:.0f}"
     if counts > MOST_COUNTS:
-        many = "encoder counts: many"
-        return manual.find(many, _off(configured), counts=counts, most=MOST_COUNTS)
+        return manual.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
+    right, off = configured in (0, counts), abs(configured / counts - 1)
     return manual.find(
-        "encoder counts: right" if configured in (0, counts) else "encoder counts: wrong",
+        "encoder counts: right" if right else "encoder counts: wrong",
         {"mcu.encoder_counts": counts},
         counts=counts,
         configured=configured,
         how=how,
-        off=abs(configured / counts - 1),
+        off=off,
     )
-
-
-def _off(configured: int) -> dict[str, object]:
-    return {"mcu.encoder_counts": 0} if configured else {}

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msgspec import Struct
-
 from acsard.checkup import manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import GLANCE_S, SPEED
-from acsard.checkup.motion import ZERO
-from acsard.checkup.wheels import moving
+from acsard.checkup.motion import ZERO, moving
 from acsard.mcu.check import seal
 from acsard.mcu.frames import LETTERS
 
@@ -19,17 +16,11 @@ REPEATS = 3
 """How often each broken line goes out: a motor needs a moment to show that it took it."""
 
 
-class Broken(Struct, frozen=True):
-    """A line that is none, and whether all of its values are whole."""
-
-    what: str
-    line: bytes
-    whole: bool = False
-    """Only what is around the four values is wrong: firmware that takes them is lenient, not
-    dangerous."""
+WHOLE = {"over-long", "garbage before it"}
+"""Wrong is only what is around the four values: who takes them is lenient, not dangerous."""
 
 
-def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broken]:
+def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
     """Every kind of damage, in the dialect the firmware takes; all but these motors at zero."""
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
@@ -41,22 +32,21 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[Broke
         return (",".join(tokens) + end).encode()
 
     found = [
-        Broken("a value is missing", line(a, b, c)),
-        Broken("a wrong letter", line(a, b, c, "x" + d[1:])),
-        Broken("a letter twice", line(a, a, c, d)),
-        Broken("a bad digit", line(a, "bp0x.00", c, d)),
-        Broken("neither p nor n", line(a, b, "cq" + c[2:], d)),
-        Broken("cut short", line(a, b, c, d)[:20] + b"\r\n"),
-        Broken("cut inside the last number", line(a, b, c, d)[:30] + b"\r\n"),
-        Broken("cut inside the last number", line(a, b, c, d)[:27] + b"\r\n"),
-        Broken("over-long", line(*(a, b, c, d) * 5), whole=True),
-        Broken("garbage before it", b"\xff~" + line(a, b, c, d), whole=True),
+        ("a value is missing", line(a, b, c)),
+        ("a wrong letter", line(a, b, c, "x" + d[1:])),
+        ("a letter twice", line(a, a, c, d)),
+        ("a bad digit", line(a, "bp0x.00", c, d)),
+        ("neither p nor n", line(a, b, "cq" + c[2:], d)),
+        ("cut short", line(a, b, c, d)[:20] + b"\r\n"),
+        ("cut inside the last number", line(a, b, c, d)[:30] + b"\r\n"),
+        ("cut inside the last number", line(a, b, c, d)[:27] + b"\r\n"),
+        ("over-long", line(*(a, b, c, d) * 5)),
+        ("garbage before it", b"\xff~" + line(a, b, c, d)),
     ]
     if sealed:
         good = seal(line(a, b, c, d), 7)
         wrong = good[:-3] + (b"0" if good[-3:-2] != b"0" else b"1") + b"\r\n"
-        found.append(Broken("a wrong check", wrong))
-        found.append(Broken("a check cut short", good[:-4] + b"\r\n"))
+        found += [("a wrong check", wrong), ("a check cut short", good[:-4] + b"\r\n")]
     return found
 
 
@@ -65,17 +55,13 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if not motors:
         return manual.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
-    took = [broken for broken in lines if _moves(board, broken.line)]
+    board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that they ran on
+    took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return manual.find("damaged lines: right", lines=len(lines))
-    lenient = all(broken.whole for broken in took)
-    which = dict.fromkeys(broken.what for broken in took)
-    return manual.find(
-        "damaged lines: lenient" if lenient else "damaged lines: taken",
-        took=len(which),
-        kinds=len({broken.what for broken in lines}),
-        which=", ".join(which),
-    )
+    outcome, kinds = "lenient" if took.keys() <= WHOLE else "taken", {what for what, _ in lines}
+    seen = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
+    return manual.find(f"damaged lines: {outcome}", None, **seen)
 
 
 def _moves(board: Board, line: bytes) -> bool:

@@ -39,10 +39,8 @@ def baud(board: Board) -> Finding:
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, OTHER_S):
-            keys: dict[str, object] = {"mcu.baud_rate": rate}
-            return manual.find(
-                "baud rate: other", keys, rate=rate, configured=configured, heard=heard
-            )
+            seen = {"rate": rate, "configured": configured, "heard": heard}
+            return manual.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
     board.open(configured)
     raise StoppedError(manual.find("baud rate: none", heard=heard, configured=configured))
 
@@ -82,19 +80,24 @@ def form(board: Board) -> Finding | None:
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     board.comma = not board.comma
-    return comma_wrong(board, "refused")
+    return _comma_wrong(board, "refused")
 
 
 def _answers(board: Board, comma: bool) -> list[Reply]:
-    """What comes back for some lines of this form, and for no earlier one."""
-    board.listen(GLANCE_S / 4)
-    before = len(board.replies)
-    for _ in range(TRIES):
-        board.ask(ZERO, max(GLANCE_S / 6, 1.5 * board.period_s), comma)
-    return board.replies[before:]
+    return [reply for _, reply in board.answers(TRIES, GLANCE_S / 6, comma)]
 
 
-def comma_wrong(board: Board, how: str) -> Finding:
+def comma(board: Board, dead: bool) -> Finding:
+    """Whether the last motor, unless it is dead, needed another comma at the line's end."""
+    if board.comma != board.mcu.trailing_comma:
+        return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
+    if dead:
+        return manual.find("trailing comma: dead")
+    how = "sent" if board.comma else "not sent"
+    return manual.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
+
+
+def _comma_wrong(board: Board, how: str) -> Finding:
     """The configured form of the last comma is wrong; `board.comma` is already the right one."""
     return manual.find(
         f"trailing comma: {how}",
@@ -108,8 +111,7 @@ def comma_wrong(board: Board, how: str) -> Finding:
 
 def replies(board: Board) -> Finding:
     """How its replies are written; every form here is one the host reads."""
-    got = board.drive(ZERO, 0.1) or board.drive(ZERO, 0.4) or board.replies
-    lines = [reply.line.partition(b"#")[0] for reply in got]
+    lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
     if not all(re.search(rb"\.\d\d,? *\Z", line) for line in lines):
@@ -126,12 +128,10 @@ def check(board: Board) -> Finding:
     if not any(reply.reading for reply in _answers(board, board.comma)):
         board.sampled = False
         board.sealed = bool(_answers(board, board.comma))
+    if not board.sealed and wanted == "require":
+        return manual.find("checked link: required", {"mcu.link_check": "auto"})
     if not board.sealed:
-        if wanted == "require":
-            return manual.find("checked link: required", {"mcu.link_check": "auto"})
         return manual.find("checked link: plain")
-    return manual.find(
-        "checked link: off" if wanted == "off" else "checked link: in use",
-        {"mcu.link_check": "auto" if wanted == "off" else wanted},
-        figure="checked, with samples" if board.sampled else "checked",
-    )
+    outcome, use = ("off", "auto") if wanted == "off" else ("in use", wanted)
+    figure = "checked, with samples" if board.sampled else "checked"
+    return manual.find(f"checked link: {outcome}", {"mcu.link_check": use}, figure=figure)

@@ -45,7 +45,6 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
 
     try:
         with Board(wire, config.mcu, config.rate_hz) as board:
-            board.open(config.mcu.baud_rate)
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(manual.find("wheels: not lifted"))
@@ -73,7 +72,7 @@ def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], No
     for channel in turning.channels(board, operator):
         channels.append(channel)
         tell(encoder_finding(board.mcu, channel))
-    tell(turning.comma(board, channels[-1]))
+    tell(dialect.comma(board, channels[-1].kind == "dead"))
     tell(wheel_map(board.mcu, channels))
     right = [channel.motor for channel in channels if channel.kind == "right"]
     tell(counts.finding(board, right))

@@ -10,19 +10,20 @@ from collections.abc import Iterator
 
 from msgspec import structs
 
-from acsard.checkup import limits, manual, motion
+from acsard.checkup import limits, motion
 from acsard.checkup.board import Board
-from acsard.checkup.dialect import comma_wrong
-from acsard.checkup.findings import Finding, motor_name
-from acsard.checkup.motion import ZERO
+from acsard.checkup.findings import motor_name
+from acsard.checkup.motion import ZERO, moving
 from acsard.checkup.outside import Operator
-from acsard.checkup.wheels import NO_WHEEL, TOLERANCE, Channel, moving
+from acsard.checkup.wheels import TOLERANCE, Channel
 from acsard.mcu.frames import LETTERS, Motors
 
-CHUNKS = 8
+LOOKS = 8
 """Over so many looks the speed of an encoder is taken that is not steady before."""
 
-ANSWERS = {"fr": 0, "fl": 1, "rl": 2, "rr": 3, "none": NO_WHEEL}
+ANSWERS = {
+    "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
+}  # fmt: skip
 
 
 def one(motor: int, speed: float) -> Motors:
@@ -32,8 +33,9 @@ def one(motor: int, speed: float) -> Motors:
 
 def turn(board: Board, motor: int, speed: float) -> Motors:
     """Bring a motor to speed, once more if this host has paused; each encoder's speed by then."""
+    board.paused = False
     means = run_up(board, one(motor, speed))
-    if board.longest_pause_s >= max(limits.WATCHDOG_LEAST_S, 2 * board.period_s):
+    if board.paused:
         board.rest()
         means = run_up(board, one(motor, speed))
     return means
@@ -41,33 +43,31 @@ def turn(board: Board, motor: int, speed: float) -> Motors:
 
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up and hold until the encoders show a steady speed; what they show."""
-    board.begin()
     steps = max(1, int(limits.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
         board.drive((a, b, c, d), board.period_s)
     began_s, look_s = board.now_s, max(limits.GLANCE_S / 2, 2.5 * board.gap_s)
-    asked = sum(1 for speed in motors if speed)
+    told = [motor for motor in range(4) if motors[motor]]
     means, looks, steady = ZERO, 0, 0
-    while steady < 2 and (looks * look_s < limits.MOTOR_S or _speeds_up(board, motors, began_s)):
+    while steady < 2 and board.now_s - began_s < _patience_s(board, told):
         board.drive(motors, look_s)
         looks += 1
         # A coarse encoder needs more of them, a quick one is seen to be steady before.
-        last = min(CHUNKS, max(1, looks - 1))
+        last = min(LOOKS, max(1, looks - 1))
         means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
         near = [m for m in moving(means) if abs(abs(means[m]) / limits.SPEED - 1) < 0.4 * TOLERANCE]
-        steady = steady + 1 if len(near) >= asked else 0
-        if looks * look_s >= limits.CUT_S and max(map(abs, means)) < limits.STANDING:
+        steady = steady + 1 if len(near) >= len(told) else 0
+        if looks * look_s >= limits.CUT_S and not moving(means, limits.STANDING):
             break  # not held for longer: a control loop without its encoder may be winding up
     return means
 
 
-def _speeds_up(board: Board, motors: Motors, began_s: float) -> bool:
-    """A motor is not at the speed it was told yet, and getting there."""
-    if board.now_s - began_s >= limits.PATIENCE_S:
-        return False
+def _patience_s(board: Board, told: list[int]) -> float:
+    """For how long motors are held: longer while one of them still speeds up."""
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
-    return any(share > 1 / motion.FALLS for share, told in zip(shares, motors, strict=True) if told)
+    rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
+    return limits.PATIENCE_S if rises else limits.MOTOR_S
 
 
 def channels(board: Board, operator: Operator) -> Iterator[Channel]:
@@ -81,6 +81,7 @@ def channels(board: Board, operator: Operator) -> Iterator[Channel]:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
+    """What a motor does, turned no further than its own encoder follows; it stands afterwards."""
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
@@ -89,7 +90,7 @@ def _both_ways(board: Board, motor: int) -> Channel:
         board.rest()
         back = turn(board, motor, -limits.SPEED)
     if motor not in moving(back):
-        _let_go(board, limits.CUT_S)
+        board.let_go(limits.CUT_S)
     board.rest()
     return Channel(motor, forth, back)
 
@@ -103,11 +104,9 @@ def probe(board: Board, motor: int) -> Motors | None:
     """
     began_s = board.now_s
     shown = _probe(board, motor, limits.SPEED / 2)
-    if shown is None:
-        return None
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
-    if len(seen) >= 3 and max(seen) < 0:
+    if shown is None or (len(seen) >= 3 and max(seen) < 0):
         return shown  # no need to drive a reversed one away twice
     if not moving(shown, limits.PROBE_MOVES):
         return _probe(board, motor, limits.SPEED)
@@ -117,7 +116,7 @@ def probe(board: Board, motor: int) -> Motors | None:
 
 def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     coasting = board.replies[-1].motors if board.replies else ZERO
-    began_s = board.begin()
+    began_s = board.now_s
 
     def shown() -> Motors:
         """The angles over the probe's time, without what a wheel may still have coasted."""
@@ -134,44 +133,24 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         return None
     # The firmware may regulate zeros into a runaway, and its watchdog cuts the motor; one that was
     # seen to turn must stand before the next zeros are regulated.
-    _let_go(board, limits.STOOD_S if moving(shown(), limits.PROBE_MOVES) else limits.CUT_S)
+    moved = moving(shown(), limits.PROBE_MOVES)
+    board.let_go(limits.STOOD_S if moved else limits.CUT_S)
+    board.rest()
     seen = shown()
     return None if seen[motor] >= limits.PROBE_MOVES else seen
 
 
-def _let_go(board: Board, silent_s: float) -> None:
-    """Zeros once, then silence until the watchdog has cut the motors; they stand afterwards."""
-    board.zeros()
-    board.listen(silent_s)
-    board.rest()
-
-
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
     """The last motor does nothing: does it with the comma at the line's end turned round?"""
-    board.comma = not board.comma
-    shown = probe(board, dead.motor)
-    forth = ZERO if shown is not None else turn(board, dead.motor, limits.SPEED)
-    if dead.motor not in moving(forth):
-        board.comma = not board.comma
-        _let_go(board, limits.CUT_S)
+    configured, board.comma = board.comma, not board.comma
+    channel = _both_ways(board, dead.motor)
+    if channel.probed or dead.motor not in moving(channel.forth):
+        board.comma = configured
         return dead
-    # Zeros without the comma: firmware that needs it keeps this motor turning.
-    last = board.drive(ZERO, 0.5, comma=False)[-3:] if board.comma else []
+    turn(board, dead.motor, limits.SPEED)
+    board.latched = not board.settles(configured)
     board.rest()
-    back = turn(board, dead.motor, -limits.SPEED)
-    board.rest()
-    board.latched = bool(moving(motion.mean(last)))
-    return Channel(dead.motor, forth, back)
-
-
-def comma(board: Board, last: Channel) -> Finding:
-    """What the last motor says of the comma at the line's end."""
-    if board.comma != board.mcu.trailing_comma:
-        return comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
-    if last.kind == "dead":
-        return manual.find("trailing comma: dead")
-    how = "sent" if board.comma else "not sent"
-    return manual.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
+    return channel
 
 
 def _seen(board: Board, operator: Operator, channel: Channel) -> Channel:
@@ -182,10 +161,10 @@ def _seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     )
     while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
         _both_ways(board, channel.motor)
-    if which is None or which == "none":
-        return structs.replace(channel, wheel=which and NO_WHEEL)
-    way = operator.ask(
-        "which way did it turn first: forward (as when the robot drives ahead) or back?",
-        ("forward", "back"),
-    )
-    return structs.replace(channel, wheel=ANSWERS[which], forward=way != "back")
+    if which is None:
+        return channel
+    if wheel := ANSWERS[which]:
+        question = "which way did it turn first: forward (as when the robot drives ahead) or back?"
+        way = operator.ask(question, ("forward", "back"))
+        return structs.replace(channel, wheel=wheel, forward=way != "back")
+    return structs.replace(channel, wheel="")

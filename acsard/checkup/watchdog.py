@@ -1,61 +1,191 @@
 """The microcontroller's own last safety: does it stop the motors when the host falls silent?
 
 And when what it hears is no line: a watchdog that any byte feeds is none on a half-broken cable.
-How long it takes is measured by `silence.py`.
+
+One experiment finds it out: motors at speed, silence (or broken lines) for so long, then zeros.
+How far they ran on, less what they run out after an ordinary stop, is the watchdog's time; the
+replies' speeds and counts tell it. Firmware that answers when spoken to, with speeds of the moment,
+does not say how far: it is asked after silences of different lengths whether it was still turning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Sequence
+from itertools import cycle
 
-from acsard.checkup import manual
+from msgspec import Struct
+
+from acsard.checkup import counts, damage, limits, manual, motion
 from acsard.checkup.board import Board
-from acsard.checkup.findings import Finding
-from acsard.checkup.limits import CUT_S, WATCHDOG_LEAST_S, WATCHDOG_MOST_S
-from acsard.checkup.silence import UNKNOWN, Silence, command, measured, run
+from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup.motion import Reply
+from acsard.checkup.turning import run_up
+from acsard.config.wire_time import FIELD
+from acsard.mcu.frames import LETTERS, Motors
 
 FED = 0.75
 """Of the full speed, over all of that time: a watchdog that is right leaves less."""
+
+FEEDING = ("a wrong letter", "neither p nor n", "cut short")
+"""Broken lines that a watchdog may be fed by."""
+
+FINE_S = 0.03
+"""How finely it is found by asking."""
+
+MOST_ASKED = 8
+"""How often; each halves what is left, unless the host pauses."""
+
+TURNING, STOPPED = 0.9, 0.1
+"""Shares of the full speed: from here on it has not slowed down; below, it stands."""
+
+UNKNOWN = math.inf
+
+Between = tuple[float, float]
+"""How long the motors ran on after the last line, s: at the least and at the most."""
+
+
+class Run(Struct, frozen=True):
+    """What was seen of the motors from the last line that told them to turn, or from the zeros
+    where these came at once; in s at full speed, and in shares of it."""
+
+    silent_s: float
+    ran_s: float
+    """The one that ran the longest, its run-out with it."""
+    slow_s: float
+    """When they had nearly stopped."""
+    first: float
+    """Of the first reply after the silence: of all of it where the firmware takes speeds from one
+    line to the next; of the moment where it measures by its own clock."""
+    second: float
+    """Of the moment after; a quick motor has obeyed the first zero by then."""
+    grain_s: float
+    """How long a motor takes for what its speeds jump by: it cannot be told finer."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Measure it with these motors, which turn as told; they stand again afterwards."""
     if not motors:
         return manual.find("watchdog: untested")
-    found = measured(board, motors)
-    judged = _judged(found)
-    if judged.verdict != "FAIL" and _fed(board, motors, found.most):
+    stop = run(board, motors, 0.0)
+    least_s, most_s = measured(board, motors, stop)
+    judged = _judged(least_s, most_s)
+    if judged.verdict == "FAIL":
+        return judged
+    lines = damage.broken_lines(board.comma, board.sealed, motors)
+    broken = cycle(line for what, line in lines if what in FEEDING)
+    fed = run(board, motors, max(limits.CUT_S, 2 * most_s) + stop.slow_s, broken)
+    if fed.ran_s >= FED * fed.silent_s:
         return manual.find("watchdog: fed", figure=judged.figure)
     return judged
 
 
-def _judged(found: Silence) -> Finding:
-    if found.most == UNKNOWN:
-        return manual.find("watchdog: none", seconds=found.least)
-    middle, half = (found.least + found.most) / 2, (found.most - found.least) / 2
-    figure = f"{middle * 1000:.0f} ms" + (f" ± {half * 1000:.0f}" if half >= 0.005 else "")
-    least, most = round(found.least, 2), round(found.most, 2)  # it is measured no finer
-    if least > WATCHDOG_MOST_S:
+def _judged(least_s: float, most_s: float) -> Finding:
+    if most_s == UNKNOWN:
+        return manual.find("watchdog: none", seconds=least_s)
+    middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
+    figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
+    least_s, most_s = round(least_s, 2), round(most_s, 2)  # it is measured no finer
+    if least_s > limits.WATCHDOG_MOST_S:
         outcome = "late"
-    elif most < WATCHDOG_LEAST_S:
+    elif most_s < limits.WATCHDOG_LEAST_S:
         outcome = "early"
-    elif most > WATCHDOG_MOST_S:
+    elif most_s > limits.WATCHDOG_MOST_S:
         outcome = "unclear"
     else:
         outcome = "right"
-    return manual.find(f"watchdog: {outcome}", figure=figure, seconds=middle)
+    return manual.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s)
 
 
-def _fed(board: Board, motors: Sequence[int], stopped_s: float) -> bool:
-    """Whether broken lines instead of silence, which stops them in so long, keep them running."""
-    length_s = max(CUT_S, 2 * stopped_s) + board.slowest_rest_s
-    fed = run(board, motors, length_s, _broken(board, motors))
-    return fed.ran_s >= FED * fed.silent_s
+def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
+    """How long these motors, which turn as told and `stop` so, run on in a silence."""
+    least_s = 0.0
+    for length_s in (limits.CUT_S + stop.slow_s, limits.STOOD_S + stop.slow_s):
+        found = run(board, motors, length_s)
+        ran_on_s = found.ran_s - stop.ran_s
+        if ran_on_s < 0.95 * found.silent_s:
+            break
+        least_s = found.silent_s
+    else:
+        return limits.STOOD_S, UNKNOWN
+    by_counts = _per_turn(board, motors) > 0
+    if not (board.own_clock or by_counts or found.first >= STOPPED):
+        return _asked(board, motors, stop, (least_s, found.silent_s))
+    about_s = max(2 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
+    return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
-def _broken(board: Board, motors: Sequence[int]) -> Iterator[bytes]:
-    """Commands with a fault, another each time; no way to read them tells more than `SPEED`."""
-    while True:
-        yield board.line(command(motors))[:20] + b"\r\n"
-        yield board.line(command(motors)).replace(b"b", b"x", 1)
-        yield board.line(command(motors)).replace(b"p", b"q", 1)
+def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
+    """Between two silences: one that they turn through, and one that they do not."""
+    least_s, most_s = between
+    for _ in range(MOST_ASKED):
+        if most_s - least_s <= max(FINE_S, 0.1 * most_s):
+            break
+        answer = run(board, motors, (least_s + most_s) / 2)
+        if answer.first >= TURNING or answer.second >= STOPPED:
+            least_s = max(least_s, answer.silent_s)
+        else:
+            most_s = min(most_s, answer.silent_s)
+    # The reply that tells is of a moment after the silence, as the ordinary stop's is.
+    least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
+    most_s -= stop.slow_s - board.period_s - limits.PERIOD_S - 2 * stop.grain_s
+    return max(0.0, least_s), max(0.0, most_s)
+
+
+def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
+    """Bring the motors to speed, say nothing for so long (or something else instead), and stop."""
+    began_s = board.now_s
+    full = run_up(board, command(motors))
+    if max(abs(full[motor]) for motor in motors) < limits.SPEED / 2:
+        board.rest()
+        letters = ", ".join(LETTERS[motor] for motor in motors)
+        raise StoppedError(manual.find("watchdog: weak", letters=letters))
+    # The ramp is over by the second half of the time.
+    grain_s = _grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
+    told_s, lines = board.sent_s, iter(instead)
+    while (left_s := told_s + length_s - board.now_s) > 0:
+        if line := next(lines, b""):
+            board.wire.send(line)
+        board.listen(min(left_s, board.period_s) if line else left_s)
+    silent_s, before = board.now_s - told_s, len(board.replies)
+    board.ask()
+    told_s = told_s if length_s else board.sent_s
+    board.rest()
+    first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
+    course = motion.since(board.replies, told_s)
+    slow_s = next(
+        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), limits.PATIENCE_S
+    )
+    # The reply to the last line has what was measured when it took effect.
+    answered = not board.own_clock and course[0].at_s < told_s + limits.PERIOD_S + 2 * board.gap_s
+    since_s = course[0].at_s if answered else told_s
+    ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
+    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= limits.SPEED / 2)
+    return Run(silent_s, ran_s, slow_s, first, second, grain_s)
+
+
+def command(motors: Sequence[int]) -> Motors:
+    """All of these at once."""
+    return motion.each(lambda motor: limits.SPEED if motor in motors else 0.0)
+
+
+def _per_turn(board: Board, motors: Sequence[int]) -> float:
+    """Counts that tell how far they ran; 0 where they stand, or can wrap in the longest silence."""
+    per_turn = counts.per_turn(board.replies, motors) or 0.0
+    wraps = per_turn * limits.RUNAWAY / math.tau * limits.STOOD_S >= FIELD / 2
+    return 0.0 if wraps or per_turn < 1 else per_turn
+
+
+def _share(reply: Reply, motors: Sequence[int]) -> float:
+    """The fastest of these motors, as a share of the speed they were told."""
+    return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED
+
+
+def _grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
+    """Whole counts make the speeds of a steady motor jump, by one count in the time of a reply."""
+    if len(steady) < 5:
+        return 0.0
+    between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
+    speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
+    # One that is damaged is no jump.
+    return max(course[-2] - course[1] for course in speeds) * between_s / limits.SPEED

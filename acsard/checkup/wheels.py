@@ -12,16 +12,14 @@ from msgspec import Struct
 
 from acsard.checkup import manual
 from acsard.checkup.findings import Finding, motor_name, wheel_of, words
-from acsard.checkup.limits import MOVES, PROBE_MOVES, SPEED
+from acsard.checkup.limits import PROBE_MOVES, SPEED
+from acsard.checkup.motion import moving
 from acsard.config.settings import McuConfig
 from acsard.mcu.frames import LETTERS, Motors
 from acsard.values import WHEELS
 
 TOLERANCE = 0.25
 """By which share the encoder's speed may differ from the command."""
-
-NO_WHEEL = len(WHEELS)
-"""What a person saw turn where nothing did."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size"]
 
@@ -32,17 +30,12 @@ class Channel(Struct, frozen=True):
     motor: int
     forth: Motors
     back: Motors
-    wheel: int | None = None
-    """Which wheel a person saw turn, in `WHEELS` order, or `NO_WHEEL`; None: nobody looked."""
+    wheel: str | None = None
+    """Which wheel a person saw turn, "" for none; None: nobody looked."""
     forward: bool = True
     """It turned forward first, as seen by a person."""
     probed: bool = False
     """Its own encoder did not follow a short probe: it was not turned further, and not back."""
-
-    @property
-    def seen(self) -> str:
-        """The name of the wheel that a person saw turn, "" for none and where nobody looked."""
-        return "" if self.wheel in (None, NO_WHEEL) else WHEELS[self.wheel or 0]
 
     @property
     def moved(self) -> list[int]:
@@ -69,11 +62,6 @@ class Channel(Struct, frozen=True):
         return "right" if all(abs(size - 1) <= TOLERANCE for size in sizes) else "size"
 
 
-def moving(speeds: Motors, least: float = MOVES) -> list[int]:
-    """The encoders that move."""
-    return [motor for motor in range(4) if abs(speeds[motor]) >= least]
-
-
 def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     """What motor and encoder of one channel say of each other."""
     motor, moved = channel.motor, channel.moved
@@ -96,9 +84,9 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 def _whose(mcu: McuConfig, channel: Channel) -> str:
     """Whose fault it is, as the one who saw the wheel can tell."""
     wheel, sign = wheel_of(mcu, channel.motor)
-    seen = channel.seen
+    seen = channel.wheel
     match channel.kind:
-        case "dead" if channel.wheel is not None:
+        case "dead" if seen is not None:
             return ", turns" if seen else ", still"
         case "reversed" if seen == wheel:
             return ", encoder" if channel.forward == (sign > 0) else ", motor"
@@ -119,8 +107,8 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     entries: dict[str, str] = {}
     for channel in found:
         wheel, sign = wheel_of(mcu, channel.motor)
-        if channel.kind in ("right", "size") and channel.seen:
-            wheel, sign = channel.seen, 1 if channel.forward else -1
+        if channel.kind in ("right", "size") and channel.wheel:
+            wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
             return manual.find("wheel map: twice", wheel=words(wheel))
         entries[wheel] = f"{'+' if sign > 0 else '-'}{LETTERS[channel.motor]}"

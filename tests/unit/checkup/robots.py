@@ -57,7 +57,6 @@ class Robot(VirtualWire):
     def board(self, rest: bool = True) -> Iterator[Board]:
         """The board alone, the line open and the motors known to stand, if they can say so."""
         with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
-            board.open(self.config.mcu.baud_rate)
             if rest:
                 board.rest()
                 board.armed = True

@@ -9,13 +9,18 @@ from acsard.checkup.findings import StoppedError
 from acsard.checkup.limits import MOTOR_S, PATIENCE_S, SPEED
 from acsard.checkup.motion import ZERO
 from acsard.config.settings import Config, McuConfig, SimConfig
+from acsard.host.errors import MendableError
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Robot
 
 
-def test_a_board_that_never_opened_its_line_sends_nothing_when_left() -> None:
-    robot = Robot()
-    with Board(robot, McuConfig(), 100.0):
+def test_a_line_that_does_not_open_is_sent_nothing() -> None:
+    class Held(Robot):
+        def open(self, baud_rate: int) -> None:
+            raise MendableError("held")
+
+    robot = Held()
+    with pytest.raises(MendableError), Board(robot, McuConfig(), 100.0):
         pass
     assert robot.sent == []
 
@@ -55,7 +60,9 @@ def test_answers_come_at_the_time_they_were_complete() -> None:
 def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: bool) -> None:
     robot = Robot("comma_latched", trailing_comma=sent)
     with robot.board() as board:
-        board.drive((0.0, 0.0, 0.0, SPEED), 0.3, comma=True)
+        board.comma = True
+        board.drive((0.0, 0.0, 0.0, SPEED), 0.3)
+        board.comma = sent
         board.rest()
         assert board.latched is not sent
         assert board.comma
@@ -119,16 +126,33 @@ def test_silence_ends_it_only_while_somebody_drives() -> None:
     assert robot.later() == [0.0] * 4
 
 
+def test_short_drives_that_nobody_answers_add_up_unless_an_answer_comes_between() -> None:
+    robot = Robot("plain_only")
+    with robot.board() as board:
+        for _ in range(10):
+            with robot.mcu.mute():
+                board.drive(ZERO, 0.2)
+            board.ask()
+        with robot.mcu.mute():
+            for _ in range(2):
+                board.drive(ZERO, 0.14)
+                board.listen(1.0)
+            with pytest.raises(StoppedError) as end:
+                board.drive(ZERO, 0.14)
+    assert end.value.finding.figure == "silent for 0.3 s"
+
+
 @pytest.mark.parametrize("sent", [False, True])
 def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool) -> None:
     config = Config(sim=SimConfig(motor_time_constant=1.5))
     robot = Robot("plain_only", config=config, trailing_comma=sent)
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 3.0)
+        began_s = board.now_s
         board.rest()
         assert not board.latched
         assert board.comma is sent
-        assert MOTOR_S < board.slowest_rest_s < PATIENCE_S
+        assert MOTOR_S < board.now_s - began_s < PATIENCE_S
 
 
 def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:

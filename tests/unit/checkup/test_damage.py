@@ -18,13 +18,13 @@ from tests.unit.checkup.robots import Robot
 def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
     lines = damage.broken_lines(comma, sealed, [0, 1, 2, 3])
     assert len(lines) == (12 if sealed else 10)
-    assert all(any(b.line.endswith(end) for b in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
-    for broken in lines:
-        assert protocol.whole(broken.line) is None, broken.what
-        if "last number" in broken.what:
+    assert all(any(line.endswith(end) for _, line in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
+    for what, line in lines:
+        assert protocol.whole(line) is None, what
+        if "last number" in what:
             continue  # the host reads replies with other decimals
         with pytest.raises(FrameError):
-            Codec(WheelMap()).decode(broken.line.rstrip())
+            Codec(WheelMap()).decode(line.rstrip())
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_firmware_that_reads_a_last_number_that_is_cut_is_told() -> None:
 
 def test_motors_that_do_not_turn_as_told_are_left_out() -> None:
     lines = damage.broken_lines(False, False, [1])
-    assert all(b"ap03" not in broken.line for broken in lines)
-    assert any(b"bp03" in broken.line for broken in lines)
+    assert all(b"ap03" not in line for _, line in lines)
+    assert any(b"bp03" in line for _, line in lines)
     with Robot().board() as board:
         assert damage.finding(board, []).verdict == "SKIPPED"

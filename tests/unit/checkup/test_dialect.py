@@ -80,7 +80,6 @@ def test_a_form_of_line_that_is_not_answered_is_left_for_the_other(comma: bool) 
         assert dialect.form(board) is None
     robot = Particular(comma)
     with robot.faulty(), Board(robot, McuConfig(trailing_comma=not comma), 100.0) as board:
-        board.open(115200)
         finding = dialect.form(board)
         assert finding is not None
         assert finding.keys == {"mcu.trailing_comma": comma}

@@ -34,27 +34,27 @@ def test_a_coarse_encoder_is_no_runaway_and_a_runaway_is_one(
     for speed in (3.0, -3.0):
         good = course(speed, per_turn, period_ms, 3.0, sampled)
         for n in range(1, len(good)):
-            assert motion.fastest(good[:n], 6.0, per_turn) is None
-    found = motion.fastest(course(-9.0, per_turn, period_ms, 1.0, sampled), 6.0, per_turn)
+            assert motion.fastest(good[:n], 6.0) is None
+    found = motion.fastest(course(-9.0, per_turn, period_ms, 1.0, sampled), 6.0)
     assert found is not None
     assert found[0] == 1
     assert -10.0 < found[1] < -6.0
 
 
-def test_counts_tell_a_runaway_before_the_mean_does() -> None:
-    replies = course(1.0, 3200, 20, 1.0, True)
-    last = replies[-1]
-    assert last.reading is not None
-    for n in range(1, 7):
-        counts = last.reading.counts[1] + 200 * n
-        reading = Reading(last.reading.mcu_ms + 20 * n, (0, counts, 0, 0))
-        replies.append(Reply(last.at_s + 0.02 * n, (0.0, 19.6, 0.0, 0.0), b"", reading))
-    assert motion.fastest(replies, 18.0, 0) is None
-    assert motion.fastest(replies, 18.0, 3200) is not None
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_sudden_runaway_is_told_by_its_third_reply(sampled: bool) -> None:
+    replies = course(1.0, 3200, 20, 1.0, sampled)
+    for _ in range(3):
+        assert motion.fastest(replies, 6.0) is None
+        last = replies[-1]
+        counts = (0, last.reading.counts[1] + 200, 0, 0) if last.reading else (0, 0, 0, 0)
+        reading = last.reading and Reading(last.reading.mcu_ms + 20, counts)
+        replies.append(Reply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
+    assert motion.fastest(replies, 6.0) is not None
 
 
 def test_no_replies_say_nothing() -> None:
-    assert motion.fastest([], 6.0, 0) is None
+    assert motion.fastest([], 6.0) is None
     assert motion.covered([], 0) == (0.0,) * 4
     assert motion.trend([], 0, 0.02) == (1.0,) * 4
 

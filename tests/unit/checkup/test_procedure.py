@@ -66,6 +66,13 @@ def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -
     assert check(*fault, config=config).failed == []
 
 
+@pytest.mark.parametrize("per_turn", [16, 48, 400])
+def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_turn: int) -> None:
+    config = Config(sim=SimConfig(encoder_counts=per_turn))
+    checked = check("plain_only", "no_watchdog", config=config)
+    assert checked["damaged lines"].verdict == "PASS"
+
+
 @pytest.mark.parametrize("lag", [0.8, 1.0])
 @pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
 def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:

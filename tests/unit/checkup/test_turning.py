@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import turning
+from acsard.checkup import dialect, turning
 from acsard.checkup.limits import GLANCE_S, PATIENCE_S, SPEED
 from acsard.checkup.wheels import Channel
 from acsard.config.settings import Config, SimConfig
@@ -64,7 +64,7 @@ def test_every_motor_is_announced_before_it_turns() -> None:
 
     with Robot("plain_only").board() as board:
         found = list(turning.channels(board, Listener()))
-        comma = turning.comma(board, found[-1])
+        comma = dialect.comma(board, found[-1].kind == "dead")
     assert [text.split()[1] for text in said] == list("abcd")
     assert [channel.kind for channel in found] == ["right"] * 4
     assert (comma.verdict, comma.figure) == ("PASS", "not needed")

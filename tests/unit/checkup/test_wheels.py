@@ -7,6 +7,7 @@ import pytest
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.frames import Motors
+from acsard.values import WHEELS
 
 MCU = McuConfig()
 
@@ -55,13 +56,13 @@ def test_names_are_those_of_the_configured_wheels() -> None:
 
 
 def test_a_map_needs_a_person_for_every_motor() -> None:
-    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, m) for m in range(4)]
+    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, WHEELS[m]) for m in range(4)]
     assert wheel_map(MCU, channels).verdict == "PASS"
     assert wheel_map(MCU, [*channels[:3], seen(3, 3)]).verdict == "SKIPPED"
 
 
 def test_a_wheel_seen_twice_is_no_map() -> None:
-    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, min(m, 2)) for m in range(4)]
+    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, WHEELS[min(m, 2)]) for m in range(4)]
     finding = wheel_map(MCU, channels)
     assert (finding.verdict, finding.keys) == ("FAIL", {})
     assert "rear left" in finding.text
