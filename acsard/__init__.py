@@ -17,16 +17,17 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
 
     values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
     config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
-    mcu/           P  the serial line: frames, the check, is the MCU there, when may a line go
-    drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who
-                      commands?), limits, modes (the table), lifecycle (what latched it)
+    mcu/           P  the serial line: frames, the check, link (is the MCU there?), the port
+    drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is
+                      followed?), neutral (who may drive?), freshness (what came too late), words
+                      (all that in sentences), limits, modes (the table), tally (the log)
     messages/      P  the published structs, topics (**the** key table), encodings, report
     ros/           P  the two ROS trees: names and hashes, tokens, attachments, parameters
     incoming/      P  what comes in over the bus: sample -> command, query -> reply or request
     robot.py       P  the order; guard.py: the last look at every outgoing line
     sim/           P  the vehicle, the fake microcontroller, its faults
     checkup/       P  what `acsard mcu check` does: one module a question to the board
-    host/          S  the machine: clock, timers, threads, scheduling, systemd, journal, logs
+    host/          S  the machine: clock, timers, threads, files, systemd, journal, logs, errors
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
     runtime/       S  the control loop and the daemon; figures of itself
