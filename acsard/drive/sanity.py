@@ -71,7 +71,7 @@ class _Wheel:
         expected = self.expected
         size, most = abs(expected), max(abs(expected), abs(told))
         fast = self.driven and abs(speed) > 1.5 * most + SLACK
-        slowing = fast and abs(speed) < self.slowest - SLACK
+        slowing = abs(speed) < self.slowest - SLACK
         if slowing or not fast:
             self.slowest = abs(speed)
         moving = size > SLACK and expected * told > 0

@@ -127,7 +127,7 @@ def visit(endpoint):
         session.declare_subscriber(
             key, lambda s: heard.add(str(s.key_expr)), allowed_origin=zenoh.Locality.REMOTE
         )
-        for key in ("**", "acsard/acsar/**")
+        for key in ("**", "acsard/acsar/**", "acsard/acsar/odom")
     ]
     end = time.monotonic() + seconds
     while time.monotonic() < end:

@@ -265,6 +265,15 @@ def test_wheels_turned_by_hand_are_told_once_a_second_and_never_a_fault(speed: f
         assert told == pytest.approx([0.21, 1.21, 2.21, 3.21], abs=0.011)
 
 
+def test_one_wheel_turned_by_hand_is_told_too() -> None:
+    sanity = driven(10.0)
+    told = [sanity.watch(STILL, STILL, DT)]
+    for step in range(30):
+        assert not sanity.watch(STILL, only(2, -5.0 + step % 2), DT)
+        told.append(sanity.turned)
+    assert "rad/s with nothing commanded" in next(filter(None, told))
+
+
 def test_one_and_the_same_speed_by_hand_is_not_a_stuck_encoder() -> None:
     after, fault = watched(STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert (after, fault) == (math.inf, "")
@@ -284,11 +293,14 @@ def test_a_push_while_a_commander_holds_almost_zero_is_none_either() -> None:
     assert not any(sanity.watch(hardly, move, DT) for move in moves)
 
 
-def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slowing_is() -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slowing_is(
+    sign: float,
+) -> None:
     # by 5 rad/s2: 2 rad/s in less than half a second, as a robot that coasts
-    sanity, speed, faults = driven(20.0), 20.0, []
-    while speed > 8.0:
-        speed -= 5.0 * DT
+    sanity, speed, faults = driven(sign * 20.0), sign * 20.0, []
+    while abs(speed) > 8.0:
+        speed -= sign * 5.0 * DT
         faults.append(sanity.watch(STILL, WheelSpeeds(speed, speed, speed, speed), DT))
         faults.append(sanity.turned)
     assert not any(faults)
