@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from acsard.host import clock, real_time
+from acsard.host import clock
 from acsard.messages.encodings import Format, encode
 from acsard.messages.schema import Message
 from acsard.ros.attachments import Attachment
@@ -30,8 +30,9 @@ OPTIONS: dict[str, Any] = {
     "priority": zenoh.Priority.REAL_TIME,
 }
 
-HELD = 4
-"""Messages of one topic that wait for the thread, the newest: a step may fold a few lines."""
+HELD = 16
+"""Messages of one topic that wait for the thread, the newest: odometry of 0.16 s, which is longer
+than the machine or a client that joins usually holds it up."""
 
 STUCK_NS = NS_PER_S // 4
 """A round of puts takes 0.1 ms, a few more on a busy machine; longer, and somebody holds it up."""
@@ -132,7 +133,6 @@ class Outlets:
             self._bell.release()
 
     def _run(self) -> None:
-        real_time.follow()
         try:
             leaving = False
             while not leaving:
@@ -189,4 +189,5 @@ class Outlets:
             self._count(outlet, status.matching)
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
-        self._count(outlet, outlet.wanted or publisher.matching_status.matching)
+        if publisher.matching_status.matching:  # else it has been told meanwhile, if it has come
+            self._count(outlet, True)

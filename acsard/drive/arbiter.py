@@ -68,6 +68,16 @@ class _Source:
         free = sender.state == "free"
         return free and sender.live(now_ns), free, sender.noticed_ns
 
+    def doubt(self, name: str, was_set: bool) -> None:
+        """The clock of this sender wavers, or was set: then it begins anew."""
+        sender = self.senders.get(name)
+        if sender is None:
+            return
+        if was_set:
+            sender.forget(self.first)
+        else:
+            sender.unlearn()
+
     def live(self, now_ns: int) -> list[Sender]:
         """The senders that are not silent, first the one that counts: who may drive, came first."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
@@ -129,10 +139,10 @@ class Arbiter:
         sender = known or source.sender(command.sender, command.arrived_ns)
         if sender is None:
             return "crowded"
-        if verdict == "set":
-            sender.forget(source.first)
-        elif verdict == "first":
-            sender.unlearn()
+        if verdict in ("set", "first"):
+            # The clock is its own on every source: what it said on others is as doubtful.
+            for other in self._ranking:
+                other.doubt(command.sender, verdict == "set")
         counts = verdict in ("fresh", "set")
         sender.take(command, self._since_ns, counts=counts)
         return "" if counts else "unproven"

@@ -116,7 +116,7 @@ class Sender:
         usual = self._usual or 0.0
         enough = max(self._timeout_ns, min(1.5 * usual, self._pause_ns))
         if command.shared:  # whose zero it is, nobody knows
-            enough = self._pause_ns + min(usual, self._pause_ns)
+            enough = max(self._timeout_ns, self._pause_ns + min(usual, self._pause_ns))
         return command.arrived_ns - self._moved_ns > enough
 
     def _paused(self, command: Command) -> bool:
@@ -136,7 +136,7 @@ class Sender:
 
     def _longest_ns(self, usual: float) -> float:
         """Silence that is no pause yet: it began when its next speed was due."""
-        return max(self._pause_ns + usual, 3 * usual)
+        return max(self._timeout_ns, self._pause_ns + usual, 3 * usual)
 
     @property
     def _usual(self) -> float | None:

@@ -1,8 +1,7 @@
 """What the operating system can do for punctuality: asked for once, before any thread starts.
 
-Only the control loop's own thread becomes real-time, and behind it the one that sends what the loop
-publishes: what it starts (the bus's threads, children) does not inherit it, so that no flood on the
-bus competes with the loop.
+Only the control loop's own thread becomes real-time: what it starts (the bus's threads, children)
+does not inherit it, so that no flood on the bus competes with the loop.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-from contextlib import suppress
 from pathlib import Path
 
 PRIORITY = 10
@@ -42,18 +40,6 @@ def ask() -> str:
         "(acsard service install) has it, or give the user rtprio 10 and memlock unlimited in "
         "/etc/security/limits.conf, or set control.real_time = false to do without"
     )
-
-
-def follow() -> None:
-    """For a thread that the loop hands work to: behind the loop, ahead of all that is not so.
-
-    Without the permission, or when the loop has not got it either, it stays as it is.
-    """
-    if os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
-        return
-    behind = os.sched_param(os.sched_getparam(os.getpid()).sched_priority - 1)
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, behind)
 
 
 def _schedule() -> bool:

@@ -140,10 +140,11 @@ async def _control(
         def step() -> Next | None:
             now = clock.now()
             control.leaving = departure.begun_ns is not None
-            manager.step(control.step(now, ticker.take()))
+            period = ticker.take()
+            manager.step(control.step(now, period))
             if departure.over(now.mono_ns, control.at_rest):
                 return None
-            return Next(control.listens, control.retry_ns)
+            return Next(control.listens, control.retry_ns, ticked=period.expired > 0)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)

@@ -50,6 +50,10 @@ class Alarm(_Timer):
             self._timer.set(at_ns)
         self._at_ns = at_ns
 
+    def _expire(self) -> None:
+        self._at_ns = None  # it may have gone off too early, and is wanted again for the same time
+        super()._expire()
+
 
 class Ticker(_Timer):
     """Calls `wake` every period while entered; `take` says what the wake-up means."""

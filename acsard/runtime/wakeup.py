@@ -28,6 +28,8 @@ class Next(Struct, frozen=True):
     """A command is worth a step of its own."""
     retry_ns: int | None
     """When to step again, monotonic; None for no need."""
+    ticked: bool = True
+    """A period has ended: a stop may wake the loop again."""
 
 
 class Wakeup:
@@ -95,7 +97,7 @@ class Wakeup:
     def _arm(self, then: Next) -> None:
         self._alarm.set(then.retry_ns)
         self._listens = then.listens
-        if then.listens:
+        if then.listens or then.ticked:
             self._stop_told = False
-            if self._heard:  # it came while the step ran, and was perhaps too late for it
-                self._listens, self._again = False, True
+        if then.listens and self._heard:  # while the step ran, and perhaps too late for it
+            self._listens, self._again = False, True

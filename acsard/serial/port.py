@@ -81,7 +81,8 @@ class SerialPort:
         """Send the line now, or say that it did not go; it is never kept."""
         if not self.is_open:
             return "down"
-        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), unsent(self._fd))
+        waiting = unsent(self._fd)  # before the time is read: asking the driver takes some
+        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
         if data is None:
             return "superseded"
         try:

@@ -223,7 +223,14 @@ def taken_over(
         steady = peer.awaits(text(0.3), after=time.monotonic()).at
         with commander(daemon, 0.1, successor) as other:
             until(lambda: len(other.out) > 5, 5.0, "the other one commands")
-            waits = {one["name"]: one["waits_for"] for one in bus.state()["sources"]}
+
+            def waiting() -> str:
+                return next(
+                    str(s["waits_for"]) for s in bus.state()["sources"] if s["name"] == successor
+                )
+
+            until(lambda: "may be late" not in waiting(), 5.0, "its delays are steady")
+            waits = {successor: waiting()}
             driven = peer.lines[-1].line.startswith(text(0.3))
             first.signal(signal.SIGKILL)
             first.ended(5.0)
