@@ -74,7 +74,7 @@ class Robot:
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
-        adds what it alone sees (superseded lines, missed periods)."""
+        adds what it alone sees (lines that were superseded, the bus)."""
         self._refused = ""
         self._sanity = Sanity(config.feedback)
         self._tally = Tally()

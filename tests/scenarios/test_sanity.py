@@ -138,7 +138,12 @@ def shove(world: World, mode: str, dice: random.Random) -> None:
 
 
 @pytest.mark.parametrize(
-    "count", [40, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
+    "count",
+    [
+        8,
+        pytest.param(40, marks=pytest.mark.slow),
+        pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)]),
+    ],
 )
 def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> None:
     dice, kinds = random.Random(7), Counter[str]()

@@ -471,7 +471,7 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [24, long(500, 1800)])
+@pytest.mark.parametrize("count", [6, slow(24), long(500, 1800)])
 def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
     count: int,
 ) -> None:
@@ -521,7 +521,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
     return "" if driving_again(world, speaker) else f"after the cut: {world.state.reason}"
 
 
-@pytest.mark.parametrize("count", [16, long(400, 1800)])
+@pytest.mark.parametrize("count", [5, slow(16), long(400, 1800)])
 def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()
     for trial in range(count):
@@ -609,7 +609,7 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [6, long(100, 1800)])
+@pytest.mark.parametrize("count", [2, slow(6), long(100, 1800)])
 @pytest.mark.parametrize("kind", ["steady", "stalls", "cuts", "another"])
 def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> None:
     dice, found = random.Random(9), Counter[str]()
