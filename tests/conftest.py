@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 # No deadline: a slow machine must not fail a true sentence.
@@ -17,3 +20,20 @@ settings.load_profile("default")
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
+
+
+TIMED = ("bench", "firmware", "system", "systemd")
+"""Where real time passes: these run one after the other. All else is only computed beside them."""
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Two processes for the whole; one, which shows what is printed, for a part or with -s."""
+    part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
+    return 0 if part or config.option.capture == "no" or len(os.sched_getaffinity(0)) < 2 else 2
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.relative_to(here).parts[0] in TIMED:
+            item.add_marker(pytest.mark.xdist_group("timed"))
