@@ -418,7 +418,8 @@ def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fresh: Bu
         pose = await robot.pose()
         return reply.success, pose.x
 
-    assert run_async(shared, work) == (True, 4.0)
+    # To a tenth of a millimetre: wheels that come to rest creep.
+    assert run_async(shared, work) == (True, pytest.approx(4.0, abs=1e-4))
 
 
 def test_nothing_of_this_was_an_exception_in_the_daemon(shared: Daemon) -> None:
