@@ -27,9 +27,10 @@ TIMED = ("bench", "firmware", "system", "systemd")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for the whole; one, which shows what is printed, for a part or with -s."""
+    """Two processes for the default run; one, which shows what is printed, for another or a part."""
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
-    return 0 if part or config.option.capture == "no" or len(os.sched_getaffinity(0)) < 2 else 2
+    other = config.option.capture == "no" or "not (slow or soak" not in config.option.markexpr
+    return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
