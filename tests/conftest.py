@@ -27,7 +27,7 @@ TIMED = ("bench", "firmware", "system", "systemd")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for the default run; one, which shows what is printed, for another or a part."""
+    """Two processes for the default run; one, which shows what is printed, for any other."""
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
     other = config.option.capture == "no" or "not (slow or soak" not in config.option.markexpr
     return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
