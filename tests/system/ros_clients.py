@@ -342,24 +342,28 @@ class Client:
             replies += samples.seen
         return Called(replies, errors, time.monotonic() - begun)
 
-    def heard(self, bus: Bus, name: str, type_name: str, payload: bytes) -> None:
-        """Put it, once, and wait until it was taken as a command."""
+    def heard(
+        self, bus: Bus, name: str, type_name: str, payload: bytes | Callable[[], bytes]
+    ) -> None:
+        """Put it, made anew each time, until it is taken: a new sender must show its delays."""
         before = bus.count("commands")
-        self.put(name, type_name, payload)
-        until(lambda: bus.count("commands") > before, 5.0, f"a command on {name}")
+
+        def taken() -> bool:
+            self.put(name, type_name, payload if isinstance(payload, bytes) else payload())
+            return bus.count("commands") > before
+
+        until(taken, 5.0, f"a command on {name}")
 
     def zeros(self, bus: Bus) -> None:
         """A zero of every source, taken: from here on each could move the robot."""
-        before = bus.count("commands")
         for name in ("cmd_vel", "cmd_vel_teleop"):
-            self.put(name, TWIST, twist(0.0))
-        self.put("joint_commands", JOINTS, joints(0.0))
-        until(lambda: bus.count("commands") >= before + 3, 5.0, "a zero of each source")
+            self.heard(bus, name, TWIST, twist(0.0))
+        self.heard(bus, "joint_commands", JOINTS, lambda: joints(0.0))
 
     @contextmanager
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
         """A zero, and then so fast at 20 Hz while entered."""
-        self.heard(bus, name, type_name, PAYLOADS[type_name](0.0))
+        self.heard(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
         silenced = threading.Event()
 
         def send() -> None:

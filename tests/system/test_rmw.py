@@ -163,7 +163,9 @@ def test_an_independent_client_drives_the_robot(ground: Ground) -> None:
         assert 0.2 <= top <= 0.31, (topic, kind)
         after = until(lambda: _standing(ground.bus.state()), 5.0, "it stands after a zero")
         assert after["x"] > before["x"] + 0.005, (topic, kind)
-        assert [key for key in after["counters"] if key.startswith("command_")] == []
+        # What a new sender says before its delays were steady is refused, and nothing else.
+        refused = {key for key in after["counters"] if key.startswith("command_")}
+        assert refused <= {"command_unproven"}
 
 
 def _standing(state: Any) -> Any:
