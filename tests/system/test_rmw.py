@@ -529,14 +529,14 @@ def test_a_put_with_another_hash_is_silence(bus: Bus, ros: RmwClient) -> None:
     assert after["wheels"] == before["wheels"]
 
 
-PLAIN = {
-    "big endian": (TWIST, b"\0\0\0\0" + struct.pack(">6d", 0, 0, 0, 0, 0, 0)),
-    "surplus bytes": (TWIST, twist(0.0) + b"\xff\xff\xff"),
-    "padding that says so": (TWIST, b"\0\1\0\3" + twist(0.0)[4:] + bytes(3)),
-    "no frame": (STAMPED, stamped(0.0, age=None).replace(b"base_link", bytes(9))),
-    "surplus bytes, stamped": (STAMPED, stamped(0.0) + bytes(4)),
-    "joints without a stamp": (JOINTS, joints(0.0)),
-    "joints in another order": (JOINTS, joints(0.0, WHEELS[::-1])),
+PLAIN: dict[str, tuple[str, Callable[[], bytes]]] = {
+    "big endian": (TWIST, lambda: b"\0\0\0\0" + struct.pack(">6d", 0, 0, 0, 0, 0, 0)),
+    "surplus bytes": (TWIST, lambda: twist(0.0) + b"\xff\xff\xff"),
+    "padding that says so": (TWIST, lambda: b"\0\1\0\3" + twist(0.0)[4:] + bytes(3)),
+    "no frame": (STAMPED, lambda: stamped(0.0, age=None).replace(b"base_link", bytes(9))),
+    "surplus bytes, stamped": (STAMPED, lambda: stamped(0.0) + bytes(4)),
+    "joints without a stamp": (JOINTS, lambda: joints(0.0)),
+    "joints in another order": (JOINTS, lambda: joints(0.0, WHEELS[::-1])),
 }
 
 
@@ -544,9 +544,8 @@ PLAIN = {
 def test_what_is_unusual_but_right_is_taken(bus: Bus, ros: RmwClient, name: str) -> None:
     kind, payload = PLAIN[name]
     before = bus.state()
-    ros.put("joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
-    until(lambda: bus.count("commands") > before["counters"].get("commands", 0), 3.0, name)
-    assert changes(before, bus.state()) == {"commands": 1}
+    ros.heard(bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
+    assert changes(before, bus.state()).keys() <= {"commands", "command_unproven"}
 
 
 def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> None:
