@@ -200,8 +200,7 @@ class Rig:
         `wheel_speed` gives the speed of all wheels of the n-th command, rad/s.
         """
         phases, number = random.Random(seed), 0
-        self._put(0.0)  # neutral first
-        time.sleep(0.2)
+        self._neutral(phases)
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         while clock.mono_ns() - began_ns < seconds * NS_PER_S:
             time.sleep(phases.uniform(*SPACING_S))
@@ -211,6 +210,25 @@ class Rig:
         time.sleep(0.1)  # the last one's line
         self._put(0.0)
         return self._share(began_ns, used_ns)
+
+    def _neutral(self, phases: random.Random) -> None:
+        """Send zeros until they count: whose delays nobody knows shows them first."""
+        before = self._counted()
+
+        def look() -> bool | None:
+            self._put(0.0)
+            time.sleep(phases.uniform(*SPACING_S))
+            return before is None or self._counted() != before or None
+
+        self._wait(look, "neutral command counted")
+        time.sleep(0.2)
+
+    def _counted(self) -> int | None:
+        """Commands so far; None of a program that does not say."""
+        try:
+            return self.state().counters.get("commands", 0)
+        except NoAnswerError:
+            return None
 
     def _share(self, began_ns: int, used_ns: int) -> float:
         self._alive()

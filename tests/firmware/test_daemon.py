@@ -116,10 +116,10 @@ def stands(board: Board) -> Status:
 
 
 def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
-    """The commander sends neutral, then a speed."""
+    """The commander sends neutral for longer than its timeout, then a speed."""
     commander.wish = ZERO
     before = bus.count("commands")
-    until(lambda: bus.count("commands") >= before + 3, 5.0, "neutral was heard")
+    until(lambda: bus.count("commands") >= before + 10, 5.0, "neutral for half a second")
     commander.wish = twist(linear)
 
 

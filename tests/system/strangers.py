@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 _OPEN = """\
-import json, sys, time
+import json, signal, sys, time
 import zenoh
 
 def open_session(endpoint):
@@ -121,14 +121,19 @@ def put(linear):
 for _ in range(zeros):
     put(0.0)
     time.sleep(0.05)
+lets_go = []
+signal.signal(signal.SIGUSR1, lambda *_: lets_go.extend([0.0] * 10))
 start, step = time.monotonic(), 0
 while True:
-    put(speed)
+    put(lets_go.pop() if lets_go else speed)
     step += 1
     time.sleep(max(0.0, start + step / 20 - time.monotonic()))
 """
 )
-"""So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put."""
+"""So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put.
+
+SIGUSR1 makes it let go: ten zeros, longer than the timeout of its source.
+"""
 
 CODED_FLOOD = (
     _OPEN
@@ -174,7 +179,7 @@ time.sleep(600)
 """Subscribes to everything and promises to live for ten minutes, to be stopped with SIGSTOP."""
 
 ROUTER = """\
-import json, sys, time
+import json, signal, sys, time
 import zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"router"')

@@ -580,7 +580,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
 ) -> None:
     peer, daemon = far
     # Shorter than the 2 s after which clients give the daemon up and connect anew.
-    with commander(daemon, 0.3):
+    with commander(daemon, 0.3) as driver:
         peer.awaits(text(0.3), after=time.monotonic())
         with stalled(daemon):
             begun = time.monotonic()
@@ -591,7 +591,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
             until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
             assert no_burst(peer.since(woken)) >= 0.0
             assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
-            bus.put("cmd/app", ZERO)
+            driver.process.send_signal(signal.SIGUSR1)
             peer.awaits(text(0.3), after=woken)
 
 
