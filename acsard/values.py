@@ -146,6 +146,7 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "wheels_turned", "bus_stuck", "missed_periods",
+    "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
 ]  # fmt: skip

@@ -30,6 +30,7 @@ PURE_AMONG_SHELLS = (
     "runtime.period",
     "bench.matching",
     "bench.record",
+    "door.watch",
     "top.text",
     "top.view",
 )
@@ -50,7 +51,7 @@ CLOCKS = {
 """What reads a clock in module `time`. `time.sleep` is not among them, and client.py and cli/ are
 tools that a person waits for: they may use `time.monotonic`."""
 
-DAEMON_ROOMS = ("host", "serial", "bus", "runtime")
+DAEMON_ROOMS = ("host", "serial", "bus", "door", "runtime")
 """What the daemon is made of: one clock for all."""
 
 LONG_FILE, LONG_FUNCTION = 300, 50

@@ -46,6 +46,8 @@ SPOKEN = (
 )
 """The messages a daemon sends by itself: data, answers, and what it has and listens to."""
 
+EVERYTHING = (*SPOKEN, "put", "delete", "query")
+
 GRANTS: dict[Role, tuple[str, ...]] = {
     "viewer": ("speak", "tell", "watch", "ask", "halt"),
     "operator": ("speak", "tell", "watch", "ask", "halt", "command", "operate"),
@@ -131,6 +133,15 @@ class _Keys:
 
 def access_control(config: Config) -> dict[str, object]:
     """The value of Zenoh's `access_control` for the session of this daemon."""
+    return _access(config, LOCAL)
+
+
+def door_access(config: Config) -> dict[str, object]:
+    """The same for the door's, whose only link without a certificate is the daemon's."""
+    return _access(config, ("pass",))
+
+
+def _access(config: Config, local: tuple[str, ...]) -> dict[str, object]:
     rules = _rules(_Keys(config))
     access = config.access
     names: dict[Role, tuple[str, ...]] = {
@@ -146,7 +157,7 @@ def access_control(config: Config) -> dict[str, object]:
         if held
     }
     wide = WIDE if access.wildcards else dict.fromkeys(GRANTS, ())
-    granted: dict[str, tuple[str, ...]] = {"local": LOCAL}
+    granted: dict[str, tuple[str, ...]] = {"local": local}
     granted |= {role: (*GRANTS[role], *wide[role]) for role in GRANTS}
     return {
         "enabled": True,
@@ -194,13 +205,15 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*answered, *tokens], "deny"),
+        # between the door and the daemon
+        _rule("pass", "both", EVERYTHING, ["**"]),
     )
     return {rule["id"]: rule for rule in rules}
 
 
 def _rule(
     name: str,
-    flow: Flow,
+    flow: Flow | Literal["both"],
     messages: Sequence[str],
     keys: Sequence[str],
     permission: Permission = "allow",
@@ -208,7 +221,7 @@ def _rule(
     return {
         "id": name,
         "permission": permission,
-        "flows": [flow],
+        "flows": ["ingress", "egress"] if flow == "both" else [flow],
         "messages": list(messages),
         "key_exprs": list(dict.fromkeys(keys)),
     }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from acsard.config.settings import Config
+from acsard.bus.session import reachable
+from acsard.config.settings import TLS, Config
 
 
 class Address(NamedTuple):
@@ -26,15 +27,10 @@ def address_of(
     bus = config.bus
     # The daemon listens only as a peer; plain endpoints need no certificate.
     known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
-    endpoint = connect or _reachable(known[0])
+    endpoint = connect or reachable(known[0])
     certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
     return Address(endpoint, robot_id or config.robot.id, certificates)
 
 
-def _reachable(endpoint: str) -> str:
-    """Where a tool on this machine reaches what listens on every address."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
-
-
 def _is_tls(endpoint: str) -> bool:
-    return endpoint.startswith("tls/")
+    return endpoint.startswith(TLS)

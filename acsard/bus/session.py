@@ -11,7 +11,7 @@ import re
 
 import zenoh
 
-from acsard.config.settings import BusConfig
+from acsard.config.settings import TLS, BusConfig
 from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
@@ -19,7 +19,8 @@ COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
 
 MAX_SESSIONS = 256
-"""Clients at once; idle connections of strangers must not keep a person out for long."""
+"""Clients at once, at the machine and at the door each; idle connections of strangers must not
+keep a person out for long."""
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 """The files of a TLS directory."""
@@ -37,39 +38,84 @@ def daemon_session(
 ) -> zenoh.Session:
     """The daemon's session: a peer that listens where it is told, finds nobody by itself.
 
-    `limited` are the ROS keys commands come in on, `access` is who may do what. Raises `InUseError`
-    when the address is taken. Blocks, as a client until its router is there; call it in a thread.
+    `limited` are the ROS keys commands come in on, `access` is who may do what. Who comes by TLS
+    comes through the door. Raises `InUseError` when the address is taken. Blocks, as a client until
+    its router is there; call it in a thread.
     """
     settings = _base(bus.mode) | {
-        "listen/endpoints": list(bus.listen) if bus.mode == "peer" else [],
+        "listen/endpoints": list(bus.plain),
         "connect/endpoints": list(bus.connect),
         # Peers behind a router find each other by gossip only; without a router there is nobody.
         "scouting/gossip/enabled": bool(bus.connect),
         "timestamping/enabled": True,
-        # A stopped subscriber must not hold a put: by default each waits 1 ms for room.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+        "queries_default_timeout": 3000,
+    }
+    settings |= _listening() | _limits(robot_id, sources, limited, access)
+    if any(endpoint.startswith(TLS) for endpoint in bus.connect):
+        settings |= _tls(bus.tls)
+    if bus.connect:
+        settings |= PATIENT
+    return _opened(settings, bus.plain)
+
+
+def door_session(
+    bus: BusConfig,
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+) -> zenoh.Session:
+    """The door's session: a router between the network, by TLS, and the daemon on this machine."""
+    settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
+    settings |= _limits(robot_id, sources, limited, access)
+    settings |= {
+        "listen/endpoints": list(bus.outside),
+        "connect/endpoints": [reachable(bus.plain[0])],
+        "scouting/gossip/enabled": False,
+        # Who does not stamp must not seem to: the daemon would take the door for the sender.
+        "timestamping/enabled": False,
+    }
+    return _opened(settings, bus.outside)
+
+
+def reachable(endpoint: str) -> str:
+    """Where somebody on this machine reaches what listens on every address."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+
+
+def _listening() -> dict[str, object]:
+    """Strangers who connect and say nothing, or too much."""
+    return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
         # With 32, 300 idle connections keep a person out for 2 s; so many cost 3 MB then.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
-        "queries_default_timeout": 3000,
-        "access_control": access,
-        "downsampling": [_command_limits(robot_id, sources, limited)],
+        # A stopped subscriber must not hold a put: by default each waits 1 ms for room.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
-    if bus.tls:
-        settings |= _tls(bus.tls)
-    if bus.connect:
-        settings |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+
+
+def _limits(
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], access: dict[str, object]
+) -> dict[str, object]:
+    """Who may do what, and how often."""
+    limits = [_command_limits(robot_id, sources, limited)]
+    return {"access_control": access, "downsampling": limits}
+
+
+def _opened(settings: dict[str, object], listen: tuple[str, ...]) -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        where = ", ".join(bus.listen)
         raise InUseError(
-            f"cannot listen on {where}: {_first_line(error)}; another daemon or router may have "
-            "it: stop that, or give this one its own bus.listen",
+            f"cannot listen on {', '.join(listen)}: {_first_line(error)}; another daemon or router "
+            "may have it: stop that, or give this one its own bus.listen",
         ) from error
 
 

@@ -18,6 +18,7 @@ from acsard.cli import (
     call,
     check,
     doctor,
+    door,
     drive,
     echo,
     hz,
@@ -49,6 +50,7 @@ VERBS = (
     ports,
     mcu,
     lan,
+    door,
     service,
 )
 

@@ -34,6 +34,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("--baud-rate", type=int, metavar="N", help="9600 to 115200")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument("--listen", metavar="ENDPOINT", help="bus address, tcp/127.0.0.1:7448")
+    parser.add_argument(
+        "--no-door",
+        action="store_true",
+        help="start no `acsard door` for the tls/ endpoints: it runs by itself, as a service",
+    )
     parser.set_defaults(main=main)
 
 
@@ -83,11 +88,12 @@ def main(args: argparse.Namespace) -> int:
         for text in warnings(config):
             log.event(Event("configuration", text, "warning"))
 
+    door = [*(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
     # The watchdog ends a daemon that hangs by SIGABRT: where it hung goes to standard error.
     if sys.stderr is not None:  # None when it was closed before the start
         faulthandler.enable()
     try:
-        asyncio.run(daemon.run(config, log, announce))
+        asyncio.run(daemon.run(config, log, announce, None if args.no_door else door))
     finally:
         log.close()
         screen.close(0.2)

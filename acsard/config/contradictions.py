@@ -191,6 +191,11 @@ def _bus_problems(bus: BusConfig) -> list[str]:
         )
     if not bus.listen and bus.mode == "peer":
         found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
+    if bus.outside and not bus.plain:
+        found.append(
+            f"bus.listen = {show(list(bus.listen))}: who comes by TLS reaches the daemon through "
+            'its address on this machine; add "tcp/127.0.0.1:7448"'
+        )
     for key, endpoints in _endpoints(bus).items():
         for endpoint in endpoints:
             where = f"bus.{key} = {show(endpoint)}"

@@ -208,6 +208,10 @@ class RatesConfig(Struct, frozen=True):
     diagnostics: SlowRate = 1.0
 
 
+TLS = "tls/"
+"""Endpoints that begin so show and ask for a certificate."""
+
+
 class BusConfig(Struct, frozen=True):
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
@@ -217,6 +221,20 @@ class BusConfig(Struct, frozen=True):
         Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
     ] = ""
     insecure: bool = False
+
+    @property
+    def plain(self) -> tuple[str, ...]:
+        """Where the daemon itself listens; a client listens nowhere."""
+        return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Where the door listens for the network."""
+        return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
+
+    @property
+    def _peer(self) -> bool:
+        return self.mode == "peer"
 
 
 class AccessConfig(Struct, frozen=True):

@@ -63,6 +63,10 @@ class Systemd:
         """The start waits for something; called again before `PATIENCE_S` is over."""
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
+    def alive(self) -> None:
+        """Feed the watchdog."""
+        self._send("WATCHDOG=1")
+
     def step(self, outputs: Outputs) -> None:
         """After each control step: alive, and how it goes when that has changed."""
         if self._socket is None:
@@ -70,7 +74,7 @@ class Systemd:
         now_ns = outputs.now.mono_ns
         if self._feed_every_ns and now_ns - self._fed_ns >= self._feed_every_ns:
             self._fed_ns = now_ns
-            self._send("WATCHDOG=1")
+            self.alive()
         if outputs.status_changed or now_ns - self._status_ns >= STATUS_PERIOD_NS:
             self._status_ns = now_ns
             status = status_of(outputs)

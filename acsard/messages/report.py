@@ -69,7 +69,8 @@ class Report:
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
     ) -> None:
         self._config = config
-        self._certificate_ends_ns = certificate_ends_ns
+        self.certificate_ends_ns = certificate_ends_ns
+        """Wall-clock time; the door tells it where the daemon may not read it."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -215,7 +216,7 @@ class Report:
         """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""
         if not self._config.bus.tls:
             return 0, ""
-        return expiry(self._certificate_ends_ns, now.wall_ns)
+        return expiry(self.certificate_ends_ns, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures

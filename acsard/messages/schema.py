@@ -192,6 +192,19 @@ class RobotState(Message, frozen=True):
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
 
 
+class DoorState(Message, frozen=True):
+    """What the door to the network tells the daemon."""
+
+    opened: int
+    """When, in ns of the machine's monotonic clock: another number is another door."""
+    connections: int
+    """From outside, now."""
+    crowded: int
+    """Looks, four a second, at which all connections were taken."""
+    certificate_ends: int = 0
+    """Wall-clock time in ns; 0 where the library to read it is missing."""
+
+
 class KeyValue(Message, frozen=True):
     """One diagnostic figure, as text."""
 
@@ -288,6 +301,7 @@ MESSAGES: dict[str, type[Message]] = {
         Twist,
         TwistStamped,
         RobotState,
+        DoorState,
         DiagnosticArray,
         ServiceReply,
         SetPose,

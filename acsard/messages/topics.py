@@ -64,6 +64,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
+    Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
     *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
     Topic("info", "query", "Info", "", "who is this daemon"),
     Topic("config", "query", "configuration", "", "the configuration in force"),

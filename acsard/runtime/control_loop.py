@@ -16,6 +16,8 @@ from acsard.guard import Guard
 from acsard.incoming.asker import asker
 from acsard.incoming.bus import Bus
 from acsard.incoming.commands import Receiver, sender
+from acsard.incoming.door import KEY as DOOR
+from acsard.incoming.door import DoorTold
 from acsard.incoming.queries import Queries
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
@@ -79,6 +81,7 @@ class ControlLoop:
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
+        self._door = DoorTold()
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._last = stop
         """The line that went last."""
@@ -158,6 +161,10 @@ class ControlLoop:
             self.robot.counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)
         for arrival in got.arrivals:
+            if arrival.key == DOOR:
+                ends_ns = self._door.hear(arrival, self.robot.counters)
+                self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
+                continue
             if arrival.key == "stop":
                 if arrival.put:
                     by = asker(arrival.via, arrival.attachment, arrival.sender)

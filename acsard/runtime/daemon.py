@@ -10,7 +10,7 @@ import asyncio
 import gc
 import os
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 
 from acsard import __version__
@@ -19,7 +19,7 @@ from acsard.bus.bus import ZenohBus
 from acsard.bus.certificates import check as check_certificates
 from acsard.bus.certificates import ends_ns as ends_ns_of
 from acsard.bus.session import log_from_environment
-from acsard.config.settings import Config
+from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
@@ -28,6 +28,7 @@ from acsard.messages.schema import Info
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
+from acsard.runtime.doorkeeper import keep_door
 from acsard.runtime.ticker import Ticker
 from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
@@ -48,8 +49,13 @@ Announce = Callable[[str, str], None]
 """Called once when everything is up, with the serial device and what is wrong with it, if it is."""
 
 
-async def run(config: Config, log: Log, announce: Announce) -> None:
-    """Run until a signal; raises a `MendableError` when it cannot start."""
+async def run(
+    config: Config, log: Log, announce: Announce, door: Sequence[str] | None = None
+) -> None:
+    """Run until a signal; raises a `MendableError` when it cannot start.
+
+    `door` are the words for an `acsard door` of ours, None where it is a service of its own.
+    """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
     departure = Departure(log, wake, manager)
@@ -61,7 +67,7 @@ async def run(config: Config, log: Log, announce: Announce) -> None:
     if refused:
         log.info("real_time", text=refused)
     try:
-        await _run(config, log, announce, departure, wake, manager)
+        await _run(config, log, announce, departure, wake, manager, door)
     except asyncio.CancelledError:
         if departure.begun_ns is None:
             raise
@@ -76,6 +82,7 @@ async def _run(
     departure: Departure,
     wake: Wakeup,
     manager: Systemd,
+    door: Sequence[str] | None,
 ) -> None:
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
@@ -99,13 +106,11 @@ async def _run(
         port = SerialPort(
             path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, events.append
         )
-        if config.bus.tls:
-            check_certificates(config.bus.tls)
+        ends_ns = _certificates(config, door is not None)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         await stack.enter_async_context(port)
-        ends_ns = ends_ns_of(config.bus.tls) if config.bus.tls else None
         info = _info(config, path)
         control = ControlLoop(
             config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events
@@ -119,9 +124,20 @@ async def _run(
                 tasks.create_task(port.keep_open()),
                 tasks.create_task(_repeat_latched(bus, control)),
             ]
+            if door is not None and config.bus.outside:
+                helpers.append(tasks.create_task(keep_door(door, events.append)))
             await _control(config, control, departure, wake, manager)
             for helper in helpers:
                 helper.cancel()
+
+
+def _certificates(config: Config, ours: bool) -> int | None:
+    """When they end, of what is opened with them here; raises a `MendableError`."""
+    bus = config.bus
+    if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
+        return None
+    check_certificates(bus.tls)
+    return ends_ns_of(bus.tls)
 
 
 async def _control(

@@ -249,6 +249,8 @@ class Daemon(Program):
         given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
         self.config = write_config(where / f"{name}.toml", given)
         self._ready = ready
+        listens = given["bus"].get("mode") != "client"
+        self._has_door = listens and "'tls/" in str(given["bus"]["listen"])
         run = [*before, *acsard("run", "--config", str(self.config), *words)]
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
@@ -261,10 +263,20 @@ class Daemon(Program):
         if self._ready:
             try:
                 self.says("bus ")
+                if self._has_door:
+                    self.door_opens()
             except BaseException:
                 self.__exit__()
                 raise
         return self
+
+    def door_opens(self, times: int = 1) -> None:
+        """The door to the network has been opened so often."""
+        until(
+            lambda: sum("door_open" in line for line in list(self.err)) >= times,
+            START_S,
+            f"the door opens\n{self}",
+        )
 
     def events(self, name: str) -> list[dict[str, Any]]:
         """The log lines of one event so far."""

@@ -1,0 +1,50 @@
+"""`acsard door`: lets clients of other machines in by TLS; a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from acsard.cli.common import add_config, load
+from acsard.host.exits import Exit, ExitError
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "door",
+        help="let clients of other machines in by TLS, beside the daemon",
+        description="Listen at the tls/ endpoints of bus.listen and hand on to the daemon what the "
+        "certificates allow. `acsard run` starts one by itself; as a service it is "
+        "acsard-door.service. Ends with 1 when it has to be opened anew.",
+    )
+    add_config(parser)
+    parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
+    parser.add_argument(
+        "--held", action="store_true", help="end with standard input, as `acsard run` keeps it"
+    )
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Be open until a signal, or until it has to be opened anew."""
+    import os
+
+    from acsard.bus.session import log_from_environment
+    from acsard.door.door import Door
+    from acsard.host.logs import Log
+    from acsard.host.systemd import Systemd
+
+    where, config = load(args.config, {"robot": {"id": args.id}} if args.id else {})
+    if not config.bus.outside:
+        raise ExitError(
+            Exit.USAGE, f"{where} has no tls/ endpoint in bus.listen; `acsard lan init --write`"
+        )
+    log_from_environment()
+    log, manager = Log(config.log), Systemd(os.environ, os.getpid())
+    try:
+        over = Door(config, log, manager, sys.stdin.fileno() if args.held else None).run()
+    finally:
+        manager.close()
+        log.close()
+    return int(Exit.OK if over else Exit.FAILURE)

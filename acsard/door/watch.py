@@ -1,0 +1,70 @@
+"""Pure: what the door sees of itself -> what to tell of it, and when it has to be opened anew."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from acsard.values import NS_PER_S, Event
+
+STUCK_NS = 3 * NS_PER_S // 2
+"""A look at Zenoh takes a millisecond; longer than this, and somebody has taken its time."""
+
+ALONE_NS = NS_PER_S
+"""Without the daemon for so long, there is nothing to be a door to."""
+
+TOLD_EVERY_NS = 60 * NS_PER_S
+
+NAMES = 5
+"""Holders of connections that are named, those with most of them."""
+
+
+class Look(Struct, frozen=True):
+    """What Zenoh said when it was last looked at."""
+
+    at_ns: int
+    holders: tuple[str, ...] = ()
+    """The name in the certificate of each connection from outside, "" where Zenoh has none."""
+    linked: bool = False
+    """The daemon is connected."""
+
+
+class Watch:
+    """Judges look after look."""
+
+    def __init__(self, most: int, opened_ns: int) -> None:
+        """`most` connections from outside are all there are."""
+        self._most, self._linked_ns = most, opened_ns
+        self._told_ns: int | None = None
+        self.crowded = 0
+        """Looks at which all connections were taken."""
+
+    def judge(self, look: Look) -> Event | None:
+        """What to tell of a new look."""
+        if look.linked:
+            self._linked_ns = look.at_ns
+        if len(look.holders) < self._most:
+            return None
+        self.crowded += 1
+        if self._told_ns is not None and look.at_ns - self._told_ns < TOLD_EVERY_NS:
+            return None
+        self._told_ns = look.at_ns
+        text = f"all {self._most} connections are taken, {crowd(look.holders)}"
+        return Event("door_crowded", f"{text}: nobody else is let in", "warning")
+
+    def over(self, look: Look, now_ns: int) -> Event | None:
+        """Why the door has to be opened anew, given the newest look; None when it has not."""
+        if now_ns - look.at_ns > STUCK_NS:
+            text = "stuck: somebody connected takes all its time; all are sent away"
+            return Event("door_stuck", text, "error")
+        if look.at_ns - self._linked_ns > ALONE_NS:
+            return Event("door_alone", "the daemon has gone", "warning")
+        return None
+
+
+def crowd(holders: Sequence[str]) -> str:
+    """Who has how many connections, in words."""
+    most = Counter(holders).most_common(NAMES)
+    return ", ".join(f"{count} by {name or 'an unnamed one'}" for name, count in most)
