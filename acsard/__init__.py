@@ -1,7 +1,7 @@
 """acsard: the hardware interface daemon of a four-wheel differential-drive robot.
 
 One process, one asyncio event loop: a serial microcontroller below, a Zenoh bus above, a control
-step every 10 ms between.
+step every 10 ms between. Who comes from the network comes through another process, the door.
 
       one task, every 10 ms (earlier when a fresh command or feedback is in hand)
 
@@ -31,6 +31,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
     runtime/       S  the control loop and the daemon; figures of itself
+    door/          S  `acsard door`: where TLS ends, a process of its own
     client.py      S  drive and follow a robot from Python
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
     doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines

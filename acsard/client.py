@@ -69,6 +69,9 @@ OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 """Zeros at first: for 0.25 s a daemon that never heard us wants to see that they are not late, and
 sees it sooner through the jitter of a busy machine the more there are."""
 
+OPENED_S = 2.0
+"""By when zeros that count have counted."""
+
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -78,7 +81,7 @@ class Client:
 
     def __init__(self, session: zenoh.Session, robot_id: str, source: str) -> None:
         self.session = session
-        self._id, self._source = robot_id, source
+        self._id, self.source = robot_id, source
         self.name = own_name()
         """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
@@ -164,7 +167,7 @@ class Client:
         )
         self._sequence += 1
         self.session.put(
-            self.key(f"cmd/{self._source}"),
+            self.key(f"cmd/{self.source}"),
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
@@ -274,10 +277,7 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
     if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
         raise UsageError("linear, angular and seconds must be finite numbers")
     # Each time: the robot may have been stopped and cleared, or started, since the last drive.
-    opened = time.monotonic() + OPENING_S
-    while time.monotonic() < opened:
-        client.send(0.0, 0.0)
-        yield OPENING_PERIOD_S
+    yield from _opening(client)
     end = time.monotonic() + seconds
     try:
         while (left := end - time.monotonic()) > 0:
@@ -286,6 +286,33 @@ def _drive(client: Client, linear: float, angular: float, seconds: float) -> Ite
     finally:
         # Whatever interrupts the drive, the robot is told to stop.
         client.send(0.0, 0.0)
+
+
+def _opening(client: Client) -> Iterator[float]:
+    """Zeros until the daemon counts them; it may never, and says why in its state."""
+    begun, states, counts = time.monotonic(), client.subscribe("state"), False
+    decoder = _decoder("state")
+    try:
+        while (passed := time.monotonic() - begun) < OPENING_S or (
+            passed < OPENED_S and not counts
+        ):
+            client.send(0.0, 0.0)
+            yield OPENING_PERIOD_S
+            sample = states.try_recv()
+            if sample is not None:
+                state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                counts = _counts(state, client.source)
+    finally:
+        states.undeclare()
+
+
+def _counts(state: schema.RobotState, source: str) -> bool:
+    """Commands of this source are heard, and it need not be neutral first."""
+    return any(
+        one.age is not None and one.age < OPENING_S and not one.waits_for.startswith("neutral")
+        for one in state.sources
+        if one.name == source
+    )
 
 
 def _name(session: zenoh.Session) -> str:

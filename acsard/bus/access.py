@@ -205,8 +205,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*answered, *tokens], "deny"),
-        # between the door and the daemon
-        _rule("pass", "both", EVERYTHING, ["**"]),
+        # between the door and the daemon; ** includes no key with an @
+        _rule("pass", "both", EVERYTHING, ["**", *tokens]),
     )
     return {rule["id"]: rule for rule in rules}
 

@@ -121,14 +121,14 @@ def _configure(file: Path, directory: Path) -> None:
 
 
 def _admit_service(directory: Path) -> None:
-    """The installed unit sees loopback only and none of root's files: its drop-in mends both."""
+    """The door of the installed service opens by a drop-in: with networks and certificates."""
     from acsard.host import service
 
     step = service.admitting(directory)
     if step is None:
         return
     step.do()
-    print(f"wrote {step.file.path} for the service; look at its networks, then:")
+    print(f"wrote {step.file.path} for the service's door; look at its networks, then:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 

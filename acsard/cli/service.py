@@ -62,7 +62,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
     from acsard.host import service
 
     _ready(args)
-    files = [*service.files(), service.lan_drop_in()]
+    files = [*service.files(), *map(service.lan_drop_in, (service.UNIT, service.DOOR))]
     _do(service.uninstalling(files, service.present(files), force=args.force), args.dry_run)
     return 0
 
@@ -73,8 +73,10 @@ def main_status(args: argparse.Namespace) -> int:
 
     for file in service.files():
         print(f"{file.condition():12}  {file.path}")
-    state = service.state()
+    state = service.state(service.UNIT)
     print(state or "systemd does not answer on this machine")
+    if state:
+        print(f"\n{service.DOOR}:\n{service.state(service.DOOR)}")
     return 0 if "ActiveState=active" in state else 1
 
 

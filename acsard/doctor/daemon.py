@@ -6,6 +6,7 @@ import socket
 from collections.abc import Iterator
 
 from acsard.bus.address import address_of
+from acsard.bus.session import reachable
 from acsard.client import connect
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding, Level
@@ -41,6 +42,16 @@ def daemon(config: Config) -> Iterator[Finding]:
     if missed > 0.01 * max(1, lines):
         mend = "what else runs here? `top`; the service runs real-time"
         yield Finding("daemon", "warning", f"missed {missed} control periods", mend)
+
+
+def door(config: Config) -> Iterator[Finding]:
+    """Is the door to the network open?"""
+    for endpoint in map(reachable, config.bus.outside):
+        if _answers(endpoint):
+            yield Finding("door", "ok", f"open at {endpoint}")
+        else:
+            mend = "systemctl status acsard-door; `acsard run` opens one by itself"
+            yield Finding("door", "warning", f"nobody listens at {endpoint}", mend)
 
 
 def _answers(endpoint: str) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, parse
 from acsard.doctor.certificates import certificates
-from acsard.doctor.daemon import daemon, routers
+from acsard.doctor.daemon import daemon, door, routers
 from acsard.doctor.finding import Finding
 from acsard.doctor.machine import clock_and_scheduling, meddlers
 from acsard.doctor.port import serial_port
@@ -33,3 +33,4 @@ def examine(where: str, text: bytes) -> Iterator[Finding]:
     yield from certificates(config)
     yield from routers(config)
     yield from daemon(config)
+    yield from door(config)

@@ -16,8 +16,9 @@ import acsard
 from acsard.host.exits import Exit, ExitError
 from acsard.host.steps import File, Keep, Remove, Run, Step, Write, called
 
-UNIT, STOP = "acsard.service", "acsard-stop"
-DROP_IN = Path("/etc/systemd/system/acsard.service.d/lan.conf")
+UNIT, DOOR, STOP = "acsard.service", "acsard-door.service", "acsard-stop"
+UNITS = Path("/etc/systemd/system")
+LAN = "lan.conf"
 HOME = "/opt/acsard/venv"
 """Where the unit of `deploy/` believes acsard to be."""
 
@@ -43,18 +44,17 @@ AGAIN = ("tty", "usb-serial", "misc")
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
-    Run(("systemctl", "enable", "--now", UNIT)),
+    Run(("systemctl", "enable", "--now", UNIT, DOOR)),
 )
-LEAVING = (Run(("systemctl", "disable", "--now", UNIT)),)
-GONE = (*RELOAD, Run(("systemctl", "reset-failed", UNIT), may_fail=True))
+LEAVING = (Run(("systemctl", "disable", "--now", DOOR, UNIT)),)
+GONE = (*RELOAD, Run(("systemctl", "reset-failed", UNIT, DOOR), may_fail=True))
 
 
 def files() -> list[File]:
     """Every file of the service, as this installation writes it."""
-    unit = (_source() / "systemd" / UNIT).read_text(encoding="utf-8").replace(HOME, sys.prefix)
     reference = _reference().read_text(encoding="utf-8")
     return [
-        File(Path("/etc/systemd/system") / UNIT, unit.encode()),
+        *(_unit(name) for name in (UNIT, DOOR)),
         File(Path("/opt/acsard/bin") / STOP, (_source() / "systemd" / STOP).read_bytes(), 0o755),
         File(
             Path("/etc/udev/rules.d/70-acsar.rules"),
@@ -68,19 +68,24 @@ def files() -> list[File]:
     ]
 
 
-def lan_drop_in() -> File:
-    """What lets the unit onto the local network and gives it its certificates."""
-    return File(DROP_IN, (_source() / "systemd" / "lan.conf").read_bytes())
+def _unit(name: str) -> File:
+    text = (_source() / "systemd" / name).read_text(encoding="utf-8")
+    return File(UNITS / name, text.replace(HOME, sys.prefix).encode())
+
+
+def lan_drop_in(unit: str) -> File:
+    """What lets a unit onto the local network and gives it its certificates."""
+    return File(UNITS / f"{unit}.d" / LAN, (_source() / "systemd" / LAN).read_bytes())
 
 
 def admitting(directory: Path) -> Write | None:
-    """What lets the installed service onto the network with these certificates; None without one.
+    """What opens the installed service's door with these certificates; None without a service.
 
     The unit itself sees loopback only, and none of root's files.
     """
-    if os.geteuid() != 0 or not (DROP_IN.parent.parent / UNIT).exists():
+    if os.geteuid() != 0 or not (UNITS / DOOR).exists():
         return None
-    file = lan_drop_in()
+    file = lan_drop_in(DOOR)
     return Write(File(file.path, file.content.replace(TLS.encode(), str(directory).encode())))
 
 
@@ -137,11 +142,11 @@ def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[S
     return [*leaving, *steps, *GONE]
 
 
-def state() -> str:
-    """What systemd says of the service, "" where it does not answer."""
+def state(unit: str) -> str:
+    """What systemd says of a unit, "" where it does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = called(("systemctl", "show", UNIT, about), ASK_S)
+        done = called(("systemctl", "show", unit, about), ASK_S)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()

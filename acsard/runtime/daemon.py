@@ -156,7 +156,7 @@ async def _control(
         def step() -> Next | None:
             now = clock.now()
             control.leaving = departure.begun_ns is not None
-            period = ticker.take()
+            period = ticker.take(now.mono_ns)
             manager.step(control.step(now, period))
             if departure.over(now.mono_ns, control.at_rest):
                 return None

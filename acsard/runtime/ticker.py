@@ -7,7 +7,6 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 from acsard.runtime.period import Period
 
@@ -61,7 +60,7 @@ class Ticker(_Timer):
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)
         self._period_ns = period_ns
-        self._expired = 0
+        self._rang = False
         self._due_ns = 0
 
     def start(self, now_ns: int) -> None:
@@ -69,17 +68,18 @@ class Ticker(_Timer):
         self._due_ns = now_ns + self._period_ns
         self._timer.set(self._due_ns)
 
-    def take(self) -> Period:
-        """The periods that ended since the last call."""
-        expired, self._expired = self._expired, 0
+    def take(self, now_ns: int) -> Period:
+        """The periods that have ended by `now_ns` since the last call, whatever woke us."""
+        # By our clock: while NTP slews the timer's, it goes off up to a tenth too early.
+        early_ns = self._period_ns // 10 if self._rang else 0
+        expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
         due_ns = self._due_ns
         self._due_ns += expired * self._period_ns
+        if expired or self._rang:
+            self._timer.set(self._due_ns)
+        self._rang = False
         return Period(expired, due_ns)
 
     def _expire(self) -> None:
-        self._timer.expirations()
-        # By our clock: while NTP slews the timer's, it goes off up to a tenth too early.
-        passed_ns = clock.mono_ns() - self._due_ns + self._period_ns // 10
-        self._expired = passed_ns // self._period_ns + 1
-        self._timer.set(self._due_ns + self._expired * self._period_ns)
-        self._wake()
+        self._rang = True
+        super()._expire()

@@ -34,6 +34,8 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
         device.open()
         _set_up(device)
     except (OSError, termios.error) as error:
+        if device.is_open:
+            unlock(device.fileno())
         device.close()
         # A device that vanishes, or is no tty, is a `termios.error`: that is no OSError, and
         # pyserial passes it on as it is or in words only.

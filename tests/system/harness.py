@@ -717,13 +717,15 @@ class Bus:
         """A commander at 20 Hz that opens with a zero, unless told to be rude, while entered."""
         commander = Commander(self, f"cmd/{source}", linear, angular)
         if neutral:
-            before = self.count("commands")
-            self.put(commander.key, ZERO)
+            before, said = self.count("commands"), 0.0
 
             def heard() -> bool:
-                # Whoever is stamped on the way, as by a router, shows its delays first.
-                if self.count("command_unproven"):
+                nonlocal said
+                # Whoever is stamped on the way, as by a router, shows its delays first; and what
+                # comes within a millisecond of another is left out.
+                if self.count("command_unproven") or time.monotonic() > said + 0.5:
                     self.put(commander.key, ZERO)
+                    said = time.monotonic()
                 return self.count("commands") > before
 
             until(heard, 5.0, "the zero was heard")

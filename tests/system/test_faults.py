@@ -428,7 +428,8 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             f"{len(waited)} lines of ours in the first 5 ms, {periods.superseded} superseded, "
             f"link {after['link']}"
         )
-        assert after["link"] == "up" or silent > 0.05
+        # Unless it, or who speaks to it, had no core for as long as a link may be silent.
+        assert after["link"] == "up" or silent > 0.05 or periods.latest > 5.0
         assert periods.superseded + periods.missed >= 35
         assert periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.

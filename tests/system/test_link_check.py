@@ -17,7 +17,7 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
     config = {"mcu": {"port": "sim", "link_check": "require", "encoder_counts": 3200}}
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
-        (outcome,) = daemon.events("link_check")
+        outcome = daemon.events("link_check")[-1]  # a link that a busy machine lost has two
         assert outcome["text"] == "the serial lines are checked with samples"
         with connect(daemon.endpoint) as robot:
             begun = time.monotonic()

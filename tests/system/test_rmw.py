@@ -641,7 +641,7 @@ def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
 def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
     driven, other = fleet.one, fleet.two
-    before = other.state()
+    before = other.at_rest()
     with driven.follow("state") as states:
         client: Client = BridgeHalf(driven.session, "one")
         if tree == "rmw":

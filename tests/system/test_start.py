@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import signal
@@ -26,6 +27,7 @@ from tests.system.harness import (
     finish,
     free_endpoint,
     until,
+    wheels,
     write_config,
 )
 from tests.system.strangers import DRIVE, FIRST_ODOMETRY, words
@@ -134,9 +136,9 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
     # Not a byte of the second: no end of line of a new session, no zero amid the driving.
     assert opened
     assert b"\r\n" not in said
-    began = next(index for index, line in enumerate(said) if line != ZERO_LINE)
-    steady = said[began : said.index(b"ap10.00,bp10.00,cp10.00,dp10.00\r\n") + 60]
-    assert ZERO_LINE not in steady
+    # A commander that waits for a core may fall silent: that is a ramp, and no zero out of nothing.
+    for before, line in itertools.pairwise(said):
+        assert line != ZERO_LINE or wheels(before)[0] < 1.0
 
 
 def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_own_port(

@@ -16,18 +16,37 @@ from acsard.values import REST, Command, Twist
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
 
+class Samples:
+    """What comes on a key."""
+
+    def __init__(self, *samples: Any) -> None:
+        self._samples = list(samples)
+        self.undeclared = False
+
+    def try_recv(self) -> Any:
+        return self._samples.pop(0) if self._samples else None
+
+    def undeclare(self) -> None:
+        self.undeclared = True
+
+
 class Session:
     """Takes what is put, as the daemon would hear it."""
 
     def __init__(self, zid: str) -> None:
         self._zid = zid
         self.heard: list[Command] = []
+        self.states = Samples()
 
     def zid(self) -> str:
         return self._zid
 
     def new_timestamp(self) -> None:
         return None
+
+    def declare_subscriber(self, key: str, queue: Any) -> Samples:
+        assert key == "acsard/acsar/state"
+        return self.states
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
         key = key.removeprefix("acsard/acsar/")
@@ -77,3 +96,4 @@ def test_a_drive_opens_with_zeros_for_longer_than_a_first_contact_takes(
     opened_ns = (session.heard[first].stamp_ns or 0) - (session.heard[0].stamp_ns or 0)
     assert opened_ns >= 300_000_000
     assert twists[-1] == REST
+    assert session.states.undeclared

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -10,7 +11,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.bus.access import GRANTS, SERVICE_ROLES, Role, access_control
+from acsard.bus.access import GRANTS, SERVICE_ROLES, Role, access_control, door_access
 from acsard.config.settings import (
     AccessConfig,
     CommandsConfig,
@@ -30,9 +31,11 @@ ZID = "0123456789abcdef"
 class Access:
     """What the rules for a configuration let pass."""
 
-    def __init__(self, **tables: Any) -> None:
+    def __init__(
+        self, rules: Callable[[Config], dict[str, object]] = access_control, **tables: Any
+    ) -> None:
         self.config = Config(**tables)
-        self.value = cast(dict[str, Any], access_control(self.config))
+        self.value = cast(dict[str, Any], rules(self.config))
         self.rules: dict[str, dict[str, Any]] = {rule["id"]: rule for rule in self.value["rules"]}
         self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
 
@@ -160,7 +163,8 @@ LEAST: dict[str, Role] = {
 def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
     key = DEFAULT.key(written(topic.key))
     message = "put" if topic.direction == "in" else "query"
-    assert DEFAULT.who(message, key) == FROM[LEAST[topic.key]]
+    allowed = {"local"} if topic.key == "door" else FROM[LEAST[topic.key]]
+    assert DEFAULT.who(message, key) == allowed
     declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
     for who in EVERYBODY:
         assert DEFAULT.lets(who, declared, DEFAULT.key(topic.pattern), "egress")
@@ -351,3 +355,13 @@ def test_zenoh_accepts_the_rules(tables: dict[str, Any]) -> None:
     for rule in access.value["rules"]:
         assert rule["key_exprs"]
         assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])
+
+
+def test_at_the_door_each_role_may_what_it_may_and_the_daemon_all() -> None:
+    door = Access(door_access)
+    for role in ROLES:
+        assert door.rules_of(role) == DEFAULT.rules_of(role)
+    for flow in ("ingress", "egress"):
+        for message in ("put", "delete", "query", "reply", "declare_subscriber"):
+            for key in ("acsard/acsar/odom", "acsard/acsar/tf_static/@adv/x", "@ros2_lv/0/x", "**"):
+                assert door.lets("local", message, key, flow)

@@ -27,12 +27,24 @@ def test_the_defaults_contradict_nothing_and_surprise_nobody() -> None:
     assert warnings(Config()) == []
 
 
+HERE = "tcp/127.0.0.1:7448"
+
+
 @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7449", "tls/127.0.0.1:7449"])
 def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
-    (line,) = problems(bus=BusConfig(listen=(endpoint,)))
+    listen = (HERE, endpoint)
+    (line,) = problems(bus=BusConfig(listen=listen))
     assert "acsard lan init" in line
-    assert problems(bus=BusConfig(listen=(endpoint,), tls="/etc/acsard/tls")) == []
+    assert problems(bus=BusConfig(listen=listen, tls="/etc/acsard/tls")) == []
     assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
+
+
+def test_the_door_needs_a_way_to_the_daemon() -> None:
+    (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
+    assert line == (
+        'bus.listen = ["tls/0.0.0.0:7449"]: who comes by TLS reaches the daemon through its '
+        f'address on this machine; add "{HERE}"'
+    )
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7448", "tcp/[::]:7448", "tcp/robot:7448"])
@@ -45,7 +57,7 @@ def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint:
 
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
 def test_anything_else_is_no_endpoint(endpoint: str) -> None:
-    (line,) = problems(bus=BusConfig(listen=(endpoint,), tls="/etc/acsard/tls"))
+    (line,) = problems(bus=BusConfig(listen=(HERE, endpoint), tls="/etc/acsard/tls"))
     assert "not an endpoint" in line
 
 
@@ -78,7 +90,7 @@ def test_a_namespace_may_not_begin_like_the_native_keys() -> None:
 
 
 def test_a_bus_that_leaves_the_machine_wants_an_id_and_a_namespace() -> None:
-    text = b'[bus]\nlisten = ["tls/0.0.0.0:7449"]\ntls = "/etc/acsard/tls"\n'
+    text = b'[bus]\nlisten = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]\ntls = "/etc/acsard/tls"\n'
     first, second = warnings(parse(text))
     assert "robot.id" in first
     assert "ros.namespace" in second

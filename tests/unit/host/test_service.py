@@ -8,6 +8,7 @@ import pytest
 
 from acsard.host.exits import ExitError
 from acsard.host.service import (
+    DOOR,
     GONE,
     INSTALLED,
     LEAVING,
@@ -89,8 +90,8 @@ def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, _, _, configuration = files()
-    assert unit.path.name == UNIT
+    unit, door, _, _, configuration = files()
+    assert (unit.path.name, door.path.name) == (UNIT, DOOR)
     assert b'port = "/dev/acsar"' in configuration.content
     assert set(present([unit])) == {unit.path}
 

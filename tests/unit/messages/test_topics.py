@@ -18,6 +18,7 @@ PROMISED = [
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
     ("stop", "in", "anything"),
+    ("door", "in", "DoorState"),
     ("srv/stop", "service", "ServiceReply"),
     ("srv/clear", "service", "ServiceReply"),
     ("srv/activate", "service", "ServiceReply"),
@@ -31,7 +32,7 @@ PROMISED = [
     ("schema/<Type>", "query", "JSON Schema"),
     ("alive", "out", "liveliness token"),
 ]
-"""DESIGN section 3."""
+"""DESIGN section 3, and what the door tells the daemon."""
 
 
 def test_the_table_is_the_one_of_the_design() -> None:
