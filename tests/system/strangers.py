@@ -244,7 +244,19 @@ many = {
 }
 print("begun", flush=True)
 end = time.monotonic() + float(seconds)
-if form == "sessions":
+if form == "come_and_go":
+    while time.monotonic() < end:
+        session().close()
+elif form == "flood":
+    # As much as goes through: calls of all a viewer may call, and puts on what he may not.
+    while time.monotonic() < end:
+        one.put("acsard/acsar/cmd/app", b"x" * 60000)
+        two.get("acsard/acsar/state", hold)
+        one.put("acsard/acsar/stop/not", b"x")
+elif form == "wide_reply":
+    # Asks for all there is, of nobody in particular, and hears no answer.
+    kept = [one.get("acsard/acsar/schema/Odometry", hold) for _ in range(2000)]
+elif form == "sessions":
     kept = [one, two]
     while time.monotonic() < end:
         try:

@@ -24,7 +24,7 @@ SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
 
 PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
 
-UNIT = "acsard.service"
+UNIT, DOOR = "acsard.service", "acsard-door.service"
 
 HOME = "/opt/acsard"
 
@@ -36,7 +36,7 @@ USUAL = f'[mcu]\nport = "{PORT}"\n'
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
 
-DROP_INS = f"/etc/systemd/system/{UNIT}.d"
+UNITS = "/etc/systemd/system"
 
 
 class UnavailableError(Exception):
@@ -197,34 +197,35 @@ class Container:
         """What `acsard service install` would write, without starting it."""
         deploy = ROOT / "deploy" / "systemd"
         self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
-        self.write(f"/etc/systemd/system/{UNIT}", (deploy / UNIT).read_text())
+        for unit in (UNIT, DOOR):
+            self.write(f"{UNITS}/{unit}", (deploy / unit).read_text())
         self.run("systemctl", "daemon-reload")
 
     def reset(self) -> None:
         """As after the installation."""
-        self.run("systemctl", "stop", UNIT)
-        if self.path(DROP_INS).exists():
-            shutil.rmtree(self.path(DROP_INS))
-            self.run("systemctl", "daemon-reload")
-        self.run("systemctl", "reset-failed", UNIT)
+        self.run("systemctl", "stop", DOOR, UNIT)
+        for unit in (UNIT, DOOR):
+            shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
+        self.run("systemctl", "daemon-reload")
+        self.run("systemctl", "reset-failed", UNIT, DOOR)
         self.write(CONFIG, USUAL)
 
-    def drop_in(self, name: str, text: str) -> None:
-        """A file in the unit's drop-in directory."""
-        self.write(f"{DROP_INS}/{name}", text)
+    def drop_in(self, name: str, text: str, unit: str = UNIT) -> None:
+        """A file in a unit's drop-in directory."""
+        self.write(f"{UNITS}/{unit}.d/{name}", text)
         self.run("systemctl", "daemon-reload")
 
-    def start(self) -> Ran:
-        """Start the unit; back when it is ready or has failed."""
-        return self.run("systemctl", "start", UNIT)
+    def start(self, unit: str = UNIT) -> Ran:
+        """Start a unit; back when it is ready or has failed."""
+        return self.run("systemctl", "start", unit)
 
-    def show(self, name: str) -> str:
-        """A property of the unit."""
-        return self.run("systemctl", "show", "--value", "-p", name, UNIT).out.strip()
+    def show(self, name: str, unit: str = UNIT) -> str:
+        """A property of a unit."""
+        return self.run("systemctl", "show", "--value", "-p", name, unit).out.strip()
 
-    def main_pid(self) -> int:
-        """The daemon's process as the host sees it."""
-        procs = self._cgroup / "payload" / "system.slice" / UNIT / "cgroup.procs"
+    def main_pid(self, unit: str = UNIT) -> int:
+        """A unit's process as the host sees it."""
+        procs = self._cgroup / "payload" / "system.slice" / unit / "cgroup.procs"
         return int(procs.read_text().split()[0])
 
     def waited(self) -> float:
@@ -244,10 +245,10 @@ class Container:
         words = ["journalctl", "-o", "json", f"_SYSTEMD_INVOCATION_ID={self.show('InvocationID')}"]
         return [json.loads(line) for line in self.run(*words).out.splitlines()]
 
-    def messages(self) -> str:
-        """All that was ever written about the unit."""
+    def messages(self, unit: str = UNIT) -> str:
+        """All that was ever written about a unit."""
         self.run("journalctl", "--sync")
-        return self.run("journalctl", "-o", "cat", "-u", UNIT).out
+        return self.run("journalctl", "-o", "cat", "-u", unit).out
 
     def is_active_again(self, restarts: int) -> None:
         """Wait for the daemon's return after its `restarts`-th end."""

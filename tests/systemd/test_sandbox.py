@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
+from pathlib import Path
 
 import pytest
 
-from tests.system.harness import ROOT
-from tests.systemd.container import CONFIG, PORT, UNIT, USUAL, ZERO, Board, Container
+from tests.system.harness import ROOT, until
+from tests.systemd.container import CONFIG, DOOR, PORT, UNIT, USUAL, ZERO, Board, Container
 
 pytestmark = pytest.mark.systemd
 
@@ -20,16 +24,32 @@ ACSARD = "/opt/acsard/venv/bin/acsard"
 TLS = "/etc/acsard/tls"
 
 
-def test_systemd_finds_nothing_wrong_with_the_unit(container: Container) -> None:
-    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{UNIT}")
+@pytest.mark.parametrize("unit", [UNIT, DOOR])
+def test_systemd_finds_nothing_wrong_with_a_unit(container: Container, unit: str) -> None:
+    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{unit}")
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
-def test_its_exposure_is_small(container: Container) -> None:
-    words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{UNIT}"]
+@pytest.mark.parametrize("unit", [UNIT, DOOR])
+def test_its_exposure_is_small(container: Container, unit: str) -> None:
+    words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{unit}"]
     text = container.run("systemd-analyze", *words).out.splitlines()[-1]
     print(text.strip(" →"))
-    assert float(text.partition(f"{UNIT}:")[2].split()[0]) <= EXPOSURE
+    assert float(text.partition(f"{unit}:")[2].split()[0]) <= EXPOSURE
+
+
+def opened(container: Container) -> None:
+    """The service with a door to the network."""
+    made = container.run(ACSARD, "lan", "init", "--force", "--address", "127.0.0.1")
+    assert made.code == 0, made.err
+    listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
+    container.write(
+        CONFIG, f'mcu.port = "{PORT}"\nbus.listen = {json.dumps(listen)}\nbus.tls = "{TLS}"\n'
+    )
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text(), DOOR)
+    for unit in (UNIT, DOOR):
+        started = container.start(unit)
+        assert started.code == 0, started.err + container.messages(unit)
 
 
 @pytest.mark.parametrize("name", ["lan.conf", "bind-to-device.conf"])
@@ -39,22 +59,49 @@ def test_systemd_finds_nothing_wrong_with_a_drop_in(container: Container, name: 
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
-def test_with_lan_conf_it_reads_root_s_keys_and_listens_beyond_this_computer(
+def test_with_lan_conf_the_door_reads_root_s_keys_and_listens_beyond_this_computer(
     container: Container, board: Board
 ) -> None:
-    made = container.run(ACSARD, "lan", "init", "--address", "127.0.0.1")
-    assert made.code == 0, made.err
-    listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
-    container.write(
-        CONFIG, f'mcu.port = "{PORT}"\nbus.listen = {json.dumps(listen)}\nbus.tls = "{TLS}"\n'
-    )
-    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())
-    started = container.start()
-    assert started.code == 0, started.err + container.messages()
+    opened(container)
     viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
     shown = container.run(ACSARD, "echo", "state", "-n", "1", *viewer)
     assert shown.code == 0, shown.err
-    assert json.loads(shown.out)["mode"] == "ready"
+    state = json.loads(shown.out)
+    assert state["mode"] == "ready"
+    assert state["certificate"] == "valid for 730 days", (
+        "the daemon may not read it: the door tells"
+    )
+
+
+def test_a_door_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
+    container: Container, board: Board
+) -> None:
+    opened(container)
+    daemon, first = container.main_pid(), container.main_pid(DOOR)
+    os.kill(first, signal.SIGKILL)
+    until(lambda: container.show("NRestarts", DOOR) == "1", 5.0, "it is started again")
+    until(lambda: container.show("ActiveState", DOOR) == "active", 10.0, "it is open again")
+    assert container.main_pid(DOOR) != first
+    assert container.main_pid() == daemon
+    container.run("systemctl", "restart", UNIT)
+    until(lambda: container.show("ActiveState", DOOR) == "active", 10.0, "it came along")
+
+
+def test_what_a_stranger_can_take_of_the_door_is_limited(
+    container: Container, board: Board
+) -> None:
+    opened(container)
+    for name, value in (("MemoryMax", 256 << 20), ("CPUQuotaPerSecUSec", "800ms"), ("Nice", 5)):
+        assert container.show(name, DOOR) == str(value)
+    limits = Path(f"/proc/{container.main_pid(DOOR)}/limits").read_text()
+    assert re.search(rf"Max data size +{192 << 20} +{192 << 20}", limits)
+
+
+def test_without_lan_conf_there_is_no_door(container: Container, board: Board) -> None:
+    assert container.start().code == 0
+    container.start(DOOR)
+    assert container.show("ConditionResult", DOOR) == "no"
+    assert container.show("ActiveState", DOOR) == "inactive"
 
 
 def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.systemd.container import UNIT, Container, UnavailableError
+from tests.system.harness import until
+from tests.systemd.container import DOOR, UNIT, Container, UnavailableError
 
 pytestmark = pytest.mark.systemd
 
@@ -30,8 +31,8 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 @pytest.fixture
 def bare(alone: Container) -> Iterator[Container]:
     """The program alone, as after pip."""
-    clean = "rm -rf /etc/systemd/system/acsard.service* /opt/acsard/bin /etc/acsard"
-    alone.run("systemctl", "stop", UNIT)
+    clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard/bin /etc/acsard"
+    alone.run("systemctl", "stop", DOOR, UNIT)
     alone.run("sh", "-c", clean)
     alone.run("systemctl", "daemon-reload")
     yield alone
@@ -59,11 +60,12 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
     assert listing(bare) == before
     assert written(done.out) == [
         f"/etc/systemd/system/{UNIT}",
+        f"/etc/systemd/system/{DOOR}",
         "/opt/acsard/bin/acsard-stop",
         "/etc/udev/rules.d/70-acsar.rules",
         CONFIGURATION,
     ]
-    assert f"run     systemctl enable --now {UNIT}" in done.out
+    assert f"run     systemctl enable --now {UNIT} {DOOR}" in done.out
 
 
 def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> None:
@@ -74,7 +76,7 @@ def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> N
     assert "/dev/acsar" in bare.show("StatusText")  # waits for the board
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
-    assert (status.code, status.out.count("as installed")) == (0, 4)
+    assert (status.code, status.out.count("as installed")) == (0, 5)
     gone = bare.run(ACSARD, "service", "uninstall")
     assert gone.code == 0, gone.out + gone.err
     assert listing(bare) == before
@@ -120,6 +122,7 @@ def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> N
     bare.run("systemctl", "daemon-reload")
     bare.run("systemctl", "restart", UNIT)
     assert bare.show("ActiveState") == "active"
+    until(lambda: bare.show("ActiveState", DOOR) == "active", 10.0, "the door opens with it")
     assert bare.show("NRestarts") == "0"
     status = bare.run(ACSARD, "call", "stop", "--config", CONFIGURATION)
     assert status.code == 0, status.err
@@ -127,4 +130,4 @@ def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> N
     assert bare.run(ACSARD, "call", "stop", *viewer).code == 0
     assert bare.run(ACSARD, "call", "clear", *viewer).code == 69
     assert bare.run(ACSARD, "service", "uninstall").code == 0
-    assert not bare.path("/etc/systemd/system/acsard.service.d").exists()
+    assert not bare.path("/etc/systemd/system/acsard-door.service.d").exists()
