@@ -46,7 +46,6 @@ INSTALLED = (
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
     Run(("systemctl", "enable", "--now", UNIT, DOOR)),
 )
-LEAVING = (Run(("systemctl", "disable", "--now", DOOR, UNIT)),)
 GONE = (*RELOAD, Run(("systemctl", "reset-failed", UNIT, DOOR), may_fail=True))
 
 
@@ -138,7 +137,8 @@ def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[S
     for file in there:
         stays = file.path.name in staying
         steps.append(Keep(file.path, why) if stays else Remove(file.path))
-    leaving = LEAVING if any(file.path.name == UNIT for file in there) else ()
+    units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
+    leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]
 
 

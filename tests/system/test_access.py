@@ -432,7 +432,7 @@ def test_a_link_ends_with_its_certificate(robot: Robot, tmp_path: Path) -> None:
     end = time.monotonic() + 2.0
     with zenoh.open(robot.certificates.shown(robot.tls, tmp_path)) as session:
         assert list(session.get(f"{ME}/info", timeout=1.0))
-        until(lambda: not list(session.info.peers_zid()), 6.0, "the link ends")
+        until(lambda: not list(session.info.routers_zid()), 6.0, "the link ends")
         assert time.monotonic() > end - 1.1  # certificates count whole seconds
 
 

@@ -73,7 +73,7 @@ def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> N
     done = bare.run(ACSARD, "service", "install")
     assert done.code == 0, done.out + done.err
     assert bare.show("ActiveState") == "active"
-    assert "/dev/acsar" in bare.show("StatusText")  # waits for the board
+    until(lambda: "/dev/acsar" in bare.show("StatusText"), 5.0, "it waits for the board")
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
     assert (status.code, status.out.count("as installed")) == (0, 5)

@@ -11,7 +11,6 @@ from acsard.host.service import (
     DOOR,
     GONE,
     INSTALLED,
-    LEAVING,
     STOP,
     UNIT,
     Found,
@@ -21,19 +20,20 @@ from acsard.host.service import (
     present,
     uninstalling,
 )
-from acsard.host.steps import File, Keep, Remove, Write
+from acsard.host.steps import File, Keep, Remove, Run, Write
 
 ETC = Path("/etc/x")
 UNIT_FILE = File(ETC / UNIT, b"unit")
 STOP_FILE = File(ETC / STOP, b"stop", 0o755)
 RULES = File(ETC / "rules", b"rules")
 OWN = File(ETC / "acsard.toml", b"first", kept=True)
-ALL = [UNIT_FILE, STOP_FILE, RULES, OWN]
+DOOR_FILE = File(ETC / DOOR, b"door")
+ALL = [UNIT_FILE, DOOR_FILE, STOP_FILE, RULES, OWN]
 
 
 def there(**other: bytes | None) -> Found:
     """All files as installed, but for these."""
-    names = {"unit": UNIT_FILE, "stop": STOP_FILE, "rules": RULES, "own": OWN}
+    names = {"unit": UNIT_FILE, "door": DOOR_FILE, "stop": STOP_FILE, "rules": RULES, "own": OWN}
     changes = {names[name].path: content for name, content in other.items()}
     return {file.path: file.content for file in ALL} | changes
 
@@ -64,7 +64,14 @@ def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None
 
 def test_all_that_is_as_installed_is_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
-    assert uninstalling(ALL, there(), force=False) == [*LEAVING, *removed, *GONE]
+    leaving = Run(("systemctl", "disable", "--now", DOOR, UNIT))
+    assert uninstalling(ALL, there(), force=False) == [leaving, *removed, *GONE]
+
+
+def test_a_unit_that_is_not_there_is_not_disabled() -> None:
+    """As after an upgrade from a version without a door."""
+    leaving, *_ = uninstalling(ALL, there(door=None), force=False)
+    assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
 
 def test_where_nothing_is_nothing_is_stopped_or_removed() -> None:
