@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from acsard.bus.address import address_of
 from acsard.bus.session import reachable
 from acsard.client import connect
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding, Level
-from acsard.values import AcsardError
+from acsard.host import clock
+from acsard.values import NS_PER_S, AcsardError
+
+APART_S = 0.4
+"""From 0.5 s on Zenoh replaces the stamps of the one that is ahead."""
+
+SIGN = "commands signed as the README says need no common clock"
 
 
 def routers(config: Config) -> Iterator[Finding]:
@@ -38,10 +44,24 @@ def daemon(config: Config) -> Iterator[Finding]:
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = "see the reason; `acsard call clear` releases it" if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
+    yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
     missed, lines = state.counters.get("missed_periods", 0), state.counters.get("lines_sent", 0)
     if missed > 0.01 * max(1, lines):
         mend = "what else runs here? `top`; the service runs real-time"
         yield Finding("daemon", "warning", f"missed {missed} control periods", mend)
+
+
+def clocks(its_ns: int, ours_ns: int, counters: Mapping[str, int]) -> Iterator[Finding]:
+    """Can stamps be compared, and were some replaced? Wall-clock times of the same moment."""
+    apart = (its_ns - ours_ns) / NS_PER_S
+    if abs(apart) > APART_S:
+        way = "ahead of" if apart > 0 else "behind"
+        text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
+        yield Finding("clock", "warning", text, f"let NTP set both (timedatectl); {SIGN}")
+    replaced = counters.get("stamps_replaced", 0)
+    if replaced:
+        text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
+        yield Finding("clock", "warning", text, f"let NTP set both clocks; {SIGN}")
 
 
 def door(config: Config) -> Iterator[Finding]:

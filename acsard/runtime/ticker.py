@@ -32,7 +32,10 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        self._timer.expirations()
+        if self._timer.expirations():  # else it has been set anew since it went off
+            self._ring()
+
+    def _ring(self) -> None:
         self._wake()
 
 
@@ -49,9 +52,9 @@ class Alarm(_Timer):
             self._timer.set(at_ns)
         self._at_ns = at_ns
 
-    def _expire(self) -> None:
+    def _ring(self) -> None:
         self._at_ns = None  # it may have gone off too early, and is wanted again for the same time
-        super()._expire()
+        super()._ring()
 
 
 class Ticker(_Timer):
@@ -80,6 +83,6 @@ class Ticker(_Timer):
         self._rang = False
         return Period(expired, due_ns)
 
-    def _expire(self) -> None:
+    def _ring(self) -> None:
         self._rang = True
-        super()._expire()
+        super()._ring()

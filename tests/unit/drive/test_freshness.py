@@ -268,3 +268,34 @@ def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
         bench.wait(50).stamped(HIGH, twist=REST)
     bench.wait(50).stamped(HIGH)
     assert bench.driver() == "high"
+
+
+# a clock is a sender's on every source
+
+
+def driving(bench: Bench, source: Source, late_ms: float, ms: float) -> list[str]:
+    """The same sender's speeds at 20 Hz for so long."""
+    return [bench.wait(50).stamped(source, late_ms, "joe", GO, "joe") for _ in range(int(ms / 50))]
+
+
+def test_zeros_of_a_clock_that_wavers_on_another_source_made_nobody_neutral() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    for _ in range(3):
+        assert bench.wait(50).stamped(HIGH, 0.0, "joe", REST, "joe") == "unproven"
+    assert bench.wait(50).stamped(LOW, 2000.0, "joe", REST, "joe") == "unproven"
+    assert driving(bench, HIGH, 2000.0, 1000)[-1] == "", "its delays are steady again"
+    assert bench.driver() == ""
+
+
+def test_a_clock_that_was_set_must_be_neutral_on_each_of_its_sources() -> None:
+    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "joe", "joe").known(LOW, "joe", "joe")
+    bench.wait(50).stamped(LOW, 0.0, "joe", GO, "joe")
+    assert bench.driver() == "high" or bench.driver() == "low"
+    bench.wait(1000)
+    answers = driving(bench, HIGH, 5000.0, 3000)
+    assert answers[0] == "stale"
+    assert answers[-1] == ""
+    assert bench.driver() == ""
+    bench.wait(300)
+    assert driving(bench, LOW, 5000.0, 50) == [""]
+    assert bench.driver() == "", "it was free there before its clock was set"

@@ -6,7 +6,7 @@ import pytest
 
 from acsard.runtime import ticker
 from acsard.runtime.period import Period
-from acsard.runtime.ticker import Ticker
+from acsard.runtime.ticker import Alarm, Ticker
 
 PERIOD_NS = 10_000_000
 
@@ -16,12 +16,13 @@ class Kernel:
 
     def __init__(self) -> None:
         self.now_ns, self.rate, self.at_ns = 5_000_000_000, 1.0, 0
+        self.count = 1
 
     def set(self, at_ns: int) -> None:
         self.at_ns = self.now_ns + round((at_ns - self.now_ns) * self.rate)
 
     def expirations(self) -> int:
-        return 1
+        return self.count
 
 
 @pytest.fixture
@@ -94,3 +95,29 @@ def test_a_timer_that_goes_off_much_too_early_is_set_again(kernel: Kernel) -> No
     kernel.rate = 1.0
     assert goes_off(kernel, one).expired == 0
     assert kernel.at_ns == start_ns + PERIOD_NS
+
+
+def test_an_alarm_that_went_off_too_early_may_be_set_for_the_same_time_again(
+    kernel: Kernel,
+) -> None:
+    woken: list[int] = []
+    alarm = Alarm(lambda: woken.append(1))
+    at_ns = kernel.now_ns + PERIOD_NS
+    alarm.set(at_ns)
+    kernel.at_ns = 0
+    alarm.set(at_ns)
+    assert kernel.at_ns == 0, "it is set for that already"
+    alarm._expire()
+    alarm.set(at_ns)
+    assert kernel.at_ns == at_ns
+    assert woken == [1]
+
+
+def test_what_went_off_before_it_was_set_anew_wakes_nobody(kernel: Kernel) -> None:
+    woken: list[int] = []
+    one = Ticker(PERIOD_NS, lambda: woken.append(1))
+    one.start(kernel.now_ns)
+    kernel.count = 0
+    one._expire()
+    assert not woken
+    assert one.take(kernel.now_ns).expired == 0
