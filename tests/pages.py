@@ -150,7 +150,7 @@ COMMANDS: dict[str, How] = {
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": Elsewhere(".ci/run", "gcc-avr"),
     "make": Elsewhere("tests/firmware/board.py", '"make"'),
     "make flash PORT=/dev/ttyACM0": Elsewhere(HERE, '"make", "-n", "flash"'),
-    "sudo systemctl stop acsard": Elsewhere(CONTAINER, '"systemctl", "stop", UNIT'),
+    "sudo systemctl stop acsard": Elsewhere(CONTAINER, '"systemctl", "stop", DOOR, UNIT'),
     "acsard mcu check --port sim --yes": Run("PASS +watchdog"),
     "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": Elsewhere(
         HERE, "def test_the_broken_board"

@@ -141,9 +141,13 @@ class SerialPort:
         self._gate = Gate(baud_rate, self._stop, self._period_ns)
         self._received.clear()
         loop = asyncio.get_running_loop()
-        self._transport, _ = await serial_asyncio.connection_for_serial(
-            loop, lambda: _Reader(self), device
-        )
+        try:
+            self._transport, _ = await serial_asyncio.connection_for_serial(
+                loop, lambda: _Reader(self), device
+            )
+        except OSError:  # it sets the port up once more
+            close(device, lost=True)
+            raise
         self.is_open, self.trouble = True, ""
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))

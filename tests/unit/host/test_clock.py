@@ -1,0 +1,44 @@
+"""Both clocks are of one moment, also where the machine takes the core between them."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from acsard.host import clock
+
+WALL_NS = 1_800_000_000_000_000_000
+
+
+class Machine:
+    """Takes the core for 0.2 s right before the wall clock is read, as often as told."""
+
+    def __init__(self, takes: int) -> None:
+        self.takes, self.ns = takes, 5_000_000_000
+
+    def mono_ns(self) -> int:
+        self.ns += 500
+        return self.ns
+
+    def wall_ns(self) -> int:
+        if self.takes:
+            self.takes -= 1
+            self.ns += 200_000_000
+        return WALL_NS + self.ns
+
+
+@pytest.mark.parametrize("takes", [0, 1, 3])
+def test_both_are_of_one_moment(monkeypatch: pytest.MonkeyPatch, takes: int) -> None:
+    machine = Machine(takes)
+    monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
+    monkeypatch.setattr(time, "time_ns", machine.wall_ns)
+    at = clock.now()
+    assert at.wall_ns - at.mono_ns == WALL_NS
+
+
+def test_a_machine_that_always_does_ends_the_trying(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Machine(1000)
+    monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
+    monkeypatch.setattr(time, "time_ns", machine.wall_ns)
+    assert clock.now().wall_ns - WALL_NS == machine.ns - 500
