@@ -399,7 +399,8 @@ def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -
         counts, (0, changes), spans, (100.0, 10.0), (0.03, 0.1), strict=True
     ):
         least = (1 - near) * span - machine_s
-        assert least * rate <= heard <= (1 + near) * span * rate + more
+        # What the machine held back at the beginning has a late stamp, and the span is short.
+        assert least * rate <= heard <= (1 + near) * (span + machine_s) * rate + more
 
 
 def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> None:

@@ -15,6 +15,7 @@ from tests.system.harness import Bus, Daemon, Program, acsard, until
 
 def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path: Path) -> None:
     config = {"mcu": {"port": "sim", "link_check": "require", "encoder_counts": 3200}}
+    started = time.monotonic()
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
         outcome = daemon.events("link_check")[-1]  # a link that a busy machine lost has two
@@ -25,7 +26,9 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
             until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
             assert robot.pose().x == pytest.approx(0.25, abs=0.05 + 0.5 * lost(begun))
         assert "(serial lines checked with samples)" in bus.state()["reason"]
-        assert {name for name in bus.state()["counters"] if name.startswith("line_")} == set()
+        # A line that waited for a core for longer than the next two took answers an old one.
+        late = {"line_stale_sequence"} if lost(started) > 0.02 else set()
+        assert {name for name in bus.state()["counters"] if name.startswith("line_")} <= late
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(2.0) == 0
 
