@@ -72,6 +72,9 @@ sees it sooner through the jitter of a busy machine the more there are."""
 OPENED_S = 2.0
 """By when zeros that count have counted."""
 
+NEVER = ("inactive", "stopped", "fault", "leaving")
+"""Modes in which no command counts."""
+
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -299,9 +302,13 @@ def _opening(client: Client) -> Iterator[float]:
             client.send(0.0, 0.0)
             yield OPENING_PERIOD_S
             sample = states.try_recv()
-            if sample is not None:
+            if sample is None:
+                continue
+            try:
                 state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
-                counts = _counts(state, client.source)
+            except DecodeError:  # of a daemon of another version
+                continue
+            counts = state.mode in NEVER or _counts(state, client.source)
     finally:
         states.undeclare()
 

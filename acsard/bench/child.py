@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import subprocess
 from pathlib import Path
 
 from acsard.host.exits import Exit, ExitError
+from acsard.host.parent import end_with_parent
 
 END_S = 5.0
 """An end takes 0.2 s."""
 
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
-
 
 def end_with_us() -> None:
     """In the child: a parent that is killed leaves no daemon behind."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent(signal.SIGTERM)
 
 
 def leave(process: subprocess.Popen[bytes]) -> None:

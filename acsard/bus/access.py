@@ -1,10 +1,10 @@
 """Who may do what: the topic table and the ROS names -> Zenoh access rules, default deny.
 
-Zenoh checks them at the daemon's own session, against the neighbour on the link: who is behind a
-router has the router's rights. A rule holds for a key expression that it includes, so what may be
-asked with a wildcard has to be allowed with one. Who comes by TLS gets exact keys only, since a few
-wildcards take Zenoh's time without bound. What Zenoh lets pass is checked again in code (exact
-key, kind PUT, listed source).
+Zenoh checks them where a link ends, at the daemon's session or, for TLS, at the door's, against the
+neighbour on the link: who is behind a router has the router's rights. A rule holds for a key
+expression that it includes, so what may be asked with a wildcard has to be allowed with one. Who
+comes by TLS gets exact keys only, since a few wildcards take Zenoh's time without bound. What Zenoh
+lets pass is checked again in code (exact key, kind PUT, listed source).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Zenoh sessions as acsard opens them: the daemon's, and the tools' clients.
+"""Zenoh sessions as acsard opens them: the daemon's, the door's, and the tools' clients.
 
 What lives here: the session settings with the reason for each. What must not: keys or messages.
 """
@@ -109,12 +109,12 @@ def _limits(
     return {"access_control": access, "downsampling": limits}
 
 
-def _opened(settings: dict[str, object], listen: tuple[str, ...]) -> zenoh.Session:
+def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         raise InUseError(
-            f"cannot listen on {', '.join(listen)}: {_first_line(error)}; another daemon or router "
+            f"cannot listen on {', '.join(where)}: {_first_line(error)}; another daemon or router "
             "may have it: stop that, or give this one its own bus.listen",
         ) from error
 

@@ -43,8 +43,8 @@ def main(args: argparse.Namespace) -> int:
     log_from_environment()
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())
     try:
-        over = Door(config, log, manager, sys.stdin.fileno() if args.held else None).run()
+        code = Door(config, log, manager, sys.stdin.fileno() if args.held else None).run()
     finally:
         manager.close()
         log.close()
-    return int(Exit.OK if over else Exit.FAILURE)
+    return int(code)

@@ -45,6 +45,9 @@ def daemon(config: Config) -> Iterator[Finding]:
     mend = "see the reason; `acsard call clear` releases it" if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
+    if state.counters.get("door_crowded"):
+        text = "all connections from the network were taken at times: the log says by whom"
+        yield Finding("door", "warning", text, "take his certificate from [access], or his program")
     missed, lines = state.counters.get("missed_periods", 0), state.counters.get("lines_sent", 0)
     if missed > 0.01 * max(1, lines):
         mend = "what else runs here? `top`; the service runs real-time"

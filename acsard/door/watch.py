@@ -12,8 +12,11 @@ from acsard.values import NS_PER_S, Event
 STUCK_NS = 3 * NS_PER_S // 2
 """A look at Zenoh takes a millisecond; longer than this, and somebody has taken its time."""
 
-ALONE_NS = NS_PER_S
-"""Without the daemon for so long, there is nothing to be a door to."""
+MOMENT_NS = NS_PER_S // 2
+"""More than this between two judgements is a machine, or a quota, that let us stand still."""
+
+FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
+"""How long to wait for the daemon: for the first time, while others come in too, and later on."""
 
 TOLD_EVERY_NS = 60 * NS_PER_S
 
@@ -36,15 +39,15 @@ class Watch:
 
     def __init__(self, most: int, opened_ns: int) -> None:
         """`most` connections from outside are all there are."""
-        self._most, self._linked_ns = most, opened_ns
+        self._most = most
+        self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
+        self._last_ns = self._silent_ns = 0
         self._told_ns: int | None = None
         self.crowded = 0
         """Looks at which all connections were taken."""
 
-    def judge(self, look: Look) -> Event | None:
-        """What to tell of a new look."""
-        if look.linked:
-            self._linked_ns = look.at_ns
+    def tell(self, look: Look) -> Event | None:
+        """What there is to say of a new look."""
         if len(look.holders) < self._most:
             return None
         self.crowded += 1
@@ -54,12 +57,16 @@ class Watch:
         text = f"all {self._most} connections are taken, {crowd(look.holders)}"
         return Event("door_crowded", f"{text}: nobody else is let in", "warning")
 
-    def over(self, look: Look, now_ns: int) -> Event | None:
-        """Why the door has to be opened anew, given the newest look; None when it has not."""
-        if now_ns - look.at_ns > STUCK_NS:
+    def reopen(self, look: Look, passed_ns: int) -> Event | None:
+        """Why the door has to be opened anew, `passed_ns` after the last call; None: it has not."""
+        new, self._last_ns = look.at_ns != self._last_ns, look.at_ns
+        self._silent_ns = 0 if new else self._silent_ns + min(passed_ns, MOMENT_NS)
+        if look.linked:
+            self._linked_ns, self._patience_ns = look.at_ns, ALONE_NS
+        if self._silent_ns > STUCK_NS:
             text = "stuck: somebody connected takes all its time; all are sent away"
             return Event("door_stuck", text, "error")
-        if look.at_ns - self._linked_ns > ALONE_NS:
+        if look.at_ns - self._linked_ns > self._patience_ns:
             return Event("door_alone", "the daemon has gone", "warning")
         return None
 

@@ -126,16 +126,15 @@ def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[S
     then."""
     there = [file for file in wanted if found[file.path] is not None]
     staying = {
-        file.path.name
-        for file in there
-        if found[file.path] != file.content and (file.kept or not force)
+        file.path for file in there if found[file.path] != file.content and (file.kept or not force)
     }
-    if UNIT in staying:
-        staying.add(STOP)  # a unit that is started again must find what sends zeros after it
+    if any(path.name == UNIT for path in staying):
+        # A unit that is started again must find what sends zeros after it.
+        staying |= {file.path for file in there if file.path.name == STOP}
     why = "changed, or needed by what is; --force removes it"
     steps: list[Step] = []
     for file in there:
-        stays = file.path.name in staying
+        stays = file.path in staying
         steps.append(Keep(file.path, why) if stays else Remove(file.path))
     units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []

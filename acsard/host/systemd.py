@@ -63,6 +63,10 @@ class Systemd:
         """The start waits for something; called again before `PATIENCE_S` is over."""
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
+    def status(self, text: str) -> None:
+        """How it goes, for `systemctl status`."""
+        self._send(f"STATUS={text}")
+
     def alive(self) -> None:
         """Feed the watchdog."""
         self._send("WATCHDOG=1")

@@ -195,13 +195,13 @@ class RobotState(Message, frozen=True):
 class DoorState(Message, frozen=True):
     """What the door to the network tells the daemon."""
 
-    opened: int
+    opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
     """When, in ns of the machine's monotonic clock: another number is another door."""
-    connections: int
+    connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """From outside, now."""
-    crowded: int
+    crowded: Annotated[int, Meta(ge=0, lt=1 << 31)]
     """Looks, four a second, at which all connections were taken."""
-    certificate_ends: int = 0
+    certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """Wall-clock time in ns; 0 where the library to read it is missing."""
 
 

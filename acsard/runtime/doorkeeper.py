@@ -16,41 +16,51 @@ from acsard.host.threads import in_thread
 from acsard.values import Event
 
 AGAIN_S = 0.1
-LATER_S = 2.0
-"""Before a door is opened anew: one that had to be, and one that could not be."""
+"""Before a door is opened anew that had to be."""
 
-MEND = {Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}
-"""What it says why by itself."""
+LATER_S = 2.0
+"""Before one is tried again that could not be opened."""
 
 
 async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
     """`acsard door` with these words, again whenever it ends, until cancelled."""
-    command = [sys.executable, "-m", "acsard", "door", "--held", *words]
     while True:
-        process = await in_thread(lambda: _started(command), None, _let_go)
+        door = _Door(words)
         try:
-            code = await in_thread(process.wait, None)
+            code = await in_thread(door.run, None)
+            why = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+        except OSError as error:
+            code, why = Exit.USAGE, f"could not be started ({error})"
         finally:
-            _let_go(process)
-        log(Event("door_ended", _why(code), "warning"))
-        await asyncio.sleep(LATER_S if code in MEND else AGAIN_S)
+            door.let_go()
+        log(Event("door_ended", f"the door to the network {why}; it is opened anew", "warning"))
+        await asyncio.sleep(AGAIN_S if code <= Exit.FAILURE else LATER_S)
 
 
-def _started(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    # A session of its own: what is typed at the terminal is for the daemon, which ends it.
-    env = {k: v for k, v in os.environ.items() if k not in ("NOTIFY_SOCKET", "INVOCATION_ID")}
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True, env=env
-    )
+class _Door:
+    """One life of the process."""
 
+    def __init__(self, words: Sequence[str]) -> None:
+        # -P: what is installed, and not what lies in the directory that we were started in.
+        self._command = [sys.executable, "-P", "-m", "acsard", "door", "--held", *words]
+        self._ours, self._hold = os.pipe()
 
-def _let_go(process: subprocess.Popen[bytes]) -> None:
-    """Which ends it."""
-    if process.stdin is not None:
-        process.stdin.close()
+    def run(self) -> int:
+        """Start it and wait for its end, in one thread: the process ends with its thread at last.
 
+        Raises `OSError`.
+        """
+        hidden = ("NOTIFY_SOCKET", "INVOCATION_ID")
+        env = {key: value for key, value in os.environ.items() if key not in hidden}
+        try:
+            # A session of its own: what is typed at the terminal is for the daemon, which ends it.
+            process = subprocess.Popen(
+                self._command, stdin=self._ours, stdout=2, start_new_session=True, env=env
+            )
+        finally:
+            os.close(self._ours)
+        return process.wait()
 
-def _why(code: int) -> str:
-    if code < 0:
-        return f"the door to the network was ended by signal {-code}; it is opened anew"
-    return f"the door to the network ended with {code}; it is opened anew"
+    def let_go(self) -> None:
+        """Which ends it."""
+        os.close(self._hold)

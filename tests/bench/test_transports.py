@@ -202,6 +202,11 @@ def encoded(
         async with bus:
             with listening(one, keys, 1 if keys else 0):
                 made.clear()  # what is kept for late comers
+                while len(made) < len(keys):  # Zenoh tells of each listener when it comes to it
+                    bus.publish("odom", odometry("odom", "base_link"))
+                    bus.flush()
+                    await asyncio.sleep(0.01)
+                made.clear()
                 for number in range(1, count + 1):
                     bus.publish("odom", odometry("odom", "base_link"))
                     bus.flush()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import msgspec
 import pytest
 
 from acsard.client import Client
@@ -97,3 +98,53 @@ def test_a_drive_opens_with_zeros_for_longer_than_a_first_contact_takes(
     assert opened_ns >= 300_000_000
     assert twists[-1] == REST
     assert session.states.undeclared
+
+
+def told(waits_for: str, age: float | None = 0.01, mode: str = "ready") -> Any:
+    """A state that says this of our source."""
+    state = {
+        "stamp": {"sec": 1, "nanosec": 0}, "mode": mode, "reason": "", "x": 0, "y": 0, "yaw": 0,
+        "linear": 0, "angular": 0, "wheels": [], "link": "up", "source": "", "refused": "",
+        "sources": [{"name": "app", "priority": 50, "age": age, "waits_for": waits_for}],
+        "counters": {},
+    }  # fmt: skip
+    return Sample(msgspec.json.encode(state))
+
+
+class Sample:
+    """One sample as Zenoh hands it over."""
+
+    encoding = ""
+    key_expr = "acsard/acsar/state"
+
+    def __init__(self, data: bytes) -> None:
+        self.payload = self
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+
+NEUTRAL = "neutral first: app must send a zero"
+
+
+@pytest.mark.parametrize(
+    ("last", "opens"),
+    [
+        (told(""), True),
+        (told("teleop has the higher priority: until it is silent"), True),
+        (told(NEUTRAL), False),
+        (told("a command", None), False),
+        (told("a command", 7.0), False),
+        (told(NEUTRAL, mode="stopped"), True),
+        (Sample(b"{}"), False),
+    ],
+)
+def test_a_drive_begins_when_its_zeros_count_or_never_will(
+    session: Session, last: Any, opens: bool
+) -> None:
+    session.states = Samples(*[told(NEUTRAL)] * 45, last)
+    client_of(session).drive(0.5, seconds=0.05)
+    first = [one.twist for one in session.heard].index(Twist(0.5, 0.0))
+    opened_s = ((session.heard[first].stamp_ns or 0) - (session.heard[0].stamp_ns or 0)) / 1e9
+    assert (opened_s < 1.5) is opens

@@ -46,7 +46,19 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
     assert daemon.hears(DoorState(7, 0, 0)) is None
 
 
-@pytest.mark.parametrize("payload", [b"", b"\xff", b"{}", b'{"opened": "now"}', b"[]"])
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff",
+        b"{}",
+        b'{"opened": "now"}',
+        b"[]",
+        b'{"opened": -1, "connections": 0, "crowded": 0}',
+        b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 30 + b"}",
+        b'{"opened": 1, "connections": 0, "crowded": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
+    ],
+)
 def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
     counters = Counter[str]()
     assert DoorTold().hear(arrival(payload), counters) is None
