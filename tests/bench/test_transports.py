@@ -206,6 +206,7 @@ def encoded(
                     bus.publish("odom", odometry("odom", "base_link"))
                     bus.flush()
                     await asyncio.sleep(0.01)
+                await asyncio.sleep(0.2)  # none of these is on its way any more
                 made.clear()
                 for number in range(1, count + 1):
                     bus.publish("odom", odometry("odom", "base_link"))

@@ -7,6 +7,7 @@ own pid.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pty
@@ -81,9 +82,10 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def children(pid: int, words: str) -> list[int]:
-    """The children of a process whose command line has these words."""
+    """The children of all threads of a process whose command line has these words."""
+    born = [file.read_text().split() for file in Path(f"/proc/{pid}/task").glob("*/children")]
     found = []
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+    for child in itertools.chain.from_iterable(born):
         try:
             line = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
         except OSError:
@@ -789,6 +791,21 @@ class Periods(NamedTuple):
 def waited_for_a_core(pid: int) -> float:
     """How long the first thread of a process, the control loop, was ready and had no core, s."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+
+
+def kept_waiting(pid: int) -> float:
+    """How long all threads of a process were ready and had no core, s: one may hold up the others.
+
+    A process that has to pass its interpreter from thread to thread waits longer on a busy machine
+    than a bystander that only looks at the clock.
+    """
+    waits = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            waits += int((task / "schedstat").read_text().split()[1])
+        except OSError:
+            pass  # a thread that has ended meanwhile
+    return waits / 1e9
 
 
 def seconds(stamp: Mapping[str, int]) -> float:

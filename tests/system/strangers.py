@@ -208,7 +208,9 @@ os.nice(19)
 
 def session():
     config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
+    mode = form.partition("as_")[2] or "client"
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("listen/endpoints", "[]")
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("connect/endpoints", json.dumps([door]))
     config.insert_json5("transport/link/tls", settings)
@@ -253,9 +255,6 @@ elif form == "flood":
         one.put("acsard/acsar/cmd/app", b"x" * 60000)
         two.get("acsard/acsar/state", hold)
         one.put("acsard/acsar/stop/not", b"x")
-elif form == "wide_reply":
-    # Asks for all there is, of nobody in particular, and hears no answer.
-    kept = [one.get("acsard/acsar/schema/Odometry", hold) for _ in range(2000)]
 elif form == "sessions":
     kept = [one, two]
     while time.monotonic() < end:
@@ -266,6 +265,8 @@ elif form == "sessions":
 elif form in many:
     kept = [one.declare_subscriber(many[form] % i, hold) for i in range(700)]
 else:
+    if form.startswith("as_"):
+        form = "publish"
     kept = [pair[form](one, "b"), pair[form](two, "c")]
 print("declared", flush=True)
 time.sleep(max(0.0, end - time.monotonic()))

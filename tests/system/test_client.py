@@ -23,6 +23,7 @@ from tests.system.harness import (
     Finished,
     Program,
     free_endpoint,
+    kept_waiting,
     until,
 )
 from tests.system.strangers import words
@@ -86,8 +87,10 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
         for number, (name, endpoint) in enumerate(endpoints.items()):
             stack.enter_context(Daemon(where, endpoint=endpoint, name=f"daemon{number}"))
             buses[name] = stack.enter_context(Bus(endpoint))
-        for bus in buses.values():
+        before = {}
+        for name, bus in buses.items():
             bus.linked()
+            before[name] = kept_waiting(bus.get("info")["pid"])
         running = {
             name: stack.enter_context(Program(words(at_endpoint(code, endpoints[name])), where))
             for name, code in codes.items()
@@ -100,9 +103,8 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
             print(
                 f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
             )
-            # What it says itself that it missed, beside what a bystander does.
-            missed_s = 0.01 * state["counters"].get("missed_periods", 0)
-            outcomes[name] = Outcome(ended, state, lost(program.started) + missed_s)
+            waited_s = kept_waiting(buses[name].get("info")["pid"]) - before[name]
+            outcomes[name] = Outcome(ended, state, lost(program.started) + waited_s)
     return outcomes
 
 

@@ -56,7 +56,8 @@ FORMS = [
     "sessions",
     "come_and_go",
     "flood",
-    "wide_reply",
+    "as_router",
+    "as_peer",
 ]
 
 
@@ -193,7 +194,7 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
 def test_a_bus_that_is_locked_costs_messages_and_no_period(
     tmp_path: Path, certificates: Certificates
 ) -> None:
-    """Where wildcards are let in, on the machine: what holds Zenoh's tables holds who puts."""
+    """On the machine anybody may use wildcards: what holds Zenoh's tables holds who puts."""
     periods, counters = Robot(tmp_path, certificates).locked(0.5)
     print(f"\n{periods}, {counters}")
     assert periods.missed <= 0.01 * periods.elapsed + 4

@@ -1,0 +1,131 @@
+"""The door's process: opened anew whenever it ends, gone when the daemon is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    acsard,
+    children,
+    finish,
+    free_endpoint,
+    until,
+    write_config,
+)
+from tests.system.identities import Certificates, free_tls_endpoint
+
+pytestmark = pytest.mark.network
+
+
+class Open:
+    """A daemon with a door, and who comes through it."""
+
+    def __init__(self, where: Path, certificates: Certificates) -> None:
+        self._certificates = certificates
+        self._plain, self.tls = free_endpoint(), free_tls_endpoint()
+        bus = {"listen": [self._plain, self.tls], "tls": str(certificates.robot)}
+        self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
+
+    def door(self) -> int:
+        """Its process."""
+        (pid,) = until(lambda: children(self.daemon.pid, "acsard door"), 5.0, "a door")
+        return pid
+
+    def lets_in(self) -> bool:
+        try:
+            config = self._certificates.config("viewer", self._plain, self.tls)
+            with zenoh.open(config) as session:
+                return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
+        except zenoh.ZError:
+            return False
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return Certificates(tmp_path_factory.mktemp("certificates"))
+
+
+@pytest.fixture
+def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
+    robot = Open(tmp_path, certificates)
+    with robot.daemon:
+        yield robot
+
+
+def gone(pid: int) -> bool:
+    """It has ended, whoever it was left to."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def test_a_door_that_is_killed_is_opened_anew_and_counted(robot: Open) -> None:
+    assert robot.lets_in()
+    first = robot.door()
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("door_opened") == 1, 5.0, "it has told that it is open")
+    os.kill(first, signal.SIGKILL)
+    robot.daemon.door_opens(times=2)
+    assert robot.lets_in()
+    assert robot.door() != first
+    (line,) = robot.daemon.events("door_ended")
+    assert "ended by signal 9" in line["text"]
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("door_opened") == 2, 5.0, "it is counted")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_the_door_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
+    door = robot.door()
+    robot.daemon.signal(number)
+    robot.daemon.ended(5.0)
+    until(lambda: gone(door), 1.0, "it closes")
+    assert not robot.lets_in()
+
+
+def test_a_door_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
+    door = robot.door()
+    os.kill(door, signal.SIGSTOP)
+    robot.daemon.signal(signal.SIGTERM)
+    begun = time.monotonic()
+    assert robot.daemon.ended(2.0) == 0
+    until(lambda: gone(door), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
+
+
+def test_a_machine_that_stood_still_opens_no_door_anew(robot: Open) -> None:
+    door = robot.door()
+    os.kill(door, signal.SIGSTOP)
+    end = time.monotonic() + 2.0
+    until(lambda: time.monotonic() > end, 5.0, "two seconds")
+    os.kill(door, signal.SIGCONT)
+    until(robot.lets_in, 5.0, "it goes on")
+    assert robot.door() == door
+
+
+def test_what_somebody_at_the_machine_puts_in_the_door_s_place_harms_nobody(robot: Open) -> None:
+    huge = b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 400 + b"}"
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("door_opened") == 1, 5.0, "it has told that it is open")
+        for payload in (b"", b"{}", b"\xff", huge):
+            bus.session.put("acsard/acsar/door", payload)
+        assert bus.ask("info")
+        assert bus.count("door_opened") == 1
+
+
+def test_without_a_tls_endpoint_there_is_no_door_to_open(tmp_path: Path) -> None:
+    config = write_config(tmp_path / "plain.toml", {"bus": {"listen": [free_endpoint()]}})
+    done = finish(acsard("door", "--config", str(config)), tmp_path)
+    assert done.code == 2
+    assert "no tls/ endpoint" in done.err
+    with Daemon(tmp_path) as daemon:
+        assert not children(daemon.pid, "acsard door")
