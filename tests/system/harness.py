@@ -808,6 +808,12 @@ def kept_waiting(pid: int) -> float:
     return waits / 1e9
 
 
+def silences(times: Sequence[float], longest: float = 0.2) -> float:
+    """What a robot may lose by silences of its commander, s: it ramps down and up once more."""
+    gaps = [after - before for before, after in itertools.pairwise(times)]
+    return sum(gap + 0.3 for gap in gaps if gap > longest)
+
+
 def seconds(stamp: Mapping[str, int]) -> float:
     """A stamp of a message as seconds since 1970."""
     return stamp["sec"] + stamp["nanosec"] / 1e9

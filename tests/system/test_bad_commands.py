@@ -20,6 +20,7 @@ from tests.system.harness import (
     Daemon,
     Periods,
     Program,
+    kept_waiting,
     resident_kb,
     twist,
     until,
@@ -230,7 +231,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
-        waited = waited_for_a_core(daemon.pid)
+        waited = kept_waiting(daemon.pid)
         with Program(words(FLOOD, daemon.endpoint, 0.2, 2.0), tmp_path) as flood:
             flood.says("flooding")
             begun = time.monotonic()
@@ -248,7 +249,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
             count = int(flood.says("flooded").split()[1])
             assert flood.ended(5.0) == 0
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
-        waited = waited_for_a_core(daemon.pid) - waited
+        waited = kept_waiting(daemon.pid) - waited
         until(lambda: bus.state()["linear"] == 0.0, 3.0, "at rest")
     periods = Periods.between(before, after)
     counters = after["counters"]

@@ -24,6 +24,7 @@ from tests.system.harness import (
     Program,
     free_endpoint,
     kept_waiting,
+    silences,
     until,
 )
 from tests.system.strangers import words
@@ -91,6 +92,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
         for name, bus in buses.items():
             bus.linked()
             before[name] = kept_waiting(bus.get("info")["pid"])
+        heard = {name: stack.enter_context(bus.follow("cmd/app")) for name, bus in buses.items()}
         running = {
             name: stack.enter_context(Program(words(at_endpoint(code, endpoints[name])), where))
             for name, code in codes.items()
@@ -104,7 +106,9 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
                 f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
             )
             waited_s = kept_waiting(buses[name].get("info")["pid"]) - before[name]
-            outcomes[name] = Outcome(ended, state, lost(program.started) + waited_s)
+            silent_s = silences([seen.at for seen in heard[name].seen])
+            late = lost(program.started) + waited_s + silent_s
+            outcomes[name] = Outcome(ended, state, late)
     return outcomes
 
 
