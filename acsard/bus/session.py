@@ -140,9 +140,11 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
+        about = ", and is your certificate (--tls DIRECTORY) there and of its authority"
         raise UnreachableError(
             f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
-            f"is this its bus.listen, and has it room (at most {MAX_SESSIONS} connections)?",
+            f"is this its bus.listen, has it room (at most {MAX_SESSIONS} connections)"
+            f"{about if endpoint.startswith(TLS) else ''}?",
         ) from error
 
 

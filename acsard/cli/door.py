@@ -21,7 +21,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     add_config(parser)
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(
-        "--held", action="store_true", help="end with standard input, as `acsard run` keeps it"
+        "--held", action="store_true", help="end with standard input; so `acsard run` starts it"
     )
     parser.set_defaults(main=main)
 

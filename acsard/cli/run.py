@@ -33,7 +33,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
     parser.add_argument("--baud-rate", type=int, metavar="N", help="9600 to 115200")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
-    parser.add_argument("--listen", metavar="ENDPOINT", help="bus address, tcp/127.0.0.1:7448")
+    parser.add_argument(
+        "--listen",
+        metavar="ENDPOINT",
+        help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
+    )
     parser.add_argument(
         "--no-door",
         action="store_true",

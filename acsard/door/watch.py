@@ -67,7 +67,7 @@ class Watch:
             text = "stuck: somebody connected takes all its time; all are sent away"
             return Event("door_stuck", text, "error")
         if look.at_ns - self._linked_ns > self._patience_ns:
-            return Event("door_alone", "the daemon has gone", "warning")
+            return Event("door_alone", "nothing is heard of the daemon any more", "warning")
         return None
 
 
