@@ -155,7 +155,7 @@ def _renderer(form: Form) -> Any:
         case "journal":
             return render
         case "console":
-            return structlog.dev.ConsoleRenderer(pad_event_to=14)
+            return structlog.dev.ConsoleRenderer(14)  # how far it pads; the name was another once
         case "json":
             return structlog.processors.JSONRenderer()
         case "logfmt":
