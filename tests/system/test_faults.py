@@ -494,7 +494,8 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
         f"{max(between) * 1e3:.1f} ms apart, {close} closer than a line's time; ramp "
         f"{slower.at - sent:.3f} s after the last command"
     )
-    assert periods.are_all_accounted_for()
+    # A link that was lost may have periods in which nothing is said.
+    assert periods.are_all_accounted_for() or broken(states, begun, ended)
     # Counted, not timed: the kernel's thread that carries bytes through a pty starves as well,
     # and then hands over several lines at once.
     assert len(lines) <= 100 * (ended - begun) + 5
