@@ -29,7 +29,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
         try:
             code = await in_thread(door.run, None)
             why = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # no room for a process, or for a thread
             code, why = Exit.USAGE, f"could not be started ({error})"
         finally:
             door.let_go()
@@ -43,7 +43,8 @@ class _Door:
     def __init__(self, words: Sequence[str]) -> None:
         # -P: what is installed, and not what lies in the directory that we were started in.
         self._command = [sys.executable, "-P", "-m", "acsard", "door", "--held", *words]
-        self._ours, self._hold = os.pipe()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._over = False
 
     def run(self) -> int:
         """Start it and wait for its end, in one thread: the process ends with its thread at last.
@@ -52,15 +53,16 @@ class _Door:
         """
         hidden = ("NOTIFY_SOCKET", "INVOCATION_ID")
         env = {key: value for key, value in os.environ.items() if key not in hidden}
-        try:
-            # A session of its own: what is typed at the terminal is for the daemon, which ends it.
-            process = subprocess.Popen(
-                self._command, stdin=self._ours, stdout=2, start_new_session=True, env=env
-            )
-        finally:
-            os.close(self._ours)
-        return process.wait()
+        # A session of its own: what is typed at the terminal is for the daemon, which ends it.
+        self._process = subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, stdout=2, start_new_session=True, env=env
+        )
+        if self._over:  # let go of while it was started
+            self.let_go()
+        return self._process.wait()
 
     def let_go(self) -> None:
-        """Which ends it."""
-        os.close(self._hold)
+        """Close its standard input, which ends it."""
+        self._over = True
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()

@@ -175,6 +175,16 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
     return Certificates(tmp_path_factory.mktemp("certificates"))
 
 
+def undisturbed(figures: Figures) -> None:
+    """The loop, the stop, the daemon's memory and the other users."""
+    # A few periods either way are the machine's, which other tests use as well.
+    few = 0.01 * figures.periods.elapsed + 4 + 100.0 * figures.taken
+    assert figures.periods.missed <= 2 * figures.calm.missed + few
+    assert 0.0 < figures.stopped <= STOP_S
+    assert figures.grown_kb <= GROWTH_KB
+    assert figures.back <= BACK_S
+
+
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
 @pytest.mark.parametrize("who", ["viewer", "unlisted"])
 @pytest.mark.parametrize("form", FORMS)
@@ -183,12 +193,7 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
 ) -> None:
     figures = Robot(tmp_path, certificates).attacked(form, who, seconds)
     print(f"\n{form} by {who}: {figures}")
-    # A few either way are the machine's, which other tests use as well.
-    few = 0.01 * figures.periods.elapsed + 4 + 100.0 * figures.taken
-    assert figures.periods.missed <= 2 * figures.calm.missed + few
-    assert 0.0 < figures.stopped <= STOP_S
-    assert figures.grown_kb <= GROWTH_KB
-    assert figures.back <= BACK_S
+    undisturbed(figures)
 
 
 def test_a_bus_that_is_locked_costs_messages_and_no_period(
@@ -208,11 +213,7 @@ def test_behind_the_door_not_even_wildcards_disturb(
 ) -> None:
     figures = Robot(tmp_path, certificates, wildcards=True).attacked(form, "viewer", 1.5)
     print(f"\n{form} with wildcards: {figures}")
-    few = 0.01 * figures.periods.elapsed + 4 + 100.0 * figures.taken
-    assert figures.periods.missed <= 2 * figures.calm.missed + few
-    assert 0.0 < figures.stopped <= STOP_S
-    assert figures.grown_kb <= GROWTH_KB
-    assert figures.back <= BACK_S
+    undisturbed(figures)
 
 
 def test_who_takes_all_connections_is_in_the_log_and_in_the_state(
