@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# No deadline: a slow machine must not fail a true sentence.
-settings.register_profile("default", deadline=None, max_examples=30)
-settings.register_profile("thorough", deadline=None, max_examples=300)
+# No deadline: a slow machine must not fail a true sentence. The same examples every time: what a
+# change is judged by must not be luck. `explore` looks for new ones.
+settings.register_profile("default", deadline=None, max_examples=30, derandomize=True)
+settings.register_profile("thorough", deadline=None, max_examples=300, derandomize=True)
 """`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
+settings.register_profile("explore", deadline=None, max_examples=3000)
+"""`pytest --hypothesis-profile explore tests/unit`: about ten minutes, other examples each time."""
 settings.load_profile("default")
 
 # nohup and a script's `&` start a program with these ignored, and what a test starts inherits that.

@@ -56,11 +56,13 @@ def problems(config: Config) -> list[str]:
 
 def _reach(config: Config) -> _Reach:
     drive, limits = config.drive, config.limits
-    smaller = min(drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
-    radius = drive.wheel_radius * smaller
+    sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
     half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
-    rim = limits.wheel_speed * radius
-    wished = (limits.linear_speed + limits.angular_speed * half_track) / radius
+    # Where one side's wheels are larger, the fastest turn also moves forward: each side at its own
+    # rim speed, so the mean of the two bounds either axis.
+    rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
+    fastest_rim = limits.linear_speed + limits.angular_speed * half_track
+    wished = fastest_rim / (drive.wheel_radius * min(sides))
     return _Reach(
         min(limits.linear_speed, rim),
         min(limits.angular_speed, rim / half_track),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -80,7 +80,26 @@ def test_what_each_line_says_to_write_is_enough(
     pytest.fail(f"it still says {lines}")
 
 
+LOPSIDED = DriveConfig(
+    wheel_radius=0.119,
+    wheel_separation=0.703,
+    wheel_separation_multiplier=1.83,
+    left_wheel_radius_multiplier=0.8,
+    right_wheel_radius_multiplier=1.051,
+)
+SOFT = LimitsConfig(
+    linear_speed=0.065,
+    angular_speed=0.321,
+    linear_deceleration=0.01,
+    angular_deceleration=0.01,
+    linear_stop_deceleration=0.01,
+    angular_stop_deceleration=0.01,
+    wheel_speed=2.162,
+)
+
+
 @given(drives, limits, st.booleans(), st.sampled_from([(1, 0), (0, 1), (1, 1), (-1, 1)]))
+@example(LOPSIDED, SOFT, False, (1, 1))
 def test_whatever_is_accepted_comes_to_rest_in_time_from_any_speed_it_can_reach(
     drive: DriveConfig, limit: LimitsConfig, stop: bool, way: tuple[int, int]
 ) -> None:
