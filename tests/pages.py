@@ -99,6 +99,7 @@ How = Run | Elsewhere | Collected | Shown
 
 HERE = "tests/system/test_pages.py"
 CLI, FLEET, MCU = (f"tests/system/test_{name}.py" for name in ("cli", "fleet", "mcu"))
+FLEET_ROUTER = "tests/system/fleet_router.py"
 SERVICE, CONTAINER = "tests/systemd/test_service.py", "tests/systemd/container.py"
 ROS_FILES, BRIDGE = "tests/test_deploy_ros2.py", "tests/system/test_ros_bridge.py"
 
@@ -226,7 +227,8 @@ COMMANDS: dict[str, How] = {
     "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": BY_ROOT,
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": BY_ROOT,
     "sudo install -m 0644 router.json5 /etc/zenohd/": BY_ROOT,
-    "zenohd -c /etc/zenohd/router.json5": Elsewhere(FLEET, "ROUTER_FILE"),
+    "acsard router /etc/zenohd/router.json5": Elsewhere(FLEET_ROUTER, 'acsard("router"'),
+    "zenohd -c /etc/zenohd/router.json5": Elsewhere(FLEET_ROUTER, "[program, "),
     "acsard check": Run("effective configuration"),
     f"acsard echo state -n 1 {_ROUTER} laptop-anna": Elsewhere(HERE, "def test_the_laptop"),
     f"acsard drive {_ROUTER} laptop-anna": Elsewhere(CLI, '"drive", "--config"'),

@@ -114,7 +114,7 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         raise InUseError(
-            f"cannot listen on {', '.join(where)}: {_first_line(error)}; another daemon or router "
+            f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
             "may have it: stop that, or give this one its own bus.listen",
         ) from error
 
@@ -142,7 +142,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     except zenoh.ZError as error:
         about = ", and is your certificate (--tls DIRECTORY) there and of its authority"
         raise UnreachableError(
-            f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
+            f"no daemon answers at {endpoint} ({first_line(error)}); is `acsard run` running, "
             f"is this its bus.listen, has it room (at most {MAX_SESSIONS} connections)"
             f"{about if endpoint.startswith(TLS) else ''}?",
         ) from error
@@ -199,7 +199,7 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
     return config
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     """What a Zenoh error says, without the source paths it carries."""
     text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
     return text[0][:200].strip() if text else type(error).__name__

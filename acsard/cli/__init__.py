@@ -25,6 +25,7 @@ from acsard.cli import (
     lan,
     mcu,
     ports,
+    router,
     run,
     service,
     sim,
@@ -51,6 +52,7 @@ VERBS = (
     mcu,
     lan,
     door,
+    router,
     service,
 )
 

@@ -1,6 +1,7 @@
-"""Keeps the door to the network open beside a daemon in the foreground: a process of its own.
+"""Keeps the door to the network, or a fleet's router, open: a process of its own, again and again.
 
-As a service it is a unit of its own (`acsard-door.service`), with limits that only systemd can set.
+As a service the door is a unit of its own (`acsard-door.service`), with limits that only systemd
+can set.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ LATER_S = 2.0
 
 
 async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
-    """`acsard door` with these words, again whenever it ends, until cancelled."""
+    """`acsard` with these words ("door", ...), again whenever it ends, until cancelled."""
     while True:
         door = _Door(words)
         try:
@@ -42,7 +43,7 @@ class _Door:
 
     def __init__(self, words: Sequence[str]) -> None:
         # -P: what is installed, and not what lies in the directory that we were started in.
-        self._command = [sys.executable, "-P", "-m", "acsard", "door", "--held", *words]
+        self._command = [sys.executable, "-P", "-m", "acsard", *words, "--held"]
         self._process: subprocess.Popen[bytes] | None = None
         self._over = False
 

@@ -1,4 +1,4 @@
-"""deploy/zenoh's router as a process: Zenoh in router mode with router.json5, or zenohd itself."""
+"""deploy/zenoh's router.json5 as a process: Python's Zenoh, `acsard router`, or zenohd itself."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import json
 import shutil
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from acsard.lan.authority import Authority
-from tests.system.harness import ROOT, Program
+from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words
 
 FILES = ROOT / "deploy" / "zenoh"
@@ -85,14 +86,23 @@ def router(where: Path, endpoint: str) -> Program:
     return Program(words(_ROUTER, ROUTER_FILE, json.dumps(_changes(where, endpoint))), where)
 
 
-def zenohd_or_pythons(where: Path, endpoint: str) -> Program:
-    """zenohd itself where it is on the PATH, without its plugins."""
+def watched_router(where: Path, endpoint: str) -> Program:
+    """`acsard router` with the file; its log says when it listens."""
+    return Program(acsard("router", str(_file(where, endpoint))), where)
+
+
+def zenohd(where: Path, endpoint: str) -> Program:
+    """The real one, where it is on the PATH, without its plugins."""
     program = shutil.which("zenohd")
     if program is None:
-        return router(where, endpoint)
+        pytest.skip("needs zenohd")
+    return Program([program, "-c", str(_file(where, endpoint))], where)
+
+
+def _file(where: Path, endpoint: str) -> Path:
     config = zenoh.Config.from_file(str(ROUTER_FILE))
     for key, value in _changes(where, endpoint).items():
         config.insert_json5(key, json.dumps(value))
     file = where / "router.json"
     file.write_text(str(config))
-    return Program([program, "-c", str(file)], where)
+    return file
