@@ -86,5 +86,5 @@ def test_a_busy_machine_beside_a_quiet_one(real_time: bool) -> None:
         print(f"{name:26}{''.join(cells[:3])}   {''.join(cells[3:])}", flush=True)
         late[name] = sum(wait > 10_000 for wait in waits) / len(waits)
     if real_time:
-        # A period at most, but for what the machine itself loses.
-        assert max(late.values()) < 0.05
+        # A period at most, but for what the machine itself loses. A flood takes what it gets.
+        assert max(late["quiet"], late["all cores busy"]) < 0.05
