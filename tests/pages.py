@@ -217,7 +217,9 @@ COMMANDS: dict[str, How] = {
         SERVICE, '"--connect", "tls/127.0.0.1:7449", "--tls"'
     ),
     # deploy/zenoh
-    "pip install 'acsard[lan]'": Elsewhere(HERE, "def test_the_service_s_venv"),
+    "python3 -m venv .venv && .venv/bin/pip install '.[lan]'": Elsewhere(
+        HERE, "def test_the_authority_of_the_fleet_page"
+    ),
     "acsard lan init --directory fleet": Run("^Wrote "),
     "acsard lan add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
     "acsard lan add robot1 --directory fleet": Run("robot1"),

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -24,6 +24,7 @@ import zenoh
 
 from acsard.cli import VERBS
 from acsard.config.settings import Config
+from acsard.host.extras import Extra, install
 from tests.pages import (
     COMMANDS,
     LANGUAGES,
@@ -137,6 +138,22 @@ def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
     assert end.value.code == 0, f"{page}: acsard {' '.join(words)}"
     told = capsys.readouterr().out
     assert not [word for word in words if word.startswith("-") and word not in told]
+
+
+# extras
+
+EXTRA = re.compile(r"pip install (?:-e )?\s*'(\S*)\[(\w+)\]'")
+
+
+def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
+    texts = [text_of(page) for page in PAGES]
+    texts += [file.read_text(encoding="utf-8") for file in (ROOT / "acsard").rglob("*.py")]
+    told = {found for text in texts for found in EXTRA.findall(text)}
+    told |= {found for extra in get_args(Extra) for found in EXTRA.findall(install(extra))}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    known = {(".", extra) for extra in project["optional-dependencies"]}
+    assert {(".", extra) for extra in get_args(Extra)} <= told
+    assert told - {(".", "{extra}")} <= known
 
 
 # calls of pytest

@@ -12,6 +12,7 @@ from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
+from acsard.host.extras import install
 from acsard.messages.expiry import expiry
 
 
@@ -36,5 +37,5 @@ def certificates(config: Config) -> Iterator[Finding]:
     level, words = expiry(ends, now().wall_ns)
     mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:
-        mend = "pip install 'acsard[lan]' to have it read"
+        mend = f"{install('lan')}, to have it read"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")
