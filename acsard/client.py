@@ -12,12 +12,14 @@ with zeros, so the daemon's staleness and neutral-first rules are met without th
 
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
-    UnreachableError  ConnectionError  nobody listens at the endpoint
-    NoAnswerError     TimeoutError     no robot of this id there, no such key, or you may not ask it
-    ReplyError        RuntimeError     the daemon answers that it cannot; a service that refuses
-                                       says so in its reply instead
-    UsageError        ValueError       an endpoint, a key or a number that cannot be
-    DecodeError                        what was sent is not one of our messages
+    UnreachableError   ConnectionError  nobody listens at the endpoint
+    NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
+    ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
+                                        says so in its reply instead
+    NotPermittedError  PermissionError  certificates that you may not read
+    CertificateError   ValueError       certificates that are not there, or cannot be used
+    UsageError         ValueError       an endpoint, a key or a number that cannot be
+    DecodeError                         what was sent is not one of our messages
 """
 
 from __future__ import annotations
@@ -37,7 +39,14 @@ import zenoh
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.host import clock
-from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
+from acsard.host.errors import (
+    CertificateError,
+    NoAnswerError,
+    NotPermittedError,
+    ReplyError,
+    UnreachableError,
+    UsageError,
+)
 from acsard.host.own_name import own_name
 from acsard.host.threads import in_thread
 from acsard.messages import schema
@@ -49,9 +58,11 @@ from acsard.values import AcsardError, Pose
 __all__ = (
     "AcsardError",
     "AsyncClient",
+    "CertificateError",
     "Client",
     "DecodeError",
     "NoAnswerError",
+    "NotPermittedError",
     "Pose",
     "ReplyError",
     "Subscription",

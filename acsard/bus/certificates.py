@@ -8,9 +8,11 @@ from __future__ import annotations
 import ssl
 from pathlib import Path
 
-from acsard.bus.session import CA, CERTIFICATE, KEY
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
+
+CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
+"""The files of a TLS directory."""
 
 
 def check(directory: str) -> None:
@@ -21,12 +23,12 @@ def check(directory: str) -> None:
             file.read_bytes()
         except PermissionError:
             raise NotPermittedError(
-                f"no permission to read {file}; a service gets its copies by the drop-in "
-                "deploy/systemd/lan.conf",
+                f"no permission to read {file}: sudo, or copies of your own; a service gets its "
+                "copies by the drop-in deploy/systemd/lan.conf",
             ) from None
         except OSError as error:
             raise CertificateError(
-                f"cannot read {file}: {error.strerror}; `acsard lan init` makes it"
+                f"cannot read {file}: {error.strerror}; `acsard lan init` or `lan add` makes it"
             ) from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:

@@ -6,7 +6,7 @@ import argparse
 import socket
 from pathlib import Path
 
-from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.bus.certificates import CA, CERTIFICATE, KEY
 from acsard.config.validation import write
 from acsard.host.extras import install
 from acsard.host.service import TLS

@@ -6,8 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.bus.certificates import check, ends_ns
-from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.bus.certificates import CA, CERTIFICATE, KEY, check, ends_ns
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.session import CA
+from acsard.bus.certificates import CA
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
