@@ -33,11 +33,12 @@ def check(directory: str) -> None:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(f"{directory}/{CA}")
-        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}")
+        # A password: Zenoh takes no key that wants one, and nobody is to be asked for it here.
+        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
             f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
-            "another certificate; `acsard lan init` or `lan add` makes them",
+            "another certificate or has a password; `acsard lan init` or `lan add` makes them",
         ) from None
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 
 from acsard.bus.certificates import check, ends_ns
 from acsard.host.errors import CertificateError, NotPermittedError
@@ -32,12 +33,20 @@ def mixed(where: Path) -> None:
     (where / "key.pem").write_bytes((other / "key.pem").read_bytes())
 
 
+def with_password(where: Path) -> None:
+    file, lock = where / "key.pem", serialization.BestAvailableEncryption(b"secret")
+    key = serialization.load_pem_private_key(file.read_bytes(), None)
+    pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+    file.write_bytes(key.private_bytes(pem, pkcs8, lock))
+
+
 BROKEN: dict[str, Callable[[Path], object]] = {
     "nothing": lambda where: [path.rename(where / path.stem) for path in where.glob("*.pem")],
     "no key": lambda where: [path.rename(where / "gone") for path in where.glob("key.pem")],
     "junk": lambda where: (where / "certificate.pem").write_text("junk"),
     "junk authority": lambda where: (where / "ca.pem").write_text("junk"),
     "another's key": mixed,
+    "a key with a password": with_password,
 }
 
 
