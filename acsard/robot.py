@@ -97,7 +97,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
-            check=session.check.in_force,
+            check=session.negotiation.in_force,
         )
 
     @property

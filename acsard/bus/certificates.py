@@ -15,7 +15,7 @@ CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 """The files of a TLS directory."""
 
 
-def check(directory: str) -> None:
+def require_usable(directory: str) -> None:
     """Raises `CertificateError` or `NotPermittedError`, with the file and the mend."""
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name

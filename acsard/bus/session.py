@@ -11,7 +11,7 @@ import re
 
 import zenoh
 
-from acsard.bus.certificates import CA, CERTIFICATE, KEY, check
+from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.config.settings import TLS, BusConfig
 from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
@@ -134,7 +134,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
     if tls:
-        check(tls)  # Zenoh says of a file it cannot read what it says of a daemon that is not there
+        require_usable(tls)  # Zenoh says of them what it says of a daemon that is not there
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))

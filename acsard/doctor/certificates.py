@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.bus.certificates import CA, CERTIFICATE, KEY, check, ends_ns
+from acsard.bus.certificates import CA, CERTIFICATE, KEY, ends_ns, require_usable
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now
@@ -28,7 +28,7 @@ def certificates(config: Config) -> Iterator[Finding]:
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
-        check(config.bus.tls)
+        require_usable(config.bus.tls)
     except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return

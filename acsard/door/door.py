@@ -18,7 +18,7 @@ import threading
 import zenoh
 
 from acsard.bus.access import door_access
-from acsard.bus.certificates import check, ends_ns
+from acsard.bus.certificates import ends_ns, require_usable
 from acsard.bus.session import MAX_SESSIONS, door_session, reachable
 from acsard.config.settings import Config
 from acsard.door.watch import Look, Watch
@@ -63,7 +63,7 @@ class Door:
             signal.signal(number, self._leave)
         if self._holder is not None:
             end_with_parent(signal.SIGKILL)
-        check(self._config.bus.tls)
+        require_usable(self._config.bus.tls)
         _confine()
         self._manager.ready()
         self._manager.status("waits for the daemon")

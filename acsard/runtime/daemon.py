@@ -16,8 +16,8 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from acsard import __version__
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
-from acsard.bus.certificates import check as check_certificates
 from acsard.bus.certificates import ends_ns as ends_ns_of
+from acsard.bus.certificates import require_usable
 from acsard.bus.session import log_from_environment
 from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
@@ -136,7 +136,7 @@ def _certificates(config: Config, ours: bool) -> int | None:
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
         return None
-    check_certificates(bus.tls)
+    require_usable(bus.tls)
     return ends_ns_of(bus.tls)
 
 

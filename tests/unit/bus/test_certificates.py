@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives import serialization
 
-from acsard.bus.certificates import check, ends_ns
+from acsard.bus.certificates import ends_ns, require_usable
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
@@ -23,7 +23,7 @@ def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
 
 
 def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:
-    check(str(made(tmp_path)))
+    require_usable(str(made(tmp_path)))
 
 
 def mixed(where: Path) -> None:
@@ -54,7 +54,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
 def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
     BROKEN[how](made(tmp_path))
     with pytest.raises(CertificateError) as caught:
-        check(str(tmp_path))
+        require_usable(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
     assert "acsard lan" in str(caught.value)
 
@@ -63,7 +63,7 @@ def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: 
 def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
     (made(tmp_path) / "key.pem").chmod(0)
     with pytest.raises(NotPermittedError):
-        check(str(tmp_path))
+        require_usable(str(tmp_path))
 
 
 @pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])
