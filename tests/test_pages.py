@@ -234,6 +234,33 @@ def test_every_file_that_a_recipe_names_is_there() -> None:
     assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
 
 
+def recipe(begin: str, end: str) -> set[str]:
+    """The files that a part of the page for who changes the code names."""
+    part = prose("acsard/README.md").partition(begin)[2].partition(end)[0]
+    return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
+
+
+def files_with(pattern: str, *rooms: str) -> set[str]:
+    """The files below these directories in whose text it is, as the recipes write them."""
+    files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
+    texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
+    found = [file for file, text in texts if re.search(pattern.encode(), text)]
+    names = {str(file.relative_to(ROOT)).removeprefix("acsard/") for file in found}
+    return names - {"README.md"}  # the recipes themselves
+
+
+def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
+    listed = files_with("reset_odometry", "acsard", "deploy")
+    assert {"values.py", "deploy/ros2/README.md"} <= listed
+    assert listed <= recipe("## Add a verb", "A verb of the command line")
+
+
+def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:
+    knowing = files_with('"(rmw|bridge)"', "acsard")
+    assert {"ros/transports.py", "bus/bus.py"} <= knowing
+    assert knowing <= recipe("A third transport", "##")
+
+
 def test_every_file_of_the_tour_is_there() -> None:
     tour = ast.get_docstring(ast.parse((ROOT / "acsard/__init__.py").read_text(encoding="utf-8")))
     assert tour is not None
