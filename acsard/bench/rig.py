@@ -267,7 +267,7 @@ class Rig:
         time.sleep(0.1)  # what was under way
         self._alive()
         self.leave()
-        seen = None if self._far_end is None else _told(self._far_end)
+        seen = None if self._far_end is None else _last_words(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -280,7 +280,7 @@ class Rig:
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
 
 
-def _told(far_end: subprocess.Popen[bytes]) -> Seen:
+def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
     """End the far end; all it saw."""
     assert far_end.stdin is not None
     assert far_end.stdout is not None
