@@ -17,7 +17,7 @@ from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not

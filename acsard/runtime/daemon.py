@@ -160,7 +160,7 @@ async def _control(
             manager.step(control.step(now, period))
             if departure.over(now.mono_ns, control.at_rest):
                 return None
-            return Next(control.listens, control.retry_ns, ticked=period.expired > 0)
+            return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)

@@ -113,7 +113,7 @@ class World:
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
         self.period_ns = int(NS_PER_S / self.config.rate_hz)
-        self.next_tick_ns = self.now_ns
+        self.next_period_ns = self.now_ns
         self.mcu = FakeMcu(self.config, self.now_ns)
         self.port = VirtualPort(
             self.config.mcu.baud_rate,
@@ -151,12 +151,12 @@ class World:
         return Instant(self.now_ns, self.now_ns + self.wall_offset_ns)
 
     def run(self, seconds: float) -> None:
-        """Let time pass: bytes arrive when they do, a tick comes every period."""
+        """Let time pass: bytes arrive when they do, a step comes every period."""
         end_ns = self.now_ns + int(seconds * NS_PER_S)
         while True:
             mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
-            tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
-            at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
+            tick = mcu_ns is None or self.next_period_ns <= mcu_ns
+            at_ns = self.next_period_ns if mcu_ns is None or tick else mcu_ns
             alarm_ns = self._alarm_ns
             if alarm_ns is not None and alarm_ns <= min(at_ns, end_ns):
                 self._alarm_ns = None
@@ -168,8 +168,8 @@ class World:
                 return
             self.now_ns = max(self.now_ns, at_ns)
             if tick:
-                due_ns = self.next_tick_ns - self._missed * self.period_ns
-                self.next_tick_ns += self.period_ns
+                due_ns = self.next_period_ns - self._missed * self.period_ns
+                self.next_period_ns += self.period_ns
                 self._step(Period(1 + self._missed, due_ns))
                 self._missed = 0
             elif self.port.mcu is not None:
@@ -185,8 +185,8 @@ class World:
             data = self.port.mcu.advance(self.now_ns)
             if data:
                 self.port.feed(Received(self.instant, data))
-        self._missed = max(0, (self.now_ns - self.next_tick_ns) // self.period_ns)
-        self.next_tick_ns += self._missed * self.period_ns
+        self._missed = max(0, (self.now_ns - self.next_period_ns) // self.period_ns)
+        self.next_period_ns += self._missed * self.period_ns
 
     def _step(self, period: Period = NO_PERIOD) -> None:
         outputs = self.loop.step(self.instant, period)
