@@ -19,6 +19,7 @@ from acsard.mcu.lines import LineReader
 from acsard.mcu.link import WORDS, Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
+from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {
@@ -61,7 +62,7 @@ class McuSession:
         self._starting_over = False
         self._announced: tuple[LinkState, str, bool] = ("down", self.negotiation.in_force, False)
         self._opened = 0
-        self._blind_ns = -BLIND_PERIOD_NS
+        self._blind = Throttle()
 
     @property
     def link(self) -> LinkState:
@@ -109,9 +110,9 @@ class McuSession:
         if self.negotiation.asking:
             return self.negotiation.question(now_ns)
         if self.silent(now_ns):
-            if now_ns - self._blind_ns < BLIND_PERIOD_NS:
+            if not self._blind.lets(now_ns, BLIND_PERIOD_NS):
                 return None
-            self._blind_ns, speeds = now_ns, STILL
+            speeds = STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
         return self.negotiation.seal(line, now_ns)
 
