@@ -20,6 +20,7 @@ from acsard.drive.sanity import Sanity
 from acsard.drive.tally import Tally
 from acsard.drive.told import Told, missed, refused
 from acsard.drive.words import REFUSED, chosen
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
@@ -40,9 +41,9 @@ MAX_DT = 0.05
 """s; the longest step towards a command, or 1.5 periods if that is longer: after a stall the robot
 must not leap."""
 
-UNHEARD_S = 0.25
-"""s without a line that left: by its contract the MCU stops by itself soon after, so start over
-from rest instead of resuming a speed it no longer has."""
+UNHEARD_S = WATCHDOG_S - 0.05
+"""s without a line that left: the MCU stops by itself soon after, or, by a clock a little fast, has
+done so. So start over from rest instead of resuming a speed it no longer has."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
 """What brakes by the stop limits."""

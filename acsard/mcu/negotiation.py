@@ -20,6 +20,7 @@ from typing import Literal
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.frames import FrameError
 from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S
@@ -76,7 +77,7 @@ TRIES = 3
 WINDOW = 64
 """Lines whose answers may still come; far fewer than the sequence can tell apart."""
 
-LATE_NS = 3 * NS_PER_S // 10
+LATE_NS = round(WATCHDOG_S * NS_PER_S)
 """An answer later than this is to a line that the MCU's own watchdog has outlived."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
