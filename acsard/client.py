@@ -37,7 +37,7 @@ import msgspec
 import zenoh
 
 from acsard.bus.session import client_session
-from acsard.bus.subscription import Subscription, queue_on
+from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
@@ -145,7 +145,7 @@ class Client:
         """The typed messages of a published key as they come; ends after `timeout` s of silence."""
         decoder = _decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
-            yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+            yield decoder.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
         """The raw samples of any key below the robot's id, whatever key they were put on."""
@@ -202,7 +202,7 @@ class Client:
             raise _no_key(name) from None
         for reply in replies:
             if reply.ok is not None:
-                found.append((str(reply.ok.encoding), reply.ok.payload.to_bytes()))
+                found.append(encoded(reply.ok))
             elif reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
@@ -254,7 +254,7 @@ class AsyncClient:
                 if sample is None:
                     await asyncio.sleep(0.001)
                     continue
-                yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                yield decoder.decode(*encoded(sample))
         finally:
             subscriber.undeclare()
 
@@ -316,7 +316,7 @@ def _opening(client: Client) -> Iterator[float]:
             if sample is None:
                 continue
             try:
-                state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                state = decoder.decode(*encoded(sample))
             except DecodeError:  # of a daemon of another version
                 continue
             counts = state.mode in NEVER or _counts(state, client.source)
