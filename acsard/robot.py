@@ -1,8 +1,9 @@
-"""`Robot.step(Inputs) -> Outputs`: the only mutable state, the only place that knows the order.
+"""`Robot.step(Inputs) -> Outputs`: has all parts of a robot, and alone knows their order.
 
 Fold the feedback into odometry, choose one command, gate by mode, limit, invert the kinematics,
-report. Pure: time, bytes and commands come in, decisions go out. The shell around it carries
-bytes, and `guard.py` checks what leaves.
+report. Pure: time, bytes and commands come in, decisions go out. What a robot remembers from step
+to step is here and in its parts, and changes in a step only (the shell adds to `counters`). The
+shell around it carries bytes, and `guard.py` checks what leaves.
 """
 
 from __future__ import annotations
