@@ -139,6 +139,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/mypy": Elsewhere(".ci/run", ".venv/bin/mypy"),
     ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "lint-imports"),
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
+    ".venv/bin/pre-commit install": Elsewhere("tests/test_pre_commit.py", "def test_a_commit"),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
     ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
