@@ -32,6 +32,7 @@ from tests.pages import (
     ROOT,
     Block,
     Elsewhere,
+    InCi,
     blocks,
     promises,
     prose,
@@ -68,11 +69,24 @@ def test_every_command_that_something_runs_is_on_a_page() -> None:
     assert set(COMMANDS) == {command for _, command in ON_PAGES}
 
 
+def named_tests(file: str) -> set[str]:
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    return {name for name in functions if name.startswith("test_")}
+
+
 @pytest.mark.parametrize(
     "how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}), ids=" ".join
 )
-def test_what_is_said_to_run_a_command_has_the_words_for_it(how: Elsewhere) -> None:
-    assert how.words in (ROOT / how.file).read_text(encoding="utf-8")
+def test_what_is_said_to_run_a_command_is_a_test(how: Elsewhere) -> None:
+    assert how.test in named_tests(how.file)
+
+
+def test_ci_has_what_it_is_said_to_run() -> None:
+    told = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    words = {how.words for how in COMMANDS.values() if isinstance(how, InCi)}
+    assert words
+    assert not {one for one in words if one not in told}
 
 
 @pytest.mark.parametrize("block", blocks(), ids=at)
