@@ -1,8 +1,9 @@
-"""`Robot.step(Inputs) -> Outputs`: the only mutable state, the only place that knows the order.
+"""`Robot.step(Inputs) -> Outputs`: has all parts of a robot, and alone knows their order.
 
 Fold the feedback into odometry, choose one command, gate by mode, limit, invert the kinematics,
-report. Pure: time, bytes and commands come in, decisions go out. The shell around it carries
-bytes, and `guard.py` checks what leaves.
+report. Pure: time, bytes and commands come in, decisions go out. What a robot remembers from step
+to step is here and in its parts, and changes in a step only (the shell adds to `counters`). The
+shell around it carries bytes, and `guard.py` checks what leaves.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from acsard.drive.sanity import Sanity
 from acsard.drive.tally import Tally
 from acsard.drive.told import Told, missed, refused
 from acsard.drive.words import REFUSED, chosen
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
@@ -40,9 +42,9 @@ MAX_DT = 0.05
 """s; the longest step towards a command, or 1.5 periods if that is longer: after a stall the robot
 must not leap."""
 
-UNHEARD_S = 0.25
-"""s without a line that left: by its contract the MCU stops by itself soon after, so start over
-from rest instead of resuming a speed it no longer has."""
+UNHEARD_S = WATCHDOG_S - 0.05
+"""s without a line that left: the MCU stops by itself soon after, or, by a clock a little fast, has
+done so. So start over from rest instead of resuming a speed it no longer has."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
 """What brakes by the stop limits."""
@@ -97,7 +99,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
-            check=session.check.in_force,
+            check=session.negotiation.in_force,
         )
 
     @property

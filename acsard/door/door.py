@@ -12,7 +12,7 @@ from typing import Any
 import zenoh
 
 from acsard.bus.access import door_access
-from acsard.bus.certificates import check, ends_ns
+from acsard.bus.certificates import ends_ns, require_usable
 from acsard.bus.session import MAX_SESSIONS, door_session, reachable
 from acsard.config.settings import Config
 from acsard.door.watch import Look, Watch
@@ -34,7 +34,7 @@ class Door:
     def __init__(self, config: Config) -> None:
         """Raises `CertificateError` or `NotPermittedError` for certificates it cannot use."""
         self._config, self.where = config, ", ".join(config.bus.outside)
-        check(config.bus.tls)
+        require_usable(config.bus.tls)
         self._opened_ns = 0
         self._publisher: Any = None
         self._ends_ns = 0

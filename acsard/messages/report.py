@@ -53,7 +53,7 @@ class _Rate:
         self._next_ns = -2 * self._period_ns
 
     def due(self, now_ns: int, at_once: bool = False) -> bool:
-        # A twentieth of the period as grace, or a tick a microsecond early would wait for the
+        # A twentieth of the period as grace, or a step a microsecond early would wait for the
         # next one.
         if not at_once and now_ns < self._next_ns - self._period_ns // 20:
             return False

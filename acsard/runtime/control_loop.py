@@ -123,7 +123,7 @@ class ControlLoop:
         port, pace = self._port, self._pace
         inputs = Inputs(
             now=now,
-            tick=ended and pace.tick(missed),
+            tick=ended and pace.period_ended(missed),
             at_once=pace.at_once(now.mono_ns, port.sent_ns),
             port_open=port.is_open,
             opened=port.opened,

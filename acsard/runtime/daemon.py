@@ -16,8 +16,8 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from acsard import __version__
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
-from acsard.bus.certificates import check as check_certificates
 from acsard.bus.certificates import ends_ns as ends_ns_of
+from acsard.bus.certificates import require_usable
 from acsard.bus.session import log_from_environment
 from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
@@ -136,7 +136,7 @@ def _certificates(config: Config, ours: bool) -> int | None:
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
         return None
-    check_certificates(bus.tls)
+    require_usable(bus.tls)
     return ends_ns_of(bus.tls)
 
 
@@ -160,7 +160,7 @@ async def _control(
             manager.step(control.step(now, period))
             if departure.over(now.mono_ns, control.at_rest):
                 return None
-            return Next(control.listens, control.retry_ns, ticked=period.expired > 0)
+            return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)

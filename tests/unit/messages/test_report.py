@@ -605,7 +605,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert "acsard[lan]" in state.certificate
+    assert "`acsard doctor`" in state.certificate
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
