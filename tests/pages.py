@@ -232,7 +232,7 @@ COMMANDS: dict[str, How] = {
     # deploy/systemd
     "sudo python3 -m venv /opt/acsard/venv": VENV,
     "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
-    "sudo /opt/acsard/venv/bin/pip install --no-deps .": VENV,
+    "sudo /opt/acsard/venv/bin/pip install --no-deps --no-build-isolation .": VENV,
     "sudo /opt/acsard/venv/bin/acsard service install": INSTALLED,
     "sudo systemctl restart acsard": OPENED,
     "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
@@ -240,7 +240,8 @@ COMMANDS: dict[str, How] = {
         "test_for_people_each_finding_is_a_line_and_its_mend_another",
     ),
     'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
-    "/opt/acsard/venv/bin/pip install --no-deps . && /opt/acsard/venv/bin/acsard service install "
+    "/opt/acsard/venv/bin/pip install --no-deps --no-build-isolation . && "
+    "/opt/acsard/venv/bin/acsard service install "
     '--force && systemctl restart acsard"': Elsewhere(
         SERVICE,
         "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
