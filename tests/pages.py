@@ -156,6 +156,7 @@ COMMANDS: dict[str, How] = {
         HERE, "def test_the_broken_board"
     ),
     "acsard mcu check --port ./mcu --yes": Elsewhere(HERE, "def test_the_broken_board"),
+    "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
     "sudo apt install gcc libsimavr-dev libelf-dev": Elsewhere(".ci/run", "libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,

@@ -14,7 +14,14 @@ from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
+from acsard.messages.topics import (
+    Direction,
+    full_key,
+    offered,
+    published,
+    service_key,
+    source_keys,
+)
 from acsard.ros.transports import Endpoint, endpoints
 from acsard.values import ROOT, Verb
 
@@ -100,17 +107,17 @@ class _Keys:
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._ros = robot, endpoints(config.ros, "*")
-        ros = self._ros
+        ros, topics, told = self._ros, offered(config), published(config)
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.config = full_key(robot, "config")
         self.stop = full_key(robot, "stop")
-        self.published = [full_key(robot, topic.key) for topic in PUBLISHED] + _of(ros, "out")
-        latched = [full_key(robot, topic.key) for topic in PUBLISHED if topic.latched]
+        self.published = [full_key(robot, topic.key) for topic in told] + _of(ros, "out")
+        latched = [full_key(robot, topic.key) for topic in told if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
         """Where Zenoh's advanced publishers keep samples for those who come late."""
-        self.heard = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "in"]
+        self.heard = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.heard += _of(ros, "in")
         """What the daemon subscribes to, whoever sends."""
         sources = [source.name for source in config.commands.sources]
@@ -119,7 +126,7 @@ class _Keys:
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
         """What listed sources send on."""
-        asked = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "query"]
+        asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
         self.questions = [key for key in asked if key != self.config]
         self.exact_questions = [key for key in self.questions if "*" not in key]
         self.exact_questions += [full_key(robot, f"schema/{name}") for name in MESSAGES]

@@ -89,14 +89,23 @@ class WheelMap(Struct, frozen=True):
     rear_right: Motor = "+d"
 
 
+SIMULATOR = "sim"
+"""The port of the built-in simulator."""
+
+
 class McuConfig(Struct, frozen=True):
-    port: Text = "sim"
+    port: Text = SIMULATOR
     baud_rate: Baud = 115200
     trailing_comma: bool = False
     reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
     link_check: Literal["off", "auto", "require"] = "off"
     encoder_counts: EncoderCounts = 0
     wheels: WheelMap = WheelMap()
+
+    @property
+    def simulated(self) -> bool:
+        """There is no device: the built-in simulator is behind the port."""
+        return self.port == SIMULATOR
 
     @property
     def wants_samples(self) -> bool:

@@ -88,6 +88,13 @@ class Pose(Message, frozen=True):
     orientation: Quaternion
 
 
+class PoseStamped(Message, frozen=True):
+    """A pose in `header.frame_id` at the time of `header.stamp`."""
+
+    header: Header
+    pose: Pose
+
+
 class PoseWithCovariance(Message, frozen=True):
     """A pose and its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
 
@@ -298,6 +305,7 @@ MESSAGES: dict[str, type[Message]] = {
         Odometry,
         TFMessage,
         JointState,
+        PoseStamped,
         Twist,
         TwistStamped,
         RobotState,

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
+from acsard.config.settings import Config
 from acsard.values import ROOT, Verb
 
 Direction = Literal["out", "in", "query", "service"]
@@ -26,6 +27,8 @@ class Topic(Struct, frozen=True):
     rate: str
     note: str
     latched: bool = False
+    simulated: bool = False
+    """Only the built-in simulator has it: on a real robot the key does not exist."""
 
     @property
     def pattern(self) -> str:
@@ -61,6 +64,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
     Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
+    Topic(
+        "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
+    ),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
@@ -78,6 +84,16 @@ PUBLISHED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.direction == "out" and topic.key != "alive"
 )
 """The topics with a payload; each also answers queries with its last value."""
+
+
+def offered(config: Config) -> tuple[Topic, ...]:
+    """The rows that a daemon of this configuration has."""
+    return tuple(topic for topic in TOPICS if config.mcu.simulated or not topic.simulated)
+
+
+def published(config: Config) -> tuple[Topic, ...]:
+    """Those of them that it publishes."""
+    return tuple(topic for topic in offered(config) if topic in PUBLISHED)
 
 
 def full_key(robot_id: str, key: str) -> str:

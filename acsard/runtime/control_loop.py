@@ -63,8 +63,12 @@ class ControlLoop:
         mono_ns: Callable[[], int],
         certificate_ends_ns: int | None = None,
         others: list[Event] | None = None,
+        beside: Callable[[str], Message | None] | None = None,
     ) -> None:
-        """`others` are the events of the daemon's other parts; each step takes what is there."""
+        """`others` are the events of the daemon's other parts; each step takes what is there.
+
+        `beside` has the present values of the keys that those parts publish.
+        """
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
@@ -72,6 +76,7 @@ class ControlLoop:
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
+        self._beside = beside
         stop = self.robot.session.codec.stop
         self._guard = Guard(
             stop,
@@ -235,7 +240,8 @@ class ControlLoop:
             self._log(event)
 
     def _current(self, key: str) -> Message | None:
-        return self.report.current(key, self._look)
+        message = self.report.current(key, self._look)
+        return self._beside(key) if message is None and self._beside else message
 
     def _look(self) -> Snapshot:
         outputs = self.outputs

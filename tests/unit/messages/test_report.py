@@ -44,7 +44,8 @@ from acsard.messages.topics import PUBLISHED
 from acsard.values import Estimate, Instant, Outputs, Snapshot
 from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
-ALL = {topic.key for topic in PUBLISHED}
+ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
+"""What is measured or decided; what is true of a simulated robot does not come by a report."""
 FRAMES = OdometryConfig(
     odom_frame="r7/odom",
     base_frame="r7/base",
@@ -116,7 +117,8 @@ def test_each_message_is_of_the_type_its_topic_says() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     for topic in PUBLISHED:
-        assert type(report.current(topic.key, look)).__name__ == topic.type
+        if topic.key in ALL:
+            assert type(report.current(topic.key, look)).__name__ == topic.type
 
 
 # odometry and transforms

@@ -27,6 +27,7 @@ ROS_FIELDS: dict[str, tuple[str, ...]] = {
     "Twist": ("linear", "angular"),
     "TwistStamped": ("header", "twist"),
     "Pose": ("position", "orientation"),
+    "PoseStamped": ("header", "pose"),
     "PoseWithCovariance": ("pose", "covariance"),
     "TwistWithCovariance": ("twist", "covariance"),
     "Odometry": ("header", "child_frame_id", "pose", "twist"),

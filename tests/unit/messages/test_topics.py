@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.config.settings import Config, McuConfig
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, VERBS, by_key, full_key, source_keys
+from acsard.messages.topics import (
+    PUBLISHED,
+    SERVICES,
+    TOPICS,
+    VERBS,
+    by_key,
+    full_key,
+    offered,
+    published,
+    source_keys,
+)
 
 PROMISED = [
     ("odom", "out", "Odometry"),
@@ -15,6 +26,7 @@ PROMISED = [
     ("cmd_vel_out", "out", "TwistStamped"),
     ("state", "out", "RobotState"),
     ("diagnostics", "out", "DiagnosticArray"),
+    ("sim/pose", "out", "PoseStamped"),
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
     ("stop", "in", "anything"),
@@ -55,6 +67,19 @@ def test_published_is_every_way_out_but_the_token() -> None:
 
 def test_only_the_static_transforms_wait_for_late_joiners() -> None:
     assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
+
+
+REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+
+
+def test_the_truth_is_offered_where_the_robot_is_simulated_and_nowhere_else() -> None:
+    simulated = {topic.key for topic in offered(Config())}
+    assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
+
+
+@pytest.mark.parametrize("config", [Config(), REAL])
+def test_published_is_what_goes_out_of_what_is_offered(config: Config) -> None:
+    assert published(config) == tuple(row for row in offered(config) if row in PUBLISHED)
 
 
 @pytest.mark.parametrize("service", SERVICES)

@@ -1,0 +1,17 @@
+"""A `Sight` of the simulated robot -> the messages that tell it on the bus."""
+
+from __future__ import annotations
+
+from acsard.messages.report import from_yaw
+from acsard.messages.schema import Header, Pose, PoseStamped, Time, Vector3
+from acsard.sim.watched import Sight
+
+FRAME = "sim"
+"""Where the robot began, in no tree of transforms: truth is not to be taken for `odom`."""
+
+
+def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
+    """Where base_link truly was at `wall_ns`, from where it began: m in the frame `sim`."""
+    pose = sight.pose
+    where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
+    return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
