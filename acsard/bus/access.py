@@ -15,6 +15,7 @@ from typing import Literal, TypedDict
 from acsard.config.settings import Config
 from acsard.messages.schema import MESSAGES
 from acsard.messages.topics import (
+    IMU,
     Direction,
     full_key,
     offered,
@@ -22,7 +23,7 @@ from acsard.messages.topics import (
     service_key,
     source_keys,
 )
-from acsard.ros.transports import Endpoint, endpoints
+from acsard.ros.transports import Endpoint, endpoints, left_out
 from acsard.values import ROOT, Verb
 
 Role = Literal["viewer", "operator", "maintainer"]
@@ -68,6 +69,7 @@ GRANTS: dict[Role, tuple[str, ...]] = {
         "command",
         "operate",
         "maintain",
+        "sense",
     ),
 }
 """The rules each role has. A router is a maintainer, and tells of a twin that is alive."""
@@ -106,7 +108,7 @@ class _Keys:
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
-        self._robot, self._ros = robot, endpoints(config.ros, "*")
+        self._robot, self._ros = robot, endpoints(config.ros, "*", left_out(config) & {IMU})
         ros, topics, told = self._ros, offered(config), published(config)
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
@@ -126,6 +128,9 @@ class _Keys:
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
         """What listed sources send on."""
+        self.gyro = [full_key(robot, t.key) for t in topics if t.key == IMU and t not in told]
+        self.gyro += [e.key for e in ros if e.native == IMU]
+        """What a gyro is heard on; the simulator has its own."""
         asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
         self.questions = [key for key in asked if key != self.config]
         self.exact_questions = [key for key in self.questions if "*" not in key]
@@ -203,6 +208,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("operate", "ingress", ["query"], services("operator")),
         _rule("maintain", "ingress", ["query"], maintained),
+        # who bends the pose, as by set_pose
+        _rule("sense", "ingress", ["put"], keys.gyro),
         # wildcards: all robots at once, the discovery of ROS, what is kept for who comes late
         _rule("roam", "ingress", watching, [f"{ROOT}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),

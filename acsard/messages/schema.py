@@ -18,6 +18,8 @@ Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
+Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
 FEW = Meta(max_length=64)
 """More joints than any robot of ours; what a stranger sends must not take long to refuse."""
 
@@ -147,6 +149,21 @@ class JointState(Message, frozen=True):
     position: Annotated[list[float], FEW] = []
     velocity: Annotated[list[float], FEW] = []
     effort: Annotated[list[float], FEW] = []
+
+
+class Imu(Message, frozen=True):
+    """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
+
+    A covariance that begins with -1 says that this is not measured.
+    """
+
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: Covariance3
+    angular_velocity: Vector3
+    angular_velocity_covariance: Covariance3
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: Covariance3
 
 
 class SourceState(Message, frozen=True):
@@ -306,6 +323,7 @@ MESSAGES: dict[str, type[Message]] = {
         TFMessage,
         JointState,
         PoseStamped,
+        Imu,
         Twist,
         TwistStamped,
         RobotState,

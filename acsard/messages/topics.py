@@ -29,6 +29,8 @@ class Topic(Struct, frozen=True):
     latched: bool = False
     simulated: bool = False
     """Only the built-in simulator has it: on a real robot the key does not exist."""
+    gyro: bool = False
+    """Only with `[odometry] gyro = true`."""
 
     @property
     def pattern(self) -> str:
@@ -46,6 +48,10 @@ _SERVICE_NOTES: dict[Verb, str] = {
     "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
     "set_pose": "the pose becomes the payload {x, y, yaw}",
 }
+
+
+IMU = "imu"
+"""What a gyro says; the simulator's own comes in on it as anybody's."""
 
 
 def service_key(verb: str) -> str:
@@ -69,6 +75,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
+    Topic(IMU, "in", "Imu", "any", "turn rate by a gyro, with [odometry] gyro", gyro=True),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
     Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
     *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
@@ -88,12 +95,15 @@ PUBLISHED: tuple[Topic, ...] = tuple(
 
 def offered(config: Config) -> tuple[Topic, ...]:
     """The rows that a daemon of this configuration has."""
-    return tuple(topic for topic in TOPICS if config.mcu.simulated or not topic.simulated)
+    simulated, gyro = config.mcu.simulated, config.odometry.gyro
+    rows = (topic for topic in TOPICS if simulated or not topic.simulated)
+    return tuple(topic for topic in rows if gyro or not topic.gyro)
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Those of them that it publishes."""
-    return tuple(topic for topic in offered(config) if topic in PUBLISHED)
+    """Those of them that it publishes; the simulator also what its gyro says."""
+    own = config.mcu.simulated
+    return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
 
 def full_key(robot_id: str, key: str) -> str:

@@ -18,11 +18,13 @@ from acsard.incoming.bus import Bus
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
+from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import Queries
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
+from acsard.messages.topics import IMU
 from acsard.robot import Robot
 from acsard.runtime.at_once import Pace
 from acsard.runtime.period import NO_PERIOD, Period
@@ -31,6 +33,7 @@ from acsard.values import (
     NS_PER_S,
     Command,
     Event,
+    GyroSample,
     Inputs,
     Instant,
     Outputs,
@@ -86,7 +89,9 @@ class ControlLoop:
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._door = DoorTold()
+        self._door, self._imu = DoorTold(), ImuTold()
+        self._turn_rates: list[GyroSample] = []
+        """What a gyro said since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._last = stop
         """The line that went last."""
@@ -137,6 +142,7 @@ class ControlLoop:
             commands=commands,
             requests=requests,
             refusals=refusals,
+            gyro=tuple(self._turn_rates),
             guard_trip=self._trip,
             superseded=self._superseded,
             missed=missed,
@@ -144,6 +150,7 @@ class ControlLoop:
             leaving=self.leaving,
         )
         self._others.clear()
+        self._turn_rates.clear()
         outputs = self.outputs = self.robot.step(inputs)
         went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
@@ -169,6 +176,11 @@ class ControlLoop:
             if arrival.key == DOOR:
                 ends_ns = self._door.hear(arrival, self.robot.counters)
                 self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
+                continue
+            if arrival.key == IMU:
+                heard = self._imu.hear(arrival, self.robot.counters, self._others)
+                if heard is not None:
+                    self._turn_rates.append(heard)
                 continue
             if arrival.key == "stop":
                 if arrival.put:

@@ -11,8 +11,9 @@ from acsard.config.settings import Config
 from acsard.host import clock
 from acsard.incoming.bus import Bus
 from acsard.messages.schema import Message
+from acsard.messages.topics import IMU
 from acsard.serial.sim_pty import SimPty
-from acsard.sim.told import true_pose
+from acsard.sim.told import true_pose, turn_rate
 from acsard.sim.watched import Sight, WatchedMcu
 
 POSE = "sim/pose"
@@ -23,6 +24,8 @@ class Simulated:
 
     def __init__(self, config: Config) -> None:
         self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
+        self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
+        self._gyro = config.odometry.gyro
         self._bus: Bus | None = None
         self._last: tuple[Sight, int] | None = None
 
@@ -55,6 +58,10 @@ class Simulated:
         now, bus = clock.now(), self._bus
         wall_ns = now.wall_ns - (now.mono_ns - sight.at_ns)
         self._last = sight, wall_ns
-        if bus is not None and POSE in bus.wanted:
+        if bus is None:
+            return
+        if POSE in bus.wanted:
             bus.publish(POSE, true_pose(sight, wall_ns))
-            bus.flush()
+        if self._gyro:  # heard by our own subscriber too, as a gyro on the robot would be
+            bus.publish(IMU, turn_rate(sight, self._frame, self._noise))
+        bus.flush()
