@@ -214,6 +214,8 @@ class RobotState(Message, frozen=True):
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
+    gyro: str = "off"
+    """What the gyro does for odometry: `values.GyroDoes`."""
 
 
 class DoorState(Message, frozen=True):

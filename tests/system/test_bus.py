@@ -51,7 +51,7 @@ FIELDS = {
     "cmd_vel_out": {"header", "twist"},
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
-        "source", "sources", "refused", "counters", "certificate", "figures",
+        "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
     },
     "diagnostics": {"header", "status"},
     "sim/pose": {"header", "pose"},

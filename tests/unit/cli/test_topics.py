@@ -7,7 +7,7 @@ import pytest
 from acsard.cli.topics import ros_table
 from acsard.config.settings import Config, RosConfig
 from acsard.messages.topics import PUBLISHED
-from acsard.ros.transports import PARAMETERS, ros_names
+from acsard.ros.transports import PARAMETERS, left_out, ros_names
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
