@@ -12,6 +12,7 @@ from collections import Counter
 
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
+from acsard.drive.gyro import Gyro, Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
@@ -30,12 +31,14 @@ from acsard.values import (
     Answer,
     Estimate,
     Event,
+    GyroStatus,
     Inputs,
     Outputs,
     Pose,
     Refusal,
     Request,
     Snapshot,
+    WheelSpeeds,
 )
 
 MAX_DT = 0.05
@@ -60,6 +63,7 @@ class Robot:
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(config.odometry, self._kinematics)
+        self._gyro = Gyro() if config.odometry.gyro else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
@@ -99,6 +103,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
+            gyro=GyroStatus() if self._gyro is None else self._gyro.status,
             check=session.negotiation.in_force,
         )
 
@@ -189,6 +194,8 @@ class Robot:
             self._linked_once = True
             self._life.link(up=True)
         now_ns = inputs.now.mono_ns
+        if self._gyro is not None:
+            self._gyro.hear(inputs.gyro)
         return tuple(
             [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
@@ -209,7 +216,19 @@ class Robot:
         if self._sanity.turned:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
-        return self._odometry.fold(line)
+        return self._odometry.fold(line, self._turn(line, events))
+
+    def _turn(self, line: Feedback, events: list[Event]) -> Turn | None:
+        """What the gyro says of the turn since the line before; None where it says nothing."""
+        gyro = self._gyro
+        if gyro is None:
+            return None
+        wheels = self._kinematics.twist(line.speeds).angular * line.dt
+        if line.turned is not None:
+            wheels = self._kinematics.twist(WheelSpeeds(*line.turned)).angular
+        turn = gyro.turn(line.at.mono_ns, line.dt, wheels, line.speeds == STILL)
+        events += gyro.events
+        return turn
 
     # requests
 

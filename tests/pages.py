@@ -193,6 +193,7 @@ COMMANDS: dict[str, How] = {
     "acsard mcu check --port sim --yes": Run("PASS +watchdog"),
     "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": BROKEN,
     "acsard mcu check --port ./mcu --yes": BROKEN,
+    "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,

@@ -20,10 +20,11 @@ from __future__ import annotations
 import math
 
 from acsard.config.settings import OdometryConfig
+from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.values import REST, STILL, Estimate, Pose, PoseCovariance, WheelSpeeds
+from acsard.values import REST, STILL, Estimate, Pose, PoseCovariance, Twist, WheelSpeeds
 
 MAX_LOST_S = 0.05
 """s of lines that could not be true, up to which the robot is held to have gone on as it did."""
@@ -72,10 +73,11 @@ class Odometry:
         else:
             self._lost_turned = _sum(self._lost_turned, feedback.turned)
 
-    def fold(self, feedback: Feedback) -> Estimate:
+    def fold(self, feedback: Feedback, gyro: Turn | None = None) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
-        After a gap without counts only the uncertainty advances.
+        After a gap without counts only the uncertainty advances. Where a gyro tells the turn since
+        the line before, the wheels tell the distance only.
         """
         speeds, turned, gap = feedback.speeds, feedback.turned, feedback.gap
         lost_dt, self._lost_dt = self._lost_dt, 0.0
@@ -87,10 +89,18 @@ class Odometry:
         if unknown > 0.0:
             self._add_gap(unknown)
         twist = self._kinematics.twist(speeds)
-        self._move(_sum(turned, lost_turned))
-        if dt > 0.0:
-            self._advance(twist.linear * dt, twist.angular * dt)
-            self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
+        if gyro is None:
+            self._move(_sum(turned, lost_turned))
+            if dt > 0.0:
+                self._advance(twist.linear * dt, twist.angular * dt)
+                self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
+        else:
+            wheels = _sum(_sum(turned, lost_turned), _times(speeds.as_tuple(), dt))
+            distance = self._kinematics.twist(WheelSpeeds(*wheels)).linear
+            self._advance(distance, gyro.angle, gyro.variance)
+            self._positions = _sum(self._positions, wheels)
+            if feedback.dt > 0.0:
+                twist = Twist(twist.linear, gyro.angle / feedback.dt)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
@@ -110,9 +120,9 @@ class Odometry:
         self._advance(moved.linear, moved.angular)
         self._positions = _sum(self._positions, turned)
 
-    def _advance(self, distance: float, turn: float) -> None:
+    def _advance(self, distance: float, turn: float, variance: float | None = None) -> None:
         self.travelled += abs(distance)
-        self._covariance = self._propagate(distance, turn)
+        self._covariance = self._propagate(distance, turn, variance)
         self._pose = arc(self._pose, distance, turn)
 
     def _add_gap(self, gap: float) -> None:
@@ -131,8 +141,11 @@ class Odometry:
             min(p.yawyaw + turned, MAX_VARIANCE),
         )
 
-    def _propagate(self, distance: float, turn: float) -> PoseCovariance:
-        """F P F' + noise, with F the Jacobian of the step in (x, y, yaw)."""
+    def _propagate(self, distance: float, turn: float, variance: float | None) -> PoseCovariance:
+        """F P F' + noise, with F the Jacobian of the step in (x, y, yaw).
+
+        `variance` is that of the turn, rad2; None where the wheels tell it.
+        """
         settings, p = self._settings, self._covariance
         if _over(p):
             return p
@@ -142,6 +155,8 @@ class Odometry:
         along = settings.distance_variance_per_metre * abs(distance)
         turned = settings.yaw_variance_per_metre * abs(distance)
         turned += settings.yaw_variance_per_radian * abs(turn)
+        if variance is not None:
+            turned = variance
         return PoseCovariance(
             p.xx + 2 * fx * p.xyaw + fx * fx * p.yawyaw + along * c * c,
             p.xy + fy * p.xyaw + fx * p.yyaw + fx * fy * p.yawyaw + along * c * s,

@@ -12,6 +12,7 @@ from msgspec.structs import asdict
 
 from acsard.config.settings import Config
 from acsard.config.wire_time import wire_use
+from acsard.drive.gyro import WORDS
 from acsard.drive.words import waiting
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
@@ -38,7 +39,7 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S, Estimate, Instant, Outputs, Snapshot
+from acsard.values import NS_PER_S, Estimate, GyroStatus, Instant, Outputs, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
 
@@ -210,6 +211,7 @@ class Report:
                 name: Figure(_spread(one.since_start), _spread(one.last_minute))
                 for name, one in snapshot.figures.items()
             },
+            gyro=snapshot.gyro.does,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -217,6 +219,20 @@ class Report:
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends_ns, now.wall_ns)
+
+    def _gyro(self, gyro: GyroStatus) -> list[tuple[str, int, str, dict[str, str]]]:
+        """The row of the gyro, none without one."""
+        if gyro.does == "off":
+            return []
+        values = {"delay_s": f"{gyro.delay:.3f}"}
+        if gyro.bias is not None:
+            values["bias_rad_s"] = f"{gyro.bias:.5f}"
+        if gyro.track is not None:
+            configured = self._config.drive.wheel_separation_multiplier
+            values["wheel_separation_multiplier"] = f"{configured:.3f}"
+            values["learned_multiplier"] = f"{configured * gyro.track:.3f}"
+        level = int(gyro.does not in ("used", "waiting for rest"))
+        return [("gyro", level, WORDS[gyro.does], values)]
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures
@@ -254,6 +270,7 @@ class Report:
                 {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
+            *self._gyro(snapshot.gyro),
             *([("certificate", *certificate, {})] if certificate[1] else []),
         )
         return DiagnosticArray(

@@ -17,12 +17,15 @@ from acsard.incoming.commands import Arrival
 from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
 from acsard.mcu.port import Gate, Offered
+from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.topics import PUBLISHED
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
+from acsard.sim.told import turn_rate
+from acsard.sim.watched import Sight, WatchedMcu
+from acsard.values import NS_PER_S, Event, Instant, Outputs, Pose, Received
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
@@ -121,7 +124,15 @@ class World:
         self.wall_offset_ns = START.wall_ns - START.mono_ns
         self.period_ns = int(NS_PER_S / self.config.rate_hz)
         self.next_period_ns = self.now_ns
-        self.mcu = FakeMcu(self.config, self.now_ns)
+        self.truth = Pose()
+        """Where the robot truly is, as far as somebody looks: with a gyro, each 10 ms."""
+        self.gyro_dead = False
+        watched = self.config.odometry.gyro
+        self.mcu = (
+            WatchedMcu(self.config, self.now_ns, self._see)
+            if watched
+            else FakeMcu(self.config, self.now_ns)
+        )
         self.port = VirtualPort(
             self.config.mcu.baud_rate,
             Codec(self.config.mcu.wheels, self.config.mcu.trailing_comma).stop,
@@ -152,6 +163,15 @@ class World:
         self._missed = 0
         self._listens = False
         """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
+
+    def _see(self, sight: Sight) -> None:
+        self.truth = sight.pose
+        if not self.gyro_dead:
+            said = turn_rate(sight, "base_link", self.config.sim.gyro_noise)
+            payload = encode(said, "msgpack")
+            self.bus.arrivals.append(
+                Arrival("imu", True, payload, "", sight.at_ns, None, "", "native")
+            )
 
     @property
     def instant(self) -> Instant:

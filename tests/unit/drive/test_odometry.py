@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.config.settings import DriveConfig, OdometryConfig
+from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
 from acsard.mcu.feedback import Feedback
@@ -444,3 +446,33 @@ def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
         robot.skip(counted(1.0, speed=99.0))
     assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
     assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)
+
+
+# the turn of a gyro
+
+
+def line(seconds: float, dt: float, speeds: WheelSpeeds, **more: Any) -> Feedback:
+    return Feedback(Instant(int(seconds * 1e9), 0), speeds, dt, **more)
+
+
+@pytest.mark.parametrize("turned", [None, (0.2, 0.1, 0.1, 0.2)])
+def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
+    turned: tuple[float, float, float, float] | None,
+) -> None:
+    speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
+    wheels, gyro = (Odometry(OdometryConfig(), kinematics) for _ in range(2))
+    by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
+    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Turn(0.05, 1e-4))
+    assert by_gyro.pose.yaw == pytest.approx(0.05)
+    assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
+    assert by_gyro.twist == Twist(by_wheels.twist.linear, 5.0)
+    assert by_gyro.positions == by_wheels.positions
+    assert gyro.travelled == pytest.approx(wheels.travelled)
+    more = by_gyro.covariance.yawyaw - OdometryConfig().pose_covariance_diagonal[5]
+    assert more == pytest.approx(1e-4)
+
+
+def test_over_a_gap_the_gyro_knows_the_turn() -> None:
+    odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+    estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4), Turn(0.3, 1e-4))
+    assert estimate.pose == Pose(0.0, 0.0, 0.3)
