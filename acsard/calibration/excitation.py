@@ -16,8 +16,11 @@ from acsard.calibration.table import Floats
 LEAST_TURN = 2 * np.pi
 """rad that the robot must turn in all."""
 
-LEAST_WAY = 10.0
-"""rad that the wheels must roll ahead or back in all, the turns taken out: a turn and a half."""
+LEAST_ROLL = 10.0
+"""rad that the wheels must roll in all, together as well as against each other."""
+
+ALIKE = 0.98
+"""Squared correlation of both: more, and they are one movement."""
 
 WORST_TRACK, WORST_RATIO = 0.2, 0.02
 """Standard deviations, as shares, that are too large for the result to be of use: of the track by
@@ -39,17 +42,29 @@ def drives_enough(parts: Sequence[Block]) -> None:
         raise RefusedError(f"the wheels turn for {seconds:.0f} s only, too little: {DRIVE}")
 
 
-def turns_enough(turned: Floats, rows: Rows) -> None:
-    """It turns, and goes somewhere; raises `RefusedError`. `turned`: rad in each row."""
+def rolls_enough(rows: Rows) -> None:
+    """The wheels turn together, against each other, and not always both at once in the same
+    way; raises `RefusedError`."""
+    together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
+    for rolled, what in ((together, "ahead or back"), (against, "against each other")):
+        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
+            raise RefusedError(
+                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to tell "
+                f"their size, left to right and the effective track: {DRIVE}"
+            )
+    cross = float(together @ against) ** 2
+    if cross > ALIKE * float(together @ together) * float(against @ against):
+        raise RefusedError(
+            f"the robot drives one and the same circle, which tells nothing: {DRIVE}"
+        )
+
+
+def turns_enough(turned: Floats) -> None:
+    """The robot turns; raises `RefusedError`. `turned`: rad in each row."""
     if (angle := float(np.abs(turned).sum())) < LEAST_TURN:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
             f"effective track: {DRIVE}"
-        )
-    if (way := float(np.abs(rows.left + rows.right).sum()) / 2) < LEAST_WAY:
-        raise RefusedError(
-            f"the wheels rolled {way / (2 * np.pi):.1f} turns ahead or back, which is too little "
-            f"to compare left and right: {DRIVE}"
         )
 
 

@@ -34,7 +34,7 @@ from acsard.calibration.table import Floats
 Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
-SMALL, SETTLED = 1e-7, 1e-3
+SMALL, SETTLED = 1e-5, 1e-3
 """A step that ends the search, and one that may be its last."""
 
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
@@ -43,6 +43,9 @@ share a track grows with each rad/s, s, m, m."""
 
 HELD = 1e9
 """Weight by which the mean radius is held where nothing measures it."""
+
+MANY = 10
+"""Blocks that make enough pairs."""
 
 LEAST_BLOCKS = 5
 """Fewer say too little of how they differ."""
@@ -80,18 +83,28 @@ class Fit(Struct, frozen=True):
 
     def covariance(self) -> Floats:
         """Of the parameters: by chance, and by what was only held to be usual."""
-        one = np.eye(len(self.score), dtype=bool)
-        change = np.array([self.without(row) - self.parameters for row in one])
-        used = int(np.sum(np.any(self.score != 0.0, axis=1)))
-        free = max(1, used - 3)
-        student = free / (free - 2) if free > 2 else 3.0
-        chance = student * (1 - 1 / len(change)) * change.T @ change
+        alone = self._jackknife(1)
+        size = np.sqrt(np.maximum(np.diag(alone), 1e-300))
+        # Errors that last longer than a block show when neighbours are left out together.
+        paired = np.sqrt(np.diag(self._jackknife(2))) if len(self.score) >= MANY else size
+        wider = np.maximum(1.0, paired / size)
+        chance = alone * np.outer(wider, wider)
         usual = np.zeros(COUNT)
         usual[list(USUAL)] = np.array(list(USUAL.values())) ** -2
         total = self.normal.sum(axis=0) + self.known
         pull = np.zeros((COUNT, COUNT))
         pull[list(self.active)] = _solved(total, np.diag(usual), self.active)
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
+
+    def _jackknife(self, together: int) -> Floats:
+        """Covariance by leaving out so many neighbouring blocks at a time."""
+        group = np.arange(len(self.score)) // together
+        change = np.array(
+            [self.without(group == number) - self.parameters for number in range(group[-1] + 1)]
+        )
+        free = len(change) - 3
+        student = free / (free - 2) if free > 2 else 3.0
+        return np.asarray(student * (1 - 1 / len(change)) * change.T @ change)
 
 
 def fit(sources: Sequence[Source], start: Floats, *, places: bool) -> Fit:

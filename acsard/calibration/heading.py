@@ -136,21 +136,26 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 
 
 def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
-    """By how many s the sensor is late: where its turn rate resembles the wheels' most."""
+    """By how many s the sensor is late: where its turn rate resembles the wheels' most.
+
+    Of the wheels, what they turn against each other; or together, should a side be reversed.
+    """
     reach = round(FURTHEST_S / GRID_S)
-    score = np.zeros(2 * reach + 1)
+    scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
     for heading, turned in zip(found, angles, strict=True):
-        if len(heading.t) < 2:
-            continue
         grid = np.arange(turned.t[0], turned.t[-1], GRID_S)
-        if len(grid) < 4:
+        if len(heading.t) < 2 or len(grid) < 4:
             continue
         left, right = turned.angles(grid)
-        wheels = np.diff(right - left)
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
-        score += _correlation(sensor - sensor.mean(), wheels - wheels.mean(), reach)
-    score = np.abs(score)
+        sensor -= sensor.mean()
+        for at, wheels in enumerate((np.diff(right - left), np.diff(right + left))):
+            wheels = wheels - wheels.mean()
+            scores[at] += _correlation(sensor, wheels, reach)
+            sizes[at] += float(wheels @ wheels)
+    alike = np.abs(scores) / np.sqrt(np.maximum(sizes, 1e-300))[:, None]
+    score = alike[int(np.argmax(alike.max(axis=1)))]
     best = int(np.argmax(score))
     if not 0 < best < 2 * reach:
         return 0.0 if not score.any() else float(best - reach) * GRID_S

@@ -89,7 +89,7 @@ class Path(Struct, frozen=True):
 
 def spots(driven: Sequence[Run], angles: Sequence[Wheels], parts: Sequence[Block]) -> list[Spots]:
     """The positions of each block, those after a jump apart."""
-    edges = [_jumps(run, turned) for run, turned in zip(driven, angles, strict=True)]
+    edges = [jumps(run, turned) for run, turned in zip(driven, angles, strict=True)]
     found = []
     for number, part in enumerate(parts):
         run = driven[part.run]
@@ -101,7 +101,7 @@ def spots(driven: Sequence[Run], angles: Sequence[Wheels], parts: Sequence[Block
     return found
 
 
-def _jumps(run: Run, turned: Wheels) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def jumps(run: Run, turned: Wheels) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Indices of positions that do not follow from the one before."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:

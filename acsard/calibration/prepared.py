@@ -20,7 +20,7 @@ from acsard.calibration.doubts import (
     way_units,
 )  # fmt: skip
 from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
-from acsard.calibration.excitation import drives_enough, turns_enough
+from acsard.calibration.excitation import drives_enough, rolls_enough, turns_enough
 from acsard.calibration.fit import Source
 from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.paths import Block, Wheels, blocks
@@ -50,12 +50,13 @@ def prepared(
     drives_enough(parts)
     count, start = len(parts), base.start()
     rows = heading.rows(headings, driven, angles, parts)
+    rolls_enough(rows)
     spots = places.spots(driven, angles, parts)
     grids = [places.grid(*pair) for pair in zip(driven, angles, strict=True)] if spots else []
     sources: list[Source] = []
     sides = begun = None
     if headings is not None and len(rows.turned):
-        turns_enough(rows.turned, rows)
+        turns_enough(rows.turned)
         sides = turning.first(rows, base)
         heading_follows(headings.source, rows.turned, turning.by_sides(rows, base, sides))
         sources.append(lambda p: turning.evidence(rows, base, p, count))

@@ -45,7 +45,8 @@ def search(
     """The best of all that is tried."""
     reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in found]
     kept = [found[i] for i in sorted(np.argsort(reach)[::-1][:MOST_SPOTS])]
-    grids = {s.run: grid(driven[s.run], angles[s.run], COARSE_S) for s in kept}
+    needed = sorted({spot.run for spot in kept})
+    grids = {run: grid(driven[run], angles[run], COARSE_S) for run in needed}
     best = Begin(base.start(), np.inf)
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         for turn in TURNS:

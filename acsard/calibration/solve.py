@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -101,7 +101,7 @@ def _calibration(
     by_wheels = turning.turned(rows, base, fitted.parameters)
     rate, truth = rates(rows, by_wheels), rows.turned
     if headings is None:
-        turns_enough(by_wheels, rows)
+        turns_enough(by_wheels)
         truth = seen_by_places(fitted, rows, base)
     result = found(fitted, rate)
     sure_enough(result, float(np.sqrt(every[TURN, TURN])) / abs(fitted.parameters[TURN]))
@@ -124,12 +124,25 @@ def _calibration(
         float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
     )  # fmt: skip
     bias = headings.bias if headings is not None else 0.0
+    notes += _cuts(log.runs, angles)
     notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))
     return Calibration(
         " and ".join(late), drives, configured(base), result, " and ".join(scale),
         float(fitted.parameters[RATE]), float(np.sqrt(every[RATE, RATE])), better, late, bias,
         tuple(notes),
     )  # fmt: skip
+
+
+def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
+    """Where the log was taken apart, a sentence each."""
+    if gone := sum(len(turned.gaps) for turned in angles):
+        yield f"the wheel speeds have {gone} gaps: nothing is taken across them"
+    pairs = zip(driven, angles, strict=True)
+    if jumps := sum(len(places.jumps(run, turned)) for run, turned in pairs):
+        yield (
+            f"the positions jump {jumps} times (outliers, or a source that found itself "
+            "elsewhere): nothing is taken across that"
+        )
 
 
 def _follow(

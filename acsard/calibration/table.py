@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from array import array
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -165,15 +166,17 @@ class _Reader:
         self._run = names.index("run") if "run" in names else -1
         # What is neither a number of ours nor the run is not looked at.
         self._picks = [i for i, name in enumerate(names) if name and name != "run"]
-        self._rows: list[list[float]] = []
+        self._values = array("d")  # a list of lists takes ten times the memory
         self._runs: list[int] = []
         self._known: dict[str, int] = {}
         self._bad, self._first = 0, ""
 
     def take(self, line: str, number: int) -> None:
-        if not line or line.isspace() or line.lstrip().startswith("#"):
+        if "#" in line:
+            line = line.partition("#")[0]
+        if not line or line.isspace():
             return
-        cells = line.split("#")[0].split(self._separator)
+        cells = line.split(self._separator)
         short = len(self._names) - len(cells)
         if short > 0:
             cells += [""] * short
@@ -181,12 +184,12 @@ class _Reader:
             self._refuse(f"line {number} has {len(cells)} cells, the header {len(self._names)}")
             return
         try:
-            row = [float(cells[i]) for i in self._picks]
+            row = [float(cells[i] or "nan") for i in self._picks]
         except ValueError:
             row = self._slowly(cells, number)
             if not row:
                 return
-        self._rows.append(row)
+        self._values.extend(row)
         name = cells[self._run].strip().strip('"') if self._run >= 0 else ""
         self._runs.append(self._known.setdefault(name, len(self._known)))
 
@@ -212,16 +215,17 @@ class _Reader:
 
     def table(self, notes: list[str]) -> Table:
         """All of it; raises `LogError` when too much could not be read."""
-        if self._bad > max(FEW, SHARE * len(self._rows)) or (self._bad and not self._rows):
+        rows = len(self._runs)
+        if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
             raise LogError(
-                f"{self._first}, and {self._bad} of {self._bad + len(self._rows)} rows are so: "
+                f"{self._first}, and {self._bad} of {self._bad + rows} rows are so: "
                 "write numbers with a point, or leave a cell empty where there is no value"
             )
-        if not self._rows:
+        if not rows:
             raise LogError("there are no rows below the header: record a drive")
         if self._bad:
             notes = [*notes, f"{_rows(self._bad)} left out: {self._first}"]
-        values = np.array(self._rows, dtype=np.float64)
+        values = np.frombuffer(self._values).reshape(rows, len(self._picks))
         columns = {self._names[i]: values[:, at].copy() for at, i in enumerate(self._picks)}
         runs = np.array(self._runs, dtype=np.int64)
         return Table(columns, runs, tuple(self._known), (*notes, *_bounded(columns)))

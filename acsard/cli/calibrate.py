@@ -26,7 +26,8 @@ wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right"; and yaw_rate (rad/s, of a 
 (m, of any source of positions) with or without yaw (rad), or both; run (any name) tells several
 drives apart. Columns may be in any order, cells empty where a sensor has nothing to say. Good logs
 begin with 3 s of standing, and have straight drives, turns to both sides, slow and fast, and
-curves, for 60 s or more. Exit 0 when something was found, 1 when the log gives nothing, with what to drive.
+curves, for 60 s or more. Exit 0 when something was found, 1 when the log gives nothing, with what
+to drive instead.
 """
 
 MOST_BYTES = 1 << 30

@@ -124,8 +124,8 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
     place[wild] += rng.normal(0, 2.0, (int(wild.sum()), 2)) @ np.array([1, 1j])
     place = 12.0 - 7.0j + place * np.exp(0.7j)
     return Drive(
-        times[ends] - every * STEP / 2 + start, shown_left, shown_right, gyro_t + start, gyro,
-        place_t + start, place, yaw[ends], where[ends],
+        np.asarray(times[ends] - every * STEP / 2 + start), shown_left, shown_right,
+        gyro_t + start, gyro, place_t + start, place, yaw[ends], where[ends],
     )  # fmt: skip
 
 
