@@ -16,7 +16,7 @@ from acsard.calibration.table import Floats
 LEAST_TURN = 2 * np.pi
 """rad that the robot must turn in all."""
 
-LEAST_ROLL = 10.0
+LEAST_ROLL = 3.0
 """rad that the wheels must roll in all, together as well as against each other."""
 
 ALIKE = 0.98

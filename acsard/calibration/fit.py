@@ -34,7 +34,7 @@ from acsard.calibration.table import Floats
 Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
-SMALL, SETTLED = 1e-5, 1e-3
+SMALL, SETTLED = 1e-5, 0.02
 """A step that ends the search, and one that may be its last."""
 
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
@@ -46,6 +46,9 @@ HELD = 1e9
 
 MANY = 10
 """Blocks that make enough pairs."""
+
+LEAST_FREE = 3.0
+"""Of Student's t, which has no standard deviation at 2."""
 
 LEAST_BLOCKS = 5
 """Fewer say too little of how they differ."""
@@ -102,9 +105,12 @@ class Fit(Struct, frozen=True):
         change = np.array(
             [self.without(group == number) - self.parameters for number in range(group[-1] + 1)]
         )
-        free = len(change) - 3
-        student = free / (free - 2) if free > 2 else 3.0
-        return np.asarray(student * (1 - 1 / len(change)) * change.T @ change)
+        # A variance that few of the groups make up is known as badly as of so few.
+        squares = np.maximum(change**2, 1e-150)
+        free = np.maximum(LEAST_FREE, squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0))
+        student = np.sqrt(free / (free - 2))
+        covariance = (1 - 1 / len(change)) * change.T @ change
+        return np.asarray(covariance * np.outer(student, student))
 
 
 def fit(sources: Sequence[Source], start: Floats, *, places: bool) -> Fit:
@@ -112,14 +118,16 @@ def fit(sources: Sequence[Source], start: Floats, *, places: bool) -> Fit:
     active = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
     held = start[LEFT] + start[RIGHT]
     parameters, size = start.copy(), np.inf
-    for _ in range(MOST_STEPS):
+    for at in range(MOST_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
         known, told = _known(parameters, held, places)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + told, active)
         # Far off, only part of the way: the path must stay near what it is linear about.
-        size = float(np.max(np.abs(step)))
-        parameters = parameters + step * min(1.0, 0.3 / size if size else 1.0)
+        # Later on, half of it, lest outliers count and not in turn.
+        size = float(np.max(np.abs(step[: RATE + 1])))
+        whole = 1.0 if at < MOST_STEPS // 3 else 0.5
+        parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
             break
     found = [source(parameters) for source in sources]

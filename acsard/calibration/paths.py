@@ -26,7 +26,7 @@ BLOCKS = 16
 SHORTEST_S, LONGEST_S = 4.0, 12.0
 """As many blocks are aimed at, of such lengths."""
 
-LEAST_TURN = 1.0
+LEAST_TURN = 0.2
 """rad that the faster side must turn in a block for it to tell anything."""
 
 

@@ -75,16 +75,21 @@ class Path(Struct, frozen=True):
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Where the sensor is at these times of the positions, and its slopes, COUNT columns."""
-        lever = complex(parameters[AHEAD], parameters[ASIDE])
         t = t - parameters[LATE]
-        ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         slopes = np.zeros((len(t), COUNT), dtype=np.complex128)
         for index, values in self.slopes.items():
             slopes[:, index] = np.interp(t, self.t, values)
+        here, ahead = self._sensor(t, parameters)
         slopes[:, AHEAD], slopes[:, ASIDE] = ahead, 1j * ahead
-        before, after = (np.interp(t + s, self.t, self.place) for s in (-SLOPE_S, SLOPE_S))
+        before, after = (self._sensor(t + s, parameters)[0] for s in (-SLOPE_S, SLOPE_S))
         slopes[:, LATE] = (before - after) / (2 * SLOPE_S)
-        return np.interp(t, self.t, self.place) + lever * ahead, slopes
+        return here, slopes
+
+    def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
+        """Where it is, and which way the robot looks, as a number of size 1."""
+        ahead = np.exp(1j * np.interp(t, self.t, self.heading))
+        lever = complex(parameters[AHEAD], parameters[ASIDE])
+        return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
 def spots(driven: Sequence[Run], angles: Sequence[Wheels], parts: Sequence[Block]) -> list[Spots]:

@@ -1,6 +1,6 @@
 """Where to begin with positions alone: Gauss-Newton needs a track that is nearly right.
 
-Tried are tracks from a third to ten times the configured one, turned the right way round and the
+Tried are tracks from a tenth to thirty times the configured one, turned the right way round and the
 wrong, and with one side reversed. How large the path comes out then is the radius.
 """
 
@@ -18,7 +18,7 @@ from acsard.calibration.places import Grid, Spots, grid, place
 from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
-TURNS = np.geomspace(0.1, 4.0, 40)
+TURNS = np.geomspace(0.03, 10.0, 60)
 """Configured over true track, for wheels of the configured radius."""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)

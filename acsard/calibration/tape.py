@@ -18,13 +18,15 @@ UNKNOWN = 1.0
 """Standard deviation of the scale's logarithm where nothing else has measured it."""
 
 LEAST_M = 0.5
-STRAIGHT = 0.5
-"""The start and the end must be so far apart, in m and as a share of the way between."""
+"""A run that ends nearer to its start, by odometry, is none to measure."""
+
+STRAIGHT = 0.8
+"""The start and the end must be so far apart, as a share of the way between."""
 
 
 class Tape(Struct, frozen=True):
-    """How far a run's end is from its start in a straight line, m; `run` "" is the one that
-    got furthest."""
+    """How far a run's end is from its start in a straight line, m; `run` "" is the
+    straightest."""
 
     metres: float
     run: str = ""
@@ -35,6 +37,11 @@ class Way(Struct, frozen=True):
 
     apart: float
     along: float
+
+    @property
+    def straight(self) -> float:
+        """1 for a straight line, 0 for a run that gets nowhere."""
+        return self.apart / self.along if self.apart > LEAST_M else 0.0
 
 
 Follow = Callable[[Floats, int], Way]
@@ -55,9 +62,9 @@ def scaled(
         )
     numbers = [names.index(tape.run)] if tape.run else range(len(names))
     ways = {number: follow(found.values, number) for number in numbers}
-    best = max(ways, key=lambda number: ways[number].apart)
+    best = max(ways, key=lambda number: ways[number].straight)
     way = ways[best]
-    if way.apart < max(LEAST_M * found.values[LEFT_RADIUS], STRAIGHT * way.along):
+    if way.straight < STRAIGHT:
         raise RefusedError(
             f"--distance: run {names[best]} ends {way.apart:.2f} m from where it began, after "
             f"{way.along:.2f} m: drive straight on for 2 m or more in a run of its own, and "

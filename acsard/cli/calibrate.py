@@ -50,7 +50,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         type=_distance,
         metavar="[RUN=]METRES",
         help="how far from its start a run ends, in a straight line by tape measure: tells how "
-        "large the wheels are; without RUN it is the run that got furthest",
+        "large the wheels are; without RUN it is the straightest run",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
