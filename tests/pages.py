@@ -99,6 +99,7 @@ How = Run | Elsewhere | Collected | Shown
 
 HERE = "tests/system/test_pages.py"
 CLI, FLEET, MCU = (f"tests/system/test_{name}.py" for name in ("cli", "fleet", "mcu"))
+CALIBRATE = "tests/unit/cli/test_calibrate.py"
 SERVICE, CONTAINER = "tests/systemd/test_service.py", "tests/systemd/container.py"
 ROS_FILES, BRIDGE = "tests/test_deploy_ros2.py", "tests/system/test_ros_bridge.py"
 
@@ -156,6 +157,10 @@ COMMANDS: dict[str, How] = {
         HERE, "def test_the_broken_board"
     ),
     "acsard mcu check --port ./mcu --yes": Elsewhere(HERE, "def test_the_broken_board"),
+    "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, '"calibrate", "--log"'),
+    "acsard calibrate --log drive.csv --distance straight=4.03 --write": Elsewhere(
+        CALIBRATE, '"--distance", "straight='
+    ),
     "sudo apt install gcc libsimavr-dev libelf-dev": Elsewhere(".ci/run", "libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,

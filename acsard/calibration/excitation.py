@@ -22,7 +22,7 @@ LEAST_ROLL = 3.0
 ALIKE = 0.98
 """Squared correlation of both: more, and they are one movement."""
 
-WORST_TRACK, WORST_RATIO = 0.2, 0.02
+WORST_TRACK, WORST_RATIO = 0.2, 0.03
 """Standard deviations, as shares, that are too large for the result to be of use: of the track by
 chance, and of the ratio of the wheels."""
 

@@ -44,7 +44,7 @@ share a track grows with each rad/s, s, m, m."""
 HELD = 1e9
 """Weight by which the mean radius is held where nothing measures it."""
 
-MANY = 10
+MANY = 16
 """Blocks that make enough pairs."""
 
 LEAST_FREE = 3.0

@@ -72,14 +72,18 @@ class Path(Struct, frozen=True):
     place: Complexes
     heading: Floats
     slopes: dict[int, Complexes]
+    bends: dict[int, Floats]
+    """How the heading changes with each, rad."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Where the sensor is at these times of the positions, and its slopes, COUNT columns."""
         t = t - parameters[LATE]
         slopes = np.zeros((len(t), COUNT), dtype=np.complex128)
-        for index, values in self.slopes.items():
-            slopes[:, index] = np.interp(t, self.t, values)
         here, ahead = self._sensor(t, parameters)
+        lever = 1j * complex(parameters[AHEAD], parameters[ASIDE]) * ahead
+        for index, values in self.slopes.items():
+            bend = np.interp(t, self.t, self.bends[index])
+            slopes[:, index] = np.interp(t, self.t, values) + lever * bend
         slopes[:, AHEAD], slopes[:, ASIDE] = ahead, 1j * ahead
         before, after = (self._sensor(t + s, parameters)[0] for s in (-SLOPE_S, SLOPE_S))
         slopes[:, LATE] = (before - after) / (2 * SLOPE_S)
@@ -145,11 +149,12 @@ def path(steps: Grid, base: Base, parameters: Floats) -> Path:
     rolls = {LEFT: base.radius * steps.left / 2, RIGHT: base.radius * steps.right / 2}
     distance = left * rolls[LEFT] + right * rolls[RIGHT]
     heading, ahead = _directions(turns)
-    slopes = {}
+    slopes, swung = {}, {}
     for index, bend in bends.items():
-        middle = cumulative(bend)[:-1] + bend / 2
+        swung[index] = cumulative(bend)
+        middle = swung[index][:-1] + bend / 2
         slopes[index] = _sums(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
-    return Path(steps.t, _sums(ahead * distance), heading, slopes)
+    return Path(steps.t, _sums(ahead * distance), heading, slopes, swung)
 
 
 def place(steps: Grid, base: Base, parameters: Floats) -> Complexes:

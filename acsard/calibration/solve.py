@@ -82,7 +82,8 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
     for length in LENGTHS_S[headings is not None]:
         made = prepared(log.runs, angles, headings, base, length)
         fitted = fit(made.sources, made.start, places=bool(made.spots))
-        tries.append((float(fitted.covariance()[TURN, TURN]), len(tries), made, fitted))
+        unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
+        tries.append((unsure, len(tries), made, fitted))
         if len(made.parts) < 3 * fitting.LEAST_BLOCKS:
             break  # half as many would be too few
     _, _, made, fitted = min(tries)

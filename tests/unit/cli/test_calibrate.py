@@ -64,6 +64,20 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     )
 
 
+def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
+    metres = 1.1 * abs(straight.where[-1])
+    log = usual().csv(places=False, run="turns")
+    log += straight.csv(places=False, run="straight").partition("\n")[2]
+    words = ["--distance", "straight=" + f"{metres:.3f}", "--write", "--json"]
+    assert called(tmp_path, log, *words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scale"] == "distance"
+    assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
+    written = parse((tmp_path / "acsard.toml").read_bytes()).drive
+    assert written.left_wheel_radius_multiplier == pytest.approx(1.1, rel=0.02)
+
+
 def test_a_refusal_ends_with_failure_and_an_object(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
