@@ -38,6 +38,10 @@ class RefusedError(AcsardError):
     """The log cannot be calibrated with; the text says why and what to do."""
 
 
+class UnlikeError(RefusedError):
+    """Positions do not follow the wheels, over blocks as long as these."""
+
+
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
     """The sensor shows the turns of the wheels, whatever sign; raises `RefusedError`."""
     spread = float(turned @ turned)
@@ -52,7 +56,7 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
 def places_follow(begun: Begin) -> None:
     """The positions show the path of the wheels; raises `RefusedError`."""
     if begun.unexplained > UNLIKE:
-        raise RefusedError(
+        raise UnlikeError(
             "the positions do not follow what the wheels do: are they x ahead and y to the left in "
             "m (not latitude and longitude), of the same drive, on the same clock within 1 s?"
         )

@@ -86,7 +86,7 @@ def sure_enough(found: Multipliers, chance: float) -> None:
 def told_apart(normal: Floats) -> None:
     """The log tells radii and track from each other; raises `RefusedError`.
 
-    `normal`: of left, right and turn, all else taken out.
+    `normal`: `Fit.apart`.
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0) or np.linalg.cond(normal / np.outer(size, size)) > WORST_CONDITION:

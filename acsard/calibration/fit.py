@@ -77,12 +77,14 @@ class Fit(Struct, frozen=True):
         return found
 
     def apart(self) -> Floats:
-        """3 x 3 normal equations of left, right and turn, with all that goes with them taken out;
-        the scale, where it is held, too."""
+        """Normal equations of left, right and turn, with all that goes with them taken out; where
+        the mean radius is held, of left against right and turn."""
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > TURN]
         inner, cross = total[np.ix_(rest, rest)], total[np.ix_([LEFT, RIGHT, TURN], rest)]
-        return np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
+        three = np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
+        free = np.eye(3) if LATE in self.active else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(free @ three @ free.T)
 
     def covariance(self) -> Floats:
         """Of the parameters: by chance, and by what was only held to be usual."""

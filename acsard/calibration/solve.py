@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from acsard.calibration import fit as fitting
 from acsard.calibration import heading, places, turning
-from acsard.calibration.doubts import RefusedError, in_range, remarks
+from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
 from acsard.calibration.evidence import LATE, LEFT, RATE, RIGHT, TURN, Base
 from acsard.calibration.excitation import DRIVE, sure_enough, told_apart, turns_enough
 from acsard.calibration.fit import Fit, fit
@@ -79,13 +79,22 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
     angles = [wheels(run) for run in log.runs]
     headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
     tries: list[tuple[float, int, Prepared, Fit]] = []
+    unlike: UnlikeError | None = None
     for length in LENGTHS_S[headings is not None]:
-        made = prepared(log.runs, angles, headings, base, length)
+        try:
+            made = prepared(log.runs, angles, headings, base, length)
+        except UnlikeError as error:
+            unlike = unlike or error
+            continue  # coarse positions may follow over a longer time
+        except RefusedError as error:
+            raise unlike or error from None
         fitted = fit(made.sources, made.start, places=bool(made.spots))
         unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
         tries.append((unsure, len(tries), made, fitted))
         if len(made.parts) < 3 * fitting.LEAST_BLOCKS:
             break  # half as many would be too few
+    if unlike is not None and not tries:
+        raise unlike
     _, _, made, fitted = min(tries)
     return _calibration(log, angles, headings, base, tape, made, fitted)
 
