@@ -37,6 +37,10 @@ LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
 more; where they are fine, more blocks do."""
 
 
+PLENTY = 100
+"""Blocks after which others are not worth the time."""
+
+
 class Drives(Struct, frozen=True):
     """What was driven, in sums."""
 
@@ -91,8 +95,8 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
         fitted = fit(made.sources, made.start, places=bool(made.spots))
         unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
         tries.append((unsure, len(tries), made, fitted))
-        if len(made.parts) < 3 * fitting.LEAST_BLOCKS:
-            break  # half as many would be too few
+        if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
+            break  # half as many would be too few, or these are plenty
     if unlike is not None and not tries:
         raise unlike
     _, _, made, fitted = min(tries)
