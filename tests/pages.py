@@ -109,6 +109,7 @@ HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
 SERVICE = "tests/systemd/test_service.py"
+CALIBRATE = "tests/unit/cli/test_calibrate.py"
 
 NO_ROS = Shown("needs ROS 2; the page says that it was not tried")
 TWO_MACHINES = Shown("needs a second machine")
@@ -194,6 +195,10 @@ COMMANDS: dict[str, How] = {
     "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": BROKEN,
     "acsard mcu check --port ./mcu --yes": BROKEN,
     "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
+    "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
+    "acsard calibrate --log drive.csv --distance straight=4.03 --write": Elsewhere(
+        CALIBRATE, "test_a_distance_measures_the_wheels"
+    ),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,

@@ -15,6 +15,7 @@ from typing import NoReturn
 from acsard import __version__
 from acsard.cli import (
     bench,
+    calibrate,
     call,
     check,
     doctor,
@@ -50,6 +51,7 @@ VERBS = (
     doctor,
     ports,
     mcu,
+    calibrate,
     lan,
     door,
     router,
