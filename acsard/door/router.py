@@ -1,7 +1,7 @@
 """A fleet's router: Zenoh in router mode by a configuration of Zenoh's own, watched (`watched.py`).
 
 The rules in the file say who may do what, as they do for zenohd. Beyond those anybody with a
-certificate can hold up a router; this one notices, and opens anew within 3 s.
+certificate can hold up a router; this one notices, and opens anew within 2 s.
 """
 
 from __future__ import annotations
