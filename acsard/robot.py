@@ -57,7 +57,7 @@ class Robot:
     def __init__(self, config: Config) -> None:
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
-        self._odometry = Odometry(config.odometry, self._kinematics)
+        self._odometry = Odometry(config.odometry, self._kinematics, config.mcu.encoder_counts)
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)

@@ -67,6 +67,7 @@ LinearJerk = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "m/s3 (0 = 
 AngularJerk = Annotated[float, Meta(ge=0.0, le=5000.0, extra={"unit": "rad/s3 (0 = no limit)"})]
 WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
 Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
 PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
 SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
@@ -181,6 +182,10 @@ class OdometryConfig(Struct, frozen=True):
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
+    wheel_separation_multiplier_std: Share = 0.0
+    left_wheel_radius_multiplier_std: Share = 0.0
+    right_wheel_radius_multiplier_std: Share = 0.0
+    covariance: Literal["model", "constant"] = "model"
 
 
 class LidarConfig(Struct, frozen=True):

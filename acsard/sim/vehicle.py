@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from acsard.config.settings import DriveConfig, SimConfig
-from acsard.drive.odometry import arc
+from acsard.drive.path import arc
 from acsard.values import Pose
 
 HANDS_S = 0.1

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.odometry import MAX_VARIANCE, Odometry, arc
+from acsard.drive.odometry import Odometry
+from acsard.drive.path import arc
+from acsard.drive.uncertainty import MAX_VARIANCE
 from acsard.mcu.feedback import Feedback
 from acsard.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.vectors.drive import (
