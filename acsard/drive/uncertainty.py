@@ -60,6 +60,8 @@ class PoseUncertainty:
         self._play = count / kinematics.track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / kinematics.track**2, 0.0)
         self._counted = counts > 0
+        self._dx = self._dy = self._rolled = 0.0
+        """m in odom, and of the wheels' way, since the last look at what is of second order."""
         self.set(0.0)
 
     def set(self, yaw: float) -> None:
@@ -136,9 +138,7 @@ class PoseUncertainty:
 
     def _begin_stretch(self) -> None:
         self._before, self._columns_before = self._p, self._columns
-        self._dx: float = 0.0
-        self._dy: float = 0.0
-        self._rolled: float = 0.0
+        self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
         """Look at what the way since the last look adds to second order."""
