@@ -48,13 +48,20 @@ class SecondOrder:
     def __init__(self, columns: int) -> None:
         self._noise: Vector = ORIGIN
         """xx, xy, yy of all [x, n] / 2 and M_i."""
-        self._with_x = [(ORIGIN, ORIGIN)] * columns
+        self._with_x: list[tuple[Vector, Vector]] = []
         """E[M_i x'], row by row."""
-        pairs = [(i, k) for i in range(columns) for k in range(i + 1)]
-        self._bent: dict[tuple[int, int], Planar] = dict.fromkeys(pairs, (0.0, 0.0))
+        self._bent: dict[tuple[int, int], Planar] = {}
         """C_ik"""
+        for _ in range(columns):
+            self.widen()
         self.xx = self.xy = self.yy = 0.0
         """m2, axes of odom; no step changes them, for x and y have no lever."""
+
+    def widen(self) -> None:
+        """There is one column more, of which nothing has come so far."""
+        self._with_x.append((ORIGIN, ORIGIN))
+        i = len(self._with_x) - 1
+        self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
         """The robot has moved by so many m in odom: x is seen from there now."""

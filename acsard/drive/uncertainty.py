@@ -42,6 +42,8 @@ MAX_VARIANCE = 1e9
 COARSE_COUNTS = 400
 """Per wheel turn, where the configuration does not tell: hardly an encoder has fewer."""
 
+NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
+
 STRETCH = 0.2
 """m the wheels roll between two looks at what is of second order: it changes slowly."""
 
@@ -54,7 +56,7 @@ class PoseUncertainty:
         self._start = odometry.pose_covariance_diagonal
         self._half = kinematics.track / 2
         self._noise = Noise(odometry, kinematics)
-        self._effects = columns(odometry, kinematics)
+        self._parameters = columns(odometry, kinematics)
         # A side is the mean of two wheels, each of which may stand anywhere within a count.
         count = kinematics.radius * math.tau / (counts or COARSE_COUNTS)
         self._play = count / kinematics.track
@@ -71,8 +73,10 @@ class PoseUncertainty:
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
         if self._counted:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
+        self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        self._gone_on = ORIGIN
+        self._columns_before = self._columns
+        """J, column by column; the last is what it may have gone on by in gaps, once there are."""
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
         self._begin_stretch()
@@ -96,8 +100,6 @@ class PoseUncertainty:
                 _bent(column, effect, distance, turn, dx, dy, c, s)
                 for column, effect in zip(self._columns, self._effects, strict=True)
             ]
-        if self._gone_on[2]:
-            self._gone_on = seen_from(self._gone_on, dx, dy)
         self._dx, self._dy = self._dx + dx, self._dy + dy
         self._rolled += abs(distance) + self._half * abs(turn)
         if self._rolled > STRETCH:
@@ -119,10 +121,17 @@ class PoseUncertainty:
         if self._lost:
             return
         c, s = self._cos, self._sin
-        self._gone_on = plus(self._gone_on, (c * distance, s * distance, turn))
+        if len(self._effects) == len(self._parameters):
+            self._effects = (*self._parameters, NO_EFFECT)
+            self._columns = [*self._columns, ORIGIN]
+            self._columns_before = [*self._columns_before, ORIGIN]
+            self._second.widen()
+        gone_on = plus(self._columns[-1], (c * distance, s * distance, turn))
+        self._columns = [*self._columns[:-1], gone_on]
         # An unknown arc leads to any side.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
-        p = added(self._p, along, yaw, 0.0, c, s)
+        way_along, way_yaw, both = self._noise.of(distance, turn, abs(turn))
+        p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
         self._p = added(p, aside, 0.0, 0.0, -s, c)
         self._publish()
 
@@ -137,7 +146,8 @@ class PoseUncertainty:
         return beyond
 
     def _begin_stretch(self) -> None:
-        self._before, self._columns_before = self._p, self._columns
+        self._before = self._p
+        self._columns_before = self._columns
         self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
@@ -154,10 +164,10 @@ class PoseUncertainty:
         self._begin_stretch()
 
     def _publish(self) -> None:
-        p, second, gone_on = self._p, self._second, self._gone_on
+        p, second = self._p, self._second
         xx, xy, yy = p.xx + second.xx, p.xy + second.xy, p.yy + second.yy
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
-        for x, y, yaw in (*self._columns, gone_on):
+        for x, y, yaw in self._columns:
             xx, xy, xyaw = xx + x * x, xy + x * y, xyaw + x * yaw
             yy, yyaw, yawyaw = yy + y * y, yyaw + y * yaw, yawyaw + yaw * yaw
         published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)

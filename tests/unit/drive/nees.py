@@ -87,6 +87,9 @@ def random(rng: np.random.Generator, seconds: float = 90.0) -> Legs:
     return legs
 
 
+Heard = Callable[[Array, np.random.Generator], list[Feedback]]
+"""What comes of a drive's lines."""
+
 Scenario = Callable[[np.random.Generator], Legs]
 SCENARIOS: dict[str, Scenario] = {
     "circle": circle,
@@ -174,10 +177,10 @@ def study(
     runs: int = 1000,
     drives: int = 1,
     seed: int = 1,
-    heard: Callable[[Array, np.random.Generator], list[Feedback]] | None = None,
+    heard: Heard | None = None,
     counts: int = 0,
 ) -> Array:
-    """NEES of `runs` robots, on so many drives; `heard` is what comes of a drive's lines."""
+    """NEES of `runs` robots, on so many drives, by all lines or by what is `heard` of them."""
     rng = np.random.default_rng(seed)
     paths = [reports(scenario(rng)) for _ in range(drives)]
     ends = true_ends(paths, runs // drives, model, rng)

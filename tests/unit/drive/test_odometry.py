@@ -505,3 +505,62 @@ def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
         robot.skip(counted(1.0, speed=99.0))
     assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
     assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)
+
+
+# at rest
+
+
+def at_rest(robot: Odometry) -> Estimate:
+    for _ in range(25):
+        estimate = robot.fold(counted(0.0))
+    return estimate
+
+
+def test_a_robot_at_rest_knows_its_twist() -> None:
+    robot = odometry()
+    for _ in range(19):
+        moving = robot.fold(feedback(0.0, 0.0, 0.01)).twist_variances
+    rest = robot.fold(feedback(0.0, 0.0, 0.02)).twist_variances
+    assert moving.lateral == 1e-3
+    assert (rest.linear, rest.lateral, rest.angular) == (1e-8, 1e-8, 1e-8)
+    assert robot.fold(feedback(0.0, 0.1, 0.01)).twist_variances.angular > 1e-8
+
+
+def test_a_count_to_and_fro_at_rest_moves_nothing() -> None:
+    robot = odometry()
+    before = at_rest(robot)
+    for _ in range(1000):
+        robot.fold(counted(0.002))
+        after = robot.fold(counted(-0.002))
+    assert (after.pose, after.covariance, after.positions) == (
+        before.pose,
+        before.covariance,
+        before.positions,
+    )
+
+
+def test_no_count_of_a_rest_is_lost() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for _ in range(10):
+        robot.fold(counted(0.002))
+    estimate = robot.fold(counted(0.002, speed=1.0))
+    assert estimate.positions == pytest.approx((0.022,) * 4)
+    assert estimate.pose.x == pytest.approx(0.022 * 0.05)
+
+
+def test_a_robot_that_creeps_too_slowly_for_two_decimals_moves() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for _ in range(1000):
+        estimate = robot.fold(counted(0.001))
+    assert estimate.pose.x == pytest.approx(1.0 * 0.05, abs=0.05 * 0.04)
+
+
+def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
+    coarse = Odometry(OdometryConfig(), Kinematics(DriveConfig()), 20)
+    covariance = coarse.fold(feedback(0.0, 0.0, 0.01)).covariance
+    # a count is 15.7 mm, a wheel anywhere in it at the start and now; a side is two wheels' mean
+    count = 0.05 * math.tau / 20
+    assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
+    assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
