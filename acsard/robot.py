@@ -62,7 +62,7 @@ class Robot:
     def __init__(self, config: Config) -> None:
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
-        self._odometry = Odometry(config.odometry, self._kinematics)
+        self._odometry = Odometry(config.odometry, self._kinematics, config.mcu.encoder_counts)
         self._gyro = Gyro() if config.odometry.gyro else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)

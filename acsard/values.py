@@ -73,6 +73,14 @@ class PoseCovariance(Struct, frozen=True):
     yawyaw: float
 
 
+class TwistVariances(Struct, frozen=True):
+    """Variances of one report in base_link: along x and y in m2/s2, of the turning in rad2/s2."""
+
+    linear: float
+    lateral: float
+    angular: float
+
+
 class Received(Struct, frozen=True):
     """Bytes as one read of the serial port gave them, and when."""
 
@@ -178,6 +186,7 @@ class Estimate(Struct, frozen=True):
     pose: Pose
     twist: Twist
     covariance: PoseCovariance
+    twist_variances: TwistVariances
     positions: tuple[float, float, float, float]
     """Wheel angles in rad since start, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds

@@ -28,6 +28,8 @@ class Feedback(Struct, frozen=True):
     dt: float
     gap: float = 0.0
     turned: Motors | None = None
+    bridged: float = 0.0
+    """s of `dt` that no line reported; the speeds of its neighbours stand in for them."""
     asked_ns: int | None = None
     """When the line it answers was made, monotonic, where the reply tells which one that is."""
 

@@ -14,6 +14,7 @@ from acsard.config.settings import Config
 from acsard.config.wire_time import wire_use
 from acsard.drive.gyro import WORDS
 from acsard.drive.words import waiting
+from acsard.messages.covariances import Covariances
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -77,8 +78,7 @@ class Report:
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
-        self._twist_covariance = [0.0] * 36
-        self._twist_covariance[::7] = config.odometry.twist_covariance_diagonal
+        self._covariances = Covariances(config.odometry)
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
@@ -150,23 +150,14 @@ class Report:
         return TFMessage(transforms)
 
     def _odom(self, estimate: Estimate) -> Odometry:
-        frames, pose, p = self._config.odometry, estimate.pose, estimate.covariance
-        d = frames.pose_covariance_diagonal
-        # fmt: off
-        covariance = [
-            p.xx,    p.xy,   0.0,  0.0,  0.0,  p.xyaw,
-            p.xy,    p.yy,   0.0,  0.0,  0.0,  p.yyaw,
-            0.0,     0.0,    d[2], 0.0,  0.0,  0.0,
-            0.0,     0.0,    0.0,  d[3], 0.0,  0.0,
-            0.0,     0.0,    0.0,  0.0,  d[4], 0.0,
-            p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,  p.yawyaw,
-        ]
-        # fmt: on
+        frames, pose = self._config.odometry, estimate.pose
+        of_pose = self._covariances.of_pose(estimate.covariance)
+        of_twist = self._covariances.of_twist(estimate.twist_variances)
         return Odometry(
             Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,
-            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), covariance),
-            TwistWithCovariance(_twist(estimate.twist), self._twist_covariance),
+            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), of_pose),
+            TwistWithCovariance(_twist(estimate.twist), of_twist),
         )
 
     def _tf(self, estimate: Estimate) -> TFMessage:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 
 from acsard.config.settings import DriveConfig, SimConfig
-from acsard.drive.odometry import arc
+from acsard.drive.path import arc
 from acsard.sim.noise import uniform
 from acsard.values import Pose
 

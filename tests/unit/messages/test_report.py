@@ -148,10 +148,10 @@ def test_the_pose_covariance_has_each_figure_in_its_cell() -> None:
     # fmt: on
 
 
-def test_the_twist_covariance_is_the_configured_diagonal() -> None:
+def test_the_twist_covariance_is_the_samples_and_of_other_axes_the_configured() -> None:
     covariance = published()["odom"].twist.covariance
     rows = [covariance[6 * i : 6 * i + 6] for i in range(6)]
-    assert [rows[i][i] for i in range(6)] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    assert [rows[i][i] for i in range(6)] == [0.01, 0.02, 0.3, 0.4, 0.5, 0.06]
     assert all(rows[i][j] == 0.0 for i in range(6) for j in range(6) if i != j)
 
 
