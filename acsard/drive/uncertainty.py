@@ -75,8 +75,8 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        self._columns_before = self._columns
         """J, column by column; the last is what it may have gone on by in gaps, once there are."""
+        self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
         self._begin_stretch()
