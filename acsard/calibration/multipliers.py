@@ -38,6 +38,20 @@ class Multipliers(Struct, frozen=True):
     def std(self) -> Floats:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
+    def own(self) -> tuple[Floats, float]:
+        """The standard deviations apart from what all three have in common, and of that: a share.
+
+        A tape says how large everything is, whatever compares turns says how the three relate. The
+        odometry takes them for independent, and the two are. A side's own is such that the
+        difference of two independent ones is that of the radii.
+        """
+        shares = self.covariance / np.outer(self.values, self.values)
+        scale, track, radii = (
+            float(np.sqrt(max(0.0, row @ shares @ row)))
+            for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
+        )
+        return self.values * np.array([track, radii, radii]) / [1.0, np.sqrt(2), np.sqrt(2)], scale
+
 
 def configured(base: Base) -> Multipliers:
     """As they are now, of which nobody knows how sure they are."""

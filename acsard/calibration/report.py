@@ -48,6 +48,9 @@ class Report(Struct, frozen=True):
     right_wheel_radius_multiplier_std: float
     covariance: Sequence[Sequence[float]]
     """Of the three multipliers, in this order."""
+    odometry: dict[str, float]
+    """The standard deviations as `[odometry]` takes them: of each apart from what all three have in
+    common, and of that."""
     effective_track: float
     """m"""
     effective_track_std: float
@@ -92,7 +95,7 @@ def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Re
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
-        covariance=found.found.covariance.tolist(),
+        covariance=found.found.covariance.tolist(), odometry=deviations(found),
         effective_track=track * drive.wheel_separation,
         effective_track_std=track_std * drive.wheel_separation,
         effective_track_growth=found.growth, effective_track_growth_std=found.growth_std,
@@ -108,14 +111,20 @@ def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Re
 
 def keys(found: Calibration) -> dict[str, object]:
     """What `--write` sets: dotted keys."""
-    values, std = found.found.values, found.found.std
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
-        for name, value in zip(NAMES, values, strict=True)
+        for name, value in zip(NAMES, found.found.values, strict=True)
     }
-    for name, deviation in zip(NAMES, std, strict=True):
-        wanted[f"odometry.{name}_std"] = round(min(float(deviation), MOST_STD), DIGITS)
-    return wanted
+    return wanted | {f"odometry.{name}": value for name, value in deviations(found).items()}
+
+
+def deviations(found: Calibration) -> dict[str, float]:
+    """The keys of `[odometry]`. Of a scale that nothing has measured there is nothing to say."""
+    own, scale = found.found.own()
+    given = {f"{name}_std": float(value) for name, value in zip(NAMES, own, strict=True)}
+    if found.scale:
+        given["distance_scale_std"] = scale
+    return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
 
 
 def lines(given: dict[str, object]) -> list[str]:

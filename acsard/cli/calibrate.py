@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_config, find, load
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write what was found into the configuration file, comments kept (needs the "
-        "extra: pip install 'acsard[mcu]')",
+        f"extra: {install('mcu')})",
     )
     parser.set_defaults(main=main)
 

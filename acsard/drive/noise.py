@@ -73,4 +73,7 @@ def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, .
         rows.append((share / 2, share * track / 4, share / track, share / 2))
     if odometry.wheel_separation_multiplier_std:
         rows.append((0.0, 0.0, 0.0, -odometry.wheel_separation_multiplier_std / separation))
+    if odometry.distance_scale_std:
+        # Radii and track alike: every turn stays what it was.
+        rows.append((odometry.distance_scale_std, 0.0, 0.0, 0.0))
     return tuple(rows)

@@ -7,7 +7,7 @@ import pytest
 
 from acsard.calibration.evidence import Base
 from acsard.calibration.fit import Fit
-from acsard.calibration.multipliers import Rates, configured, found, rates
+from acsard.calibration.multipliers import Multipliers, Rates, configured, found, rates
 from tests.unit.calibration.cut import BASE, ideal, ready
 
 
@@ -44,3 +44,12 @@ def test_rates_are_those_of_the_turns() -> None:
 def test_what_is_configured_is_taken_as_it_is() -> None:
     assert configured(Base(0.05, 0.3, 0.9, 1.1, 1.5)).values.tolist() == [1.5, 0.9, 1.1]
     assert configured(BASE).std.tolist() == [0, 0, 0]
+
+
+def test_what_all_three_have_in_common_is_told_apart_from_what_each_has_alone() -> None:
+    # Scale off by 1 %, radii by 0.1 % each on its own, track by 2 %: all independent.
+    values = np.array([1.6, 1.1, 1.0])
+    shares = np.diag([0.02, 0.001, 0.001]) ** 2 + 0.01**2
+    own, scale = Multipliers(values, shares * np.outer(values, values)).own()
+    assert scale == pytest.approx(0.01, rel=0.01)
+    assert own / values == pytest.approx([0.02, 0.001, 0.001], rel=0.01)

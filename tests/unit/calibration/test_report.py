@@ -25,9 +25,12 @@ def test_the_object_has_every_parameter_with_its_deviation() -> None:
 def test_the_lines_are_a_configuration_with_what_was_found() -> None:
     made = parse("\n".join(lines(keys(FOUND))).encode())
     assert made.drive.wheel_separation_multiplier == round(REPORT.wheel_separation_multiplier, 5)
-    assert made.odometry.left_wheel_radius_multiplier_std == round(
-        REPORT.left_wheel_radius_multiplier_std, 5
-    )
+    for name, value in REPORT.odometry.items():
+        assert getattr(made.odometry, name) == value > 0.0
+
+
+def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
+    assert "distance_scale_std" not in REPORT.odometry
 
 
 def test_people_are_told_what_it_improves_and_what_remains() -> None:

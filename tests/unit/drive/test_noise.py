@@ -93,3 +93,8 @@ def test_a_column_is_the_derivative_by_its_multiplier(multiplier: str) -> None:
 
 def test_what_is_certain_has_no_column() -> None:
     assert columns(OdometryConfig(), Kinematics(DriveConfig())) == ()
+
+
+def test_a_scale_that_is_off_bends_no_turn() -> None:
+    config = OdometryConfig(distance_scale_std=0.01)
+    assert columns(config, Kinematics(DriveConfig())) == ((0.01, 0.0, 0.0, 0.0),)
