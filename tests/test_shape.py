@@ -39,7 +39,7 @@ PURE_AMONG_SHELLS = (
 """Pure modules in rooms that do I/O."""
 
 PURE_IMPORTS = {
-    "__future__", "binascii", "bisect", "collections", "contextlib", "difflib", "enum", "functools",
+    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum", "functools",
     "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re", "rich.cells",
     "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib",
     "typing", "xxhash",
