@@ -39,9 +39,9 @@ PURE_AMONG_SHELLS = (
 """Pure modules in rooms that do I/O."""
 
 PURE_IMPORTS = {
-    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum", "functools",
-    "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re", "rich.cells",
-    "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib",
+    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
+    "functools", "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re",
+    "rich.cells",    "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib",
     "typing", "xxhash",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by

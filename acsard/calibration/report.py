@@ -10,6 +10,7 @@ from msgspec import Struct
 from acsard.calibration.multipliers import SEPARATION
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import DriveConfig
+from acsard.config.writing import excerpt
 
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -127,17 +128,6 @@ def deviations(found: Calibration) -> dict[str, float]:
     return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
 
 
-def lines(given: dict[str, object]) -> list[str]:
-    """The keys as lines of TOML, by table."""
-    found: list[str] = []
-    for key, value in given.items():
-        table, _, name = key.rpartition(".")
-        if f"[{table}]" not in found:
-            found += [""] * bool(found) + [f"[{table}]"]
-        found.append(f"{name} = {value}")
-    return found
-
-
 def text(found: Report, calibration: Calibration, where: str) -> str:
     """For people."""
     return "\n".join(_text(found, calibration, where))
@@ -167,7 +157,7 @@ def _text(found: Report, calibration: Calibration, where: str) -> Iterator[str]:
     yield from _wrapped([f"note: {note}" for note in found.notes])
     yield ""
     yield f"{where}: written" if found.written else "for acsard.toml (or --write):"
-    yield from lines(keys(calibration))
+    yield from excerpt(keys(calibration))
 
 
 def _wrapped(sentences: Sequence[str]) -> Iterator[str]:

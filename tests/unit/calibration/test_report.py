@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import msgspec
 
-from acsard.calibration.report import NAMES, keys, lines, report, text
+from acsard.calibration.report import NAMES, keys, report, text
 from acsard.config.parsing import parse
 from acsard.config.settings import DriveConfig
+from acsard.config.writing import excerpt
 from tests.unit.calibration.cut import calibrated, usual
 
 FOUND = calibrated(usual().csv(places=False))
@@ -23,7 +24,7 @@ def test_the_object_has_every_parameter_with_its_deviation() -> None:
 
 
 def test_the_lines_are_a_configuration_with_what_was_found() -> None:
-    made = parse("\n".join(lines(keys(FOUND))).encode())
+    made = parse("\n".join(excerpt(keys(FOUND))).encode())
     assert made.drive.wheel_separation_multiplier == round(REPORT.wheel_separation_multiplier, 5)
     for name, value in REPORT.odometry.items():
         assert getattr(made.odometry, name) == value > 0.0
