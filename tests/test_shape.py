@@ -41,8 +41,8 @@ PURE_AMONG_SHELLS = (
 PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
     "functools", "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re",
-    "rich.cells",    "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib",
-    "typing", "xxhash",
+    "rich.cells", "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit",
+    "tomllib", "typing", "xxhash",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
 itself, knows the time or anything of chance."""
