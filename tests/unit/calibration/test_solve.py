@@ -1,4 +1,4 @@
-"""Twenty robots each way: the heading improves, and the standard deviations cover the truth."""
+"""Robots each way: the heading improves, and the standard deviations cover the truth."""
 
 from __future__ import annotations
 
@@ -24,15 +24,19 @@ from tests.unit.calibration.robots import (
 )  # fmt: skip
 
 WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
-ROBOTS = 20
+
+FEW, MANY = 4, 20
+
+each_way = pytest.mark.parametrize("way", WAYS)
+so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
 
 
 @cache
-def robots(way: str) -> list[tuple[Calibration, Drive]]:
+def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
     """Each robot's calibration, and a random drive of five minutes that it never saw."""
     gyro, places = WAYS[way]
     made = []
-    for seed in range(ROBOTS):
+    for seed in range(count):
         rng = np.random.default_rng(seed)
         robot = Robot(rng=rng)
         plan = GUIDED if seed % 2 else wander(rng, 80.0)
@@ -50,35 +54,40 @@ def off(seen: Drive, values: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_heading_is_ten_times_better_than_geometric(way: str) -> None:
-    better = [off(d, np.ones(3)) / off(d, c.found.values) for c, d in robots(way)]
+@so_many
+@each_way
+def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:
+    better = [off(d, np.ones(3)) / off(d, c.found.values) for c, d in robots(way, count)]
     print(f"{way}: heading {min(better):.1f} to {max(better):.1f} times better")
     assert min(better) >= 10
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_standard_deviations_cover_the_truth(way: str) -> None:
+@so_many
+@each_way
+def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     """The track from its slowest turn to a fast one; both radii, or left to right by a gyro."""
-    found = [c.found for c, _ in robots(way)]
+    found = [c.found for c, _ in robots(way, count)]
     z = [(f.values[0] - 1.6 * (1 + 0.08 * rate)) / f.std[0] for f in found for rate in (0, 0.5, 1)]
     for index, true in ((1, 0.998), (2, 1.002)):
         z += [(f.values[index] - true) / f.std[index] for f in found]
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
-    assert np.mean(np.abs(z) < 2) >= 0.95
+    # Of the few one more than one in twenty may be chance.
+    assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_what_is_said_to_remain_is_what_remains(way: str) -> None:
-    for c, _ in robots(way):
+@so_many
+@each_way
+def test_what_is_said_to_remain_is_what_remains(way: str, count: int) -> None:
+    for c, _ in robots(way, count):
         assert c.gain.turn.now == pytest.approx(240, abs=25)
         assert c.gain.turn.then is not None
         assert c.gain.turn.then < 24
 
 
-def test_bias_and_time_offset_are_told() -> None:
-    for c, _ in robots("gyro"):
+@so_many
+def test_bias_and_time_offset_are_told(count: int) -> None:
+    for c, _ in robots("gyro", count):
         assert c.bias == pytest.approx(0.01, abs=0.002)
         assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
 
@@ -95,7 +104,7 @@ def test_a_tape_measures_the_wheels() -> None:
     assert made.scale == "distance"
 
 
-@pytest.mark.parametrize("way", WAYS)
+@each_way
 def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
     rng = np.random.default_rng(5)
@@ -135,7 +144,7 @@ def test_gaps_and_jumps_are_told_and_cost_little() -> None:
     "plan",
     [[(3, 0, 0), (30, 0.3, 0)], [(3, 0, 0), (40, 0, 1)], [(3, 0, 0), (60, 0.3, 0.8)], [(60, 0, 0)]],
 )
-@pytest.mark.parametrize("way", WAYS)
+@each_way
 def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
     with pytest.raises(RefusedError, match="drive 60 s"):
