@@ -264,8 +264,11 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
 
 
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
-@pytest.mark.parametrize("who", ["viewer", "unlisted"])
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("form", "who"),
+    [(form, "viewer") for form in FORMS]
+    + [(form, "unlisted") for form in ("publish", "sessions", "come_and_go", "flood")],
+)
 def test_who_attacks_the_fleets_router_does_not_disturb_the_robot_behind_it(
     tmp_path: Path, form: str, who: Identity, seconds: float
 ) -> None:
