@@ -181,7 +181,7 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    keys = [full_key(robot_id, key) for key in source_keys([*sources, "*"])]
+    keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
     keys += limited
     return {
         "id": "commands",

@@ -42,15 +42,16 @@ class Multipliers(Struct, frozen=True):
         """The standard deviations apart from what all three have in common, and of that: a share.
 
         A tape says how large everything is, whatever compares turns says how the three relate. The
-        odometry takes them for independent, and the two are. A side's own is such that the
-        difference of two independent ones is that of the radii.
+        odometry takes all four for independent. A side's own has half the variance d of the radii's
+        difference, so that of the mean radius d / 4 is the sides' and no scale's, nor the track's.
         """
         shares = self.covariance / np.outer(self.values, self.values)
-        scale, track, radii = (
-            float(np.sqrt(max(0.0, row @ shares @ row)))
+        mean, track, apart = (
+            float(row @ shares @ row)
             for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
         )
-        return self.values * np.array([track, radii, radii]) / [1.0, np.sqrt(2), np.sqrt(2)], scale
+        own = np.sqrt(np.maximum(0.0, [track - apart / 4, apart / 2, apart / 2]))
+        return self.values * own, float(np.sqrt(max(0.0, mean - apart / 4)))
 
 
 def configured(base: Base) -> Multipliers:

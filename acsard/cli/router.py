@@ -56,7 +56,7 @@ async def _kept(file: str, log: Log) -> None:
 
     from acsard.runtime.doorkeeper import keep_door
 
-    keeper = asyncio.ensure_future(keep_door(["router", file], log.event))
+    keeper = asyncio.ensure_future(keep_door(["router", file], log.event, "the router"))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)
     try:

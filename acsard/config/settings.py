@@ -284,7 +284,7 @@ class SimConfig(Struct, frozen=True):
     left_radius_multiplier: Factor = 1.0
     right_radius_multiplier: Factor = 1.0
     turn_slip: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    gyro_bias: Annotated[float, Meta(ge=-1.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
+    gyro_bias: Annotated[float, Meta(ge=-0.2, le=0.2, extra={"unit": "rad/s"})] = 0.0
     gyro_noise: Annotated[float, Meta(ge=0.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
     gyro_delay: Annotated[float, Meta(ge=0.0, le=0.2, extra={"unit": "s"})] = 0.0
     seed: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 1

@@ -30,8 +30,8 @@ class Router:
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
             raise UsageError(f"{file}: {first_line(error)}") from error
-        if isinstance(endpoints, dict):  # by mode
-            endpoints = endpoints.get("router", [])
+        if isinstance(endpoints, dict):  # by mode, as Zenoh has it of itself: everywhere, in clear
+            endpoints = []
         if mode != "router" or not endpoints:
             raise UsageError(
                 f'{file}: not a router\'s; it needs mode: "router" and listen: {{ endpoints: '

@@ -75,8 +75,8 @@ class Watched:
             end_with_parent(signal.SIGKILL)
         _confine()
         self._manager.ready()
-        self._manager.status("waits for the daemon")
         while not self._side.ready():
+            self._manager.status("waits for the daemon")
             if self._wait():
                 return Exit.OK
         watch = self._open()

@@ -46,6 +46,9 @@ SCALE_VARIANCE = 1e-4
 SLIP_S = 0.5
 """s after the last contradiction for which it slips on."""
 
+MOST_SLIP_S = 5.0
+"""s that wheels slip in one go; a gyro that contradicts them for longer is stuck, or no gyro."""
+
 PROPORTIONS = (0.25, 2.5)
 """Between these a robot turns per turn of its wheels, whatever it skids."""
 
@@ -67,6 +70,9 @@ class Turn(Struct, frozen=True):
 
     angle: float
     variance: float
+    rate: float
+    """rad/s, what it says now, and its variance: the angle may hold what came late."""
+    rate_variance: float
 
 
 class Gyro:
@@ -86,7 +92,11 @@ class Gyro:
         """rad turned by all samples taken, and what of it was handed out."""
         self._variance = 0.0
         """rad2 of what was not handed out yet."""
-        self._rest_s = self._since_rest_s = self._slip_s = 0.0
+        self._rest_s = self._since_rest_s = self._slip_s = self._slipped_s = 0.0
+        self._noise = 0.0
+        """Variance of the last sample."""
+        self._hole = False
+        """Since the last line some of the turn was not heard."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """What the last `turn` found worth a log line."""
@@ -102,6 +112,7 @@ class Gyro:
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
         """What came since the last step, in order."""
         for sample in samples:
+            self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
@@ -127,7 +138,10 @@ class Gyro:
         if resting:
             self._shift()
         self._judge(silent)
-        return Turn(angle, variance) if self._does in ("used", "disagrees") else None
+        hole, self._hole = self._hole, False
+        if hole or self._does not in ("used", "disagrees"):
+            return None
+        return Turn(angle, variance, self._rate, self._noise + self._bias.variance)
 
     # samples
 
@@ -150,14 +164,16 @@ class Gyro:
             time_ns, sample = heard.popleft()
             time_ns -= self._delay_ns
             span_ns = SILENT_NS if self._told_ns is None else time_ns - self._told_ns
+            self._hole |= span_ns >= SILENT_NS
             self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
             span = max(0, span_ns) / NS_PER_S if span_ns < SILENT_NS else 0.0
-            bias.drift(span)
+            bias.drift(max(0, span_ns) / NS_PER_S)
             stands = resting and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
+            self._noise = max(bias.noise, sample.variance)
             self._angle += self._rate * span
             if not stands:
-                self._variance += max(bias.noise, sample.variance) * span * span
+                self._variance += self._noise * span * span
 
     # beside the wheels
 
@@ -168,6 +184,7 @@ class Gyro:
             self._slip_s = SLIP_S
         else:
             self._slip_s = max(0.0, self._slip_s - dt)
+        self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
         """At rest, where it moves nothing, put the gyro's time right."""
@@ -180,11 +197,12 @@ class Gyro:
     def _judge(self, silent: bool) -> None:
         match, before = self._match, self._does
         least, most = PROPORTIONS
+        wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
         if silent:
             self._does = "silent"
         elif not self._bias.known:
             self._does = "waiting for rest"
-        elif match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most:
+        elif wrong or self._slipped_s > MOST_SLIP_S:
             self._does = "not believed"
         else:
             self._does = "disagrees" if self._slip_s > 0.0 else "used"

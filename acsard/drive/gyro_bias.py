@@ -26,6 +26,10 @@ SLACK = 0.01
 LEAST_NOISE = 1e-5
 """rad/s; a gyro that says the same again and again is coarse and not without noise."""
 
+ANEW_S = 1.0
+"""s of rest in which all says the same other bias, after which it is that: a gyro that was started
+again or grew warm, or one that was turned when it was first listened to."""
+
 LEARNING = 0.02
 """Share of a new sample in the estimate of the noise: the last fifty count."""
 
@@ -39,6 +43,8 @@ class Bias:
         self.noise = 0.0
         """Variance of one sample."""
         self._rested_s, self._samples = 0.0, 0
+        self._other: Bias | None = None
+        """What the samples say that contradict it, one after the other."""
 
     @property
     def known(self) -> bool:
@@ -57,15 +63,28 @@ class Bias:
         """
         if not self.known:
             return self._average(rate, variance, dt)
+        self._rested_s += dt
         error = rate - self.value
         noise = max(self.noise, variance, LEAST_NOISE**2)
         if abs(error) > UNLIKELY * math.sqrt(noise + self.variance) + SLACK:
-            return False
+            return self._doubt(rate, variance, dt, noise)
+        self._other = None
         gain = self.variance / (self.variance + noise)
         self.value += gain * error
         self.variance *= 1.0 - gain
         # What of the error the bias explains is no noise.
         self.noise += LEARNING * ((1.0 - gain) * error * error - self.noise)
+        return True
+
+    def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
+        """A turn of a robot whose wheels stand, or another bias: a turn does not stay the same."""
+        other = self._other = self._other or Bias()
+        if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
+            return False
+        self._other = None
+        if math.sqrt(other.noise) > UNLIKELY * math.sqrt(noise) + SLACK:
+            return False
+        self.value, self.variance, self.noise = other.value, other.variance, other.noise
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:

@@ -101,7 +101,7 @@ class Odometry:
         else:
             turned = _sum(turned, feedback.turned)
         if unknown > 0.0:
-            self._stand(unknown, before, twist, gyro)
+            self._stand(unknown, before, twist)
         rolled = NOWHERE
         if not at_rest or max(map(abs, turned)) > self._unsettled:
             rolled, turned = turned, NOWHERE
@@ -116,8 +116,8 @@ class Odometry:
         spread = self._twist_uncertainty
         variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt)
         if gyro is not None and dt > 0.0:
-            twist = Twist(twist.linear, gyro.angle / dt)
-            variances = spread.with_gyro(variances, gyro.variance / dt**2)
+            twist = Twist(twist.linear, gyro.rate)
+            variances = spread.with_gyro(variances, gyro.rate_variance)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
@@ -151,17 +151,13 @@ class Odometry:
         dx, dy, heading = self._path.advance(distance, turn)
         self._uncertainty.advance(distance, turn, dx, dy, heading, variance)
 
-    def _stand(self, seconds: float, before: Twist, after: Twist, gyro: Turn | None) -> None:
-        """What the robot did in so many seconds between two twists is unknown: it has not moved.
-
-        A gyro tells the turn of it.
-        """
-        along, yaw = self._gaps.unseen(seconds, before, after)
-        turn = seconds * (before.angular + after.angular) / 2
-        distance = seconds * (before.linear + after.linear) / 2
-        if gyro is not None:
-            turn = yaw = 0.0
-        self._uncertainty.stand(distance, turn, along, yaw)
+    def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
+        """What the robot did in so many seconds between two twists is unknown: it has not moved."""
+        self._uncertainty.stand(
+            seconds * (before.linear + after.linear) / 2,
+            seconds * (before.angular + after.angular) / 2,
+            *self._gaps.unseen(seconds, before, after),
+        )
 
 
 def _sum(a: Motors, b: Motors) -> Motors:

@@ -23,6 +23,9 @@ from acsard.values import Twist, TwistVariances
 DECIMAL = 0.01
 """rad/s; a line says a wheel's speed in two decimals."""
 
+MOST = 1e9
+"""rad2/s2; so uncertain a turning says nothing."""
+
 LEAST = 1e-8
 """m2/s2 and rad2/s2: 0.1 mm/s. Filters take less for an error."""
 
@@ -75,4 +78,4 @@ class TwistUncertainty:
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
         """Where a gyro tells the turn with a variance of `angular` rad2/s2."""
-        return TwistVariances(variances.linear, variances.lateral, max(LEAST, angular))
+        return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -42,6 +42,8 @@ MAX_VARIANCE = 1e9
 COARSE_COUNTS = 400
 """Per wheel turn, where the configuration does not tell: hardly an encoder has fewer."""
 
+NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
+
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
 STRETCH = 0.2
@@ -95,6 +97,7 @@ class PoseUncertainty:
         wheels that tell it: then their parameters bend the distance only.
         """
         if self._lost:
+            self._forget_where(distance, turn)
             return
         c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
         along, yaw, both = self._noise.of(distance, turn, self._beyond_play(turn))
@@ -128,6 +131,7 @@ class PoseUncertainty:
         column like a parameter's. `along` m2 and `yaw` rad2 are how well that is known.
         """
         if self._lost:
+            self._forget_where(distance, turn)
             return
         c, s = self._cos, self._sin
         if len(self._effects) == len(self._parameters):
@@ -143,6 +147,11 @@ class PoseUncertainty:
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
         self._p = added(p, aside, 0.0, 0.0, -s, c)
         self._publish()
+
+    def _forget_where(self, distance: float, turn: float) -> None:
+        """Who moves without a known heading, or place, knows neither."""
+        if distance or turn:
+            self.covariance = NOWHERE
 
     def _beyond_play(self, turn: float) -> float:
         """rad of `turn` that are no encoder noise."""

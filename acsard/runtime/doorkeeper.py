@@ -23,7 +23,9 @@ LATER_S = 2.0
 """Before one is tried again that could not be opened."""
 
 
-async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
+async def keep_door(
+    words: Sequence[str], log: Callable[[Event], None], what: str = "the door to the network"
+) -> None:
     """`acsard` with these words ("door", ...), again whenever it ends, until cancelled."""
     while True:
         door = _Door(words)
@@ -34,7 +36,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
             code, why = Exit.USAGE, f"could not be started ({error})"
         finally:
             door.let_go()
-        log(Event("door_ended", f"the door to the network {why}; it is opened anew", "warning"))
+        log(Event("door_ended", f"{what} {why}; it is opened anew", "warning"))
         await asyncio.sleep(AGAIN_S if code <= Exit.FAILURE else LATER_S)
 
 

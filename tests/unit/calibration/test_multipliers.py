@@ -53,3 +53,11 @@ def test_what_all_three_have_in_common_is_told_apart_from_what_each_has_alone() 
     own, scale = Multipliers(values, shares * np.outer(values, values)).own()
     assert scale == pytest.approx(0.01, rel=0.01)
     assert own / values == pytest.approx([0.02, 0.001, 0.001], rel=0.01)
+
+
+def test_radii_that_are_the_least_known_are_no_scale_and_no_track() -> None:
+    values = np.array([1.6, 1.1, 1.0])
+    shares = np.diag([0.01, 0.03, 0.03]) ** 2
+    own, scale = Multipliers(values, shares * np.outer(values, values)).own()
+    assert scale == pytest.approx(0.0, abs=1e-9)
+    assert own / values == pytest.approx([0.01, 0.03, 0.03])

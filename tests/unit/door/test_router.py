@@ -29,6 +29,7 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
     [
         ('{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }', "not a router's"),
         ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
+        ('{ mode: "router" }', "needs mode"),  # Zenoh would listen everywhere, in clear
         ('{ mode: "ruter" }', "ruter"),
         ("{ mode", "router.json5"),
         ("", "router.json5"),

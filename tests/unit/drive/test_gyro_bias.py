@@ -84,3 +84,23 @@ def test_what_the_gyro_claims_of_its_noise_counts() -> None:
         assert learned.rest(0.012, claim, DT)
     assert silent.value == pytest.approx(0.012, abs=1e-4)
     assert claiming.value == pytest.approx(0.01, abs=1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+@pytest.mark.parametrize("jump", [0.03, 0.1, -0.15])
+def test_a_bias_that_has_jumped_is_learned_anew_at_rest(jump: float, noise: float) -> None:
+    learned, off = rested(10.0, noise=noise), 0.0
+    for n in range(6000):
+        learned.drift(DT)
+        said = 0.01 + jump + noise * gauss(2, n)
+        if not learned.rest(said, 0.0, DT):
+            off += (said - learned.value) * DT
+    assert learned.value == pytest.approx(0.01 + jump, abs=0.002)
+    assert abs(off) < 1.2 * abs(jump)  # of a second and not of the minute
+
+
+def test_a_robot_that_is_turned_while_its_wheels_stand_has_no_other_bias() -> None:
+    learned = rested(10.0)
+    for n in range(300):
+        learned.rest(0.01 + 0.15 * math.sin(n * DT), 0.0, DT)
+    assert learned.value == pytest.approx(0.01, abs=2e-3)

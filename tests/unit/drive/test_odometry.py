@@ -15,7 +15,7 @@ from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import Odometry
 from acsard.drive.path import arc
-from acsard.drive.uncertainty import MAX_VARIANCE
+from acsard.drive.uncertainty import MAX_VARIANCE, NOWHERE
 from acsard.mcu.feedback import Feedback
 from acsard.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.vectors.drive import (
@@ -412,11 +412,18 @@ def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
     assert far_p.yawyaw > near_p.yawyaw
 
 
-def test_a_gap_changes_nothing_of_a_pose_that_says_nothing_any_more() -> None:
+def test_who_drives_on_from_nowhere_knows_nothing() -> None:
     robot = odometry(OdometryConfig(distance_variance_per_metre=10.0))
     before = robot.fold(feedback(40.0, 40.0, 1e9)).covariance
     assert before.xx == 1e9 > before.yawyaw
-    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == before
+    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == NOWHERE
+
+
+def test_who_has_no_heading_knows_the_place_until_it_moves() -> None:
+    start = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e9)
+    robot = odometry(OdometryConfig(pose_covariance_diagonal=start))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance.xx == pytest.approx(1e-6)
+    assert robot.fold(feedback(4.0, 4.0, 0.01)).covariance == NOWHERE
 
 
 def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
@@ -424,7 +431,7 @@ def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     robot.fold(feedback(4.5, 7.5, 0.0))
     covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
     assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
-    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == covariance
+    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == NOWHERE
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e6], ids=["driving", "gaps"])
@@ -523,10 +530,10 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
     speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
     wheels, gyro = (Odometry(OdometryConfig(), kinematics) for _ in range(2))
     by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
-    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Turn(0.05, 1e-4))
+    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Turn(0.05, 1e-4, 4.0, 1e-3))
     assert by_gyro.pose.yaw == pytest.approx(0.05)
     assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
-    assert by_gyro.twist == Twist(by_wheels.twist.linear, 5.0)
+    assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
     assert by_gyro.positions == by_wheels.positions
     assert gyro.travelled == pytest.approx(wheels.travelled)
     more = by_gyro.covariance.yawyaw - OdometryConfig().pose_covariance_diagonal[5]
@@ -535,7 +542,7 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
 
 def test_over_a_gap_the_gyro_knows_the_turn() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
-    estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4), Turn(0.3, 1e-4))
+    estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4), Turn(0.3, 1e-4, 0.7, 1e-3))
     assert estimate.pose == Pose(0.0, 0.0, 0.3)
 
 
