@@ -35,18 +35,22 @@ if sys.dont_write_bytecode:
 
 
 TIMED = ("bench", "firmware", "system", "systemd")
-"""Where real time passes: these run one after the other. All else is only computed beside them."""
+"""Where real time passes: these run one after the other. All else is only computed beside them, or
+says by a mark of its own that it does not mind."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for the default run; one, which shows what is printed, for any other."""
+    """Two processes for what `.ci/run` runs; one, which shows what is printed, for any other."""
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
-    other = config.option.capture == "no" or "not (slow or soak" not in config.option.markexpr
+    other = (
+        config.option.capture == "no" or "soak" not in config.option.markexpr.partition("not")[2]
+    )
     return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
-        if item.path.relative_to(here).parts[0] in TIMED:
+        timed = item.path.relative_to(here).parts[0] in TIMED
+        if timed and not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group("timed"))
