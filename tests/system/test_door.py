@@ -102,6 +102,16 @@ def test_a_door_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
     until(lambda: gone(door), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
 
 
+def test_a_door_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
+    first = robot.door()
+    os.kill(first, signal.SIGSTOP)
+    robot.daemon.door_opens(times=2)
+    assert robot.lets_in()
+    assert gone(first)
+    (line,) = robot.daemon.events("door_ended")
+    assert "stopped, or hung" in line["text"]
+
+
 def test_a_machine_that_stood_still_opens_no_door_anew(robot: Open) -> None:
     door = robot.door()
     os.kill(door, signal.SIGSTOP)
