@@ -9,6 +9,8 @@ reason goes back into the robot, which latches a fault.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from acsard.config.settings import Source
 from acsard.values import Outputs
 
@@ -86,6 +88,7 @@ class Guard:
         )
 
 
+@lru_cache(4)  # the line that went last was new a period ago
 def _wheels(line: bytes) -> Wheels | None:
     """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
     found = []

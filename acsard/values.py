@@ -155,6 +155,7 @@ EventName = Literal[
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "wheels_turned", "gyro", "imu_refused", "bus_stuck", "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
+    "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
 ]  # fmt: skip

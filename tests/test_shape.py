@@ -31,6 +31,7 @@ PURE_AMONG_SHELLS = (
     "bench.matching",
     "bench.record",
     "door.watch",
+    "host.silence",
     "top.sections",
     "top.seen",
     "top.text",

@@ -74,6 +74,8 @@ class ZenohBus:
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
         got = self._inbox.take(queries)
+        if not self._outlets.behind:
+            return got
         dropped, stuck = self._outlets.losses(clock.mono_ns())
         return replace(got, dropped=dropped, stuck=stuck) if dropped or stuck else got
 

@@ -13,17 +13,17 @@ import zenoh
 
 from acsard.bus.replies import Replies
 from acsard.host import clock
-from acsard.incoming.bus import BusInput, Waker
+from acsard.incoming.bus import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, VERBS, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
-ARRIVALS = 16
-"""Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
-in from one who sends all he may. What comes in on other keys than those of listed sources is held
-together: no flood pushes out a command on another key."""
+ARRIVALS = 64
+"""Samples held of one key between two steps, the newest; at 4000 Hz (`session.py`) and 100 steps a
+second 40 come in from a neighbour who sends all he may. What comes in on other keys than those of
+listed sources is held together: no flood pushes out a command on another key."""
 
 SAMPLES = 64
 """Samples of a gyro held: what one of 400 Hz says while the loop stands still for 150 ms."""
@@ -65,15 +65,22 @@ class Inbox:
         self._slow: deque[Query] = deque()
         """Those of ROS, for parameters: one takes as long to answer as all others of a step."""
         self._overrun = 0
+        self._any = False
+        """Something has come in; set behind it, so that none is overlooked."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
+        if not self._any:
+            return NOTHING
+        self._any = False
         arrivals = [one for held in self._arrivals.values() for one in _drained(held, SAMPLES)]
         arrivals.sort(key=lambda one: one.arrived_ns)
         arrivals = _drained(self._stops, STOPS) + arrivals
         asked = _drained(self._services, queries) + _drained(self._slow, 1)
         asked += _drained(self._questions, queries - len(asked))
+        if self._services or self._slow or self._questions:
+            self._any = True  # those wait for the next step
         overrun, self._overrun = self._overrun, 0
         return BusInput(tuple(arrivals), tuple(asked), overrun)
 
@@ -120,11 +127,13 @@ class Inbox:
         if len(held) == held.maxlen:
             self._overrun += 1
         held.append(arrival)
+        self._any = True
         if key != IMU:  # which is for the next line that the wheels send
             self._waker.command()
 
     def _stop(self, arrival: Arrival) -> None:
         self._stops.append(arrival)
+        self._any = True
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
@@ -175,6 +184,7 @@ class Inbox:
                 _bytes(query.attachment, ATTACHMENT_BYTES),
             )
         )
+        self._any = True
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:

@@ -109,6 +109,11 @@ class Outlets:
             self._waiting = False
             self._ring()
 
+    @property
+    def behind(self) -> bool:
+        """There may be something for `losses` to tell."""
+        return self._began_ns is not None or self._stuck or self._dropped > 0
+
     def losses(self, now_ns: int) -> tuple[int, bool]:
         """Messages dropped since the last call, and whether the bus has got stuck meanwhile."""
         dropped, self._dropped = self._dropped, 0

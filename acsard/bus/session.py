@@ -17,7 +17,12 @@ from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period."""
+"""Commands let in per key of each client: enough for a zero 1 ms after a command, too few to cost a
+period."""
+
+DAEMON_RATE_HZ = 4000.0
+"""The same at the daemon, of each neighbour. All who come through the door are one: at the door's
+own rate one of them who sends all he may would leave the others a third of their commands."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
@@ -48,7 +53,7 @@ def daemon_session(
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
     }
-    settings |= _listening() | _limits(robot_id, sources, limited, access)
+    settings |= _listening() | _limits(robot_id, sources, limited, access, DAEMON_RATE_HZ)
     if any(endpoint.startswith(TLS) for endpoint in bus.connect):
         settings |= _tls(bus.tls)
     if bus.connect:
@@ -65,7 +70,7 @@ def door_session(
 ) -> zenoh.Session:
     """The door's session: a router between the network, by TLS, and the daemon on this machine."""
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    settings |= _limits(robot_id, sources, limited, access)
+    settings |= _limits(robot_id, sources, limited, access, COMMAND_RATE_HZ)
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -100,10 +105,14 @@ def _listening() -> dict[str, object]:
 
 
 def _limits(
-    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], access: dict[str, object]
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+    rate_hz: float,
 ) -> dict[str, object]:
-    """Who may do what, and how often."""
-    limits = [_command_limits(robot_id, sources, limited)]
+    """Who may do what, and how often each of them."""
+    limits = [_command_limits(robot_id, sources, limited, rate_hz)]
     return {"access_control": access, "downsampling": limits}
 
 
@@ -178,16 +187,19 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(
-    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], rate_hz: float
 ) -> dict[str, object]:
-    """A limit per listed source, so that none uses up another's; one more for all unlisted."""
+    """A limit per listed source, so that none uses up another's; one more for all unlisted.
+
+    Zenoh counts for each neighbour by itself: who floods a key leaves others theirs.
+    """
     keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
     keys += limited
     return {
         "id": "commands",
         "messages": ["put", "delete"],
         "flows": ["ingress"],
-        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
+        "rules": [{"key_expr": key, "freq": rate_hz} for key in keys],
     }
 
 

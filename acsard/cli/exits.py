@@ -10,6 +10,7 @@ from acsard.host.errors import (
     NoPortError,
     NotPermittedError,
     ReplyError,
+    RouterFileError,
     UnreachableError,
     UsageError,
 )
@@ -24,6 +25,7 @@ CODES: dict[type[MendableError], Exit] = {
     InUseError: Exit.IN_USE,
     NotPermittedError: Exit.NO_PERMISSION,
     CertificateError: Exit.BAD_CONFIG,
+    RouterFileError: Exit.BAD_CONFIG,
 }
 
 

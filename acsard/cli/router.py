@@ -41,8 +41,7 @@ def main(args: argparse.Namespace) -> int:
     router, log = Router(args.file), Log(LogConfig())
     try:
         if not args.held:
-            asyncio.run(_kept(str(args.file), log))
-            return 0
+            return asyncio.run(_kept(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
         return int(Watched(router, log, manager, sys.stdin.fileno()).run())
@@ -50,16 +49,16 @@ def main(args: argparse.Namespace) -> int:
         log.close()
 
 
-async def _kept(file: str, log: Log) -> None:
-    """One router after the other, until a signal."""
+async def _kept(file: str, log: Log) -> int:
+    """One router after the other, until a signal or an end that is final."""
     import signal
 
-    from acsard.runtime.doorkeeper import keep_door
+    from acsard.runtime.doorkeeper import ROUTER, keep_door
 
-    keeper = asyncio.ensure_future(keep_door(["router", file], log.event, "the router"))
+    keeper = asyncio.ensure_future(keep_door(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)
     try:
-        await keeper
+        return await keeper
     except asyncio.CancelledError:
-        pass  # asked to go; the process below has been let go of
+        return 0  # asked to go; the process below has been let go of

@@ -15,7 +15,7 @@ from acsard.bus.access import door_access
 from acsard.bus.certificates import ends_ns, require_usable
 from acsard.bus.session import MAX_SESSIONS, door_session, reachable
 from acsard.config.settings import Config
-from acsard.door.watch import Look, Watch
+from acsard.door.watch import DOOR_EVENTS, Look, Watch
 from acsard.host import clock
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import DoorState
@@ -30,6 +30,7 @@ class Door:
 
     most = MAX_SESSIONS - 1
     """One is the daemon's."""
+    events = DOOR_EVENTS
 
     def __init__(self, config: Config) -> None:
         """Raises `CertificateError` or `NotPermittedError` for certificates it cannot use."""

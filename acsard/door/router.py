@@ -7,21 +7,39 @@ certificate can hold up a router; this one notices, and opens anew within 2 s.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import zenoh
 
 from acsard.bus.session import first_line
-from acsard.door.watch import Look, Watch
+from acsard.door.watch import Events, Look, Watch
 from acsard.host import clock
-from acsard.host.errors import InUseError, UsageError
+from acsard.host.errors import InUseError, RouterFileError
+
+ROUTER_EVENTS: Events = {
+    "open": "router_open",
+    "crowded": "router_crowded",
+    "stuck": "router_stuck",
+}  # it waits for nobody, and is never alone
+
+AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
+"""The part of an endpoint that may be taken, or not there yet."""
 
 
 class Router:
     """What zenohd would open, without its plugins."""
 
+    events = ROUTER_EVENTS
+
     def __init__(self, file: Path) -> None:
-        """Raises `UsageError` for a file that Zenoh does not take."""
+        """Raises `RouterFileError` for a file that Zenoh does not take."""
+        self._file = file
+        try:
+            # Zenoh says only that it could not open it.
+            file.read_bytes()
+        except OSError as error:
+            raise RouterFileError(f"cannot read {file}: {error.strerror}; correct it") from None
         try:
             self._config = zenoh.Config.from_file(str(file))
             mode = json.loads(self._config.get_json("mode"))
@@ -29,14 +47,17 @@ class Router:
             self.most = int(json.loads(self._config.get_json("transport/unicast/max_sessions")))
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
-            raise UsageError(f"{file}: {first_line(error)}") from error
+            raise RouterFileError(
+                f"{file} is no configuration of Zenoh's: {why(error)}; correct it"
+            ) from error
         if isinstance(endpoints, dict):  # by mode, as Zenoh has it of itself: everywhere, in clear
             endpoints = []
         if mode != "router" or not endpoints:
-            raise UsageError(
+            raise RouterFileError(
                 f'{file}: not a router\'s; it needs mode: "router" and listen: {{ endpoints: '
                 '["tls/..."] }'
             )
+        self._endpoints: list[str] = endpoints
         self.where = ", ".join(endpoints)
 
     def ready(self) -> bool:
@@ -44,14 +65,35 @@ class Router:
         return True
 
     def open(self) -> zenoh.Session:
-        """Listen; raises `InUseError`."""
+        """Listen; raises `InUseError` where that may be possible later, else `RouterFileError`."""
         try:
             return zenoh.open(self._config)
         except zenoh.ZError as error:
+            if not self._opens_elsewhere():
+                raise RouterFileError(
+                    f"{self._file} cannot be used: {why(error)}; correct it, or put the files it "
+                    "names in place, ours to read"
+                ) from error
             raise InUseError(
-                f"cannot listen on {self.where}: {first_line(error)}; are the addresses free, and "
-                "the files of transport/link/tls there and ours to read?"
+                f"cannot listen on {self.where}: {why(error)}; are the addresses free, and of "
+                "this machine?"
             ) from error
+
+    def _opens_elsewhere(self) -> bool:
+        """Whether it does on free addresses of this machine: then only its own are the trouble.
+
+        Zenoh's words do not tell those, which may be there later, from the rest of the file.
+        """
+        config = zenoh.Config.from_file(str(self._file))
+        free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
+        config.insert_json5("listen/endpoints", json.dumps(free))
+        config.insert_json5("connect/endpoints", "[]")
+        config.insert_json5("plugins_loading/enabled", "false")
+        try:
+            zenoh.open(config).close()
+        except zenoh.ZError:
+            return False
+        return True
 
     def look(self, session: zenoh.Session) -> Look:
         """Who is connected: all come from outside, and nobody is waited for."""
@@ -60,3 +102,18 @@ class Router:
 
     def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
         """It concerns nobody but the log."""
+
+
+PLACE = re.compile(r"line: (\d+), column: (\d+)|--> (\d+):(\d+)")
+
+
+def why(error: zenoh.ZError) -> str:
+    """What Zenoh says, as part of a sentence, with the place where it tells one."""
+    text = str(error)
+    said = re.search(r'msg: "(.*?)(?:, expected one of .*?)?", location', text)
+    missed = re.search(r"= (expected .*)", text)
+    what = said or missed
+    words = re.sub(r" at /\S+\.rs:\d+\.?", "", what[1]) if what else first_line(error)
+    place = PLACE.search(text)
+    where = f" (line {place[1] or place[3]}, column {place[2] or place[4]})" if place else ""
+    return words.rstrip(".") + where

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Literal
 
 from msgspec import Struct
 
-from acsard.values import NS_PER_S, Event
+from acsard.host.silence import Silence
+from acsard.values import NS_PER_S, Event, EventName
 
 STUCK_NS = NS_PER_S
 """A look at Zenoh takes a millisecond; longer than this, and somebody has taken its time."""
-
-MOMENT_NS = NS_PER_S // 2
-"""More than this between two judgements is a machine, or a quota, that let us stand still."""
 
 FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
 """How long to wait for the daemon: for the first time, while others come in too, and later on."""
@@ -22,6 +21,18 @@ TOLD_EVERY_NS = 60 * NS_PER_S
 
 NAMES = 5
 """Holders of connections that are named, those with most of them."""
+
+What = Literal["open", "crowded", "stuck", "alone"]
+
+Events = dict[What, EventName]
+"""What happens to it, as the log calls that."""
+
+DOOR_EVENTS: Events = {
+    "open": "door_open",
+    "crowded": "door_crowded",
+    "stuck": "door_stuck",
+    "alone": "door_alone",
+}
 
 
 class Look(Struct, frozen=True):
@@ -37,11 +48,11 @@ class Look(Struct, frozen=True):
 class Watch:
     """Judges look after look."""
 
-    def __init__(self, most: int, opened_ns: int) -> None:
+    def __init__(self, most: int, opened_ns: int, events: Events = DOOR_EVENTS) -> None:
         """`most` connections from outside are all there are."""
-        self._most = most
+        self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
-        self._last_ns = self._silent_ns = 0
+        self._last_ns, self._silence = 0, Silence(STUCK_NS)
         self._told_ns: int | None = None
         self.crowded = 0
         """Looks at which all connections were taken."""
@@ -55,19 +66,20 @@ class Watch:
             return None
         self._told_ns = look.at_ns
         text = f"all {self._most} connections are taken, {crowd(look.holders)}"
-        return Event("door_crowded", f"{text}: nobody else is let in", "warning")
+        return Event(self._events["crowded"], f"{text}: nobody else is let in", "warning")
 
     def reopen(self, look: Look, passed_ns: int) -> Event | None:
         """Why the door has to be opened anew, `passed_ns` after the last call; None: it has not."""
         new, self._last_ns = look.at_ns != self._last_ns, look.at_ns
-        self._silent_ns = 0 if new else self._silent_ns + min(passed_ns, MOMENT_NS)
+        stuck = self._silence.too_long(new, passed_ns)
         if look.linked:
             self._linked_ns, self._patience_ns = look.at_ns, ALONE_NS
-        if self._silent_ns > STUCK_NS:
+        if stuck:
             text = "stuck: somebody connected takes all its time; all are sent away"
-            return Event("door_stuck", text, "error")
+            return Event(self._events["stuck"], text, "error")
         if look.at_ns - self._linked_ns > self._patience_ns:
-            return Event("door_alone", "nothing is heard of the daemon any more", "warning")
+            text = "nothing is heard of the daemon any more"
+            return Event(self._events["alone"], text, "warning")
         return None
 
 

@@ -12,12 +12,13 @@ import os
 import resource
 import select
 import signal
+import stat
 import threading
 from typing import Protocol
 
 import zenoh
 
-from acsard.door.watch import Look, Watch
+from acsard.door.watch import Events, Look, Watch
 from acsard.host import clock
 from acsard.host.exits import Exit
 from acsard.host.logs import Log
@@ -41,6 +42,8 @@ class Side(Protocol):
     """Its addresses, in words."""
     most: int
     """Connections from outside, all there are."""
+    events: Events
+    """What the log calls what happens to it."""
 
     def ready(self) -> bool:
         """Whether it is time to let anybody in."""
@@ -59,8 +62,15 @@ class Watched:
     """One life of the process."""
 
     def __init__(self, side: Side, log: Log, manager: Systemd, holder: int | None) -> None:
-        """It ends when the file descriptor `holder` does, if there is one."""
+        """It ends when the file descriptor `holder` does, if there is one.
+
+        A holder that is a socket is told all the time that we are alive.
+        """
         self._side, self._log, self._manager, self._holder = side, log, manager, holder
+        self._beats = False
+        if holder is not None and stat.S_ISSOCK(os.fstat(holder).st_mode):
+            os.set_blocking(holder, False)
+            self._beats = True
         self._session: zenoh.Session | None = None
         """Kept to the end of the process: to close it could take for ever."""
         self._look = Look(0)
@@ -99,6 +109,9 @@ class Watched:
         """A moment; whether it is time to go."""
         self._manager.alive()
         held = [] if self._holder is None else [self._holder]
+        if self._beats and self._holder is not None:
+            with contextlib.suppress(OSError):  # it is full, or gone
+                os.write(self._holder, b".")
         ended, _, _ = select.select(held, [], [], LOOK_S)
         return self._leaving or bool(ended and not os.read(held[0], 64))
 
@@ -106,9 +119,9 @@ class Watched:
         side = self._side
         session = self._session = side.open()
         opened_ns = clock.mono_ns()
-        self._look, watch = Look(opened_ns), Watch(side.most, opened_ns)
+        self._look, watch = Look(opened_ns), Watch(side.most, opened_ns, side.events)
         threading.Thread(target=self._report, args=(session, watch), daemon=True).start()
-        self._log.info("door_open", text=f"listens at {side.where}")
+        self._log.info(side.events["open"], text=f"listens at {side.where}")
         self._manager.status(f"open at {side.where}")
         return watch
 

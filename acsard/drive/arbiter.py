@@ -81,6 +81,8 @@ class _Source:
     def live(self, now_ns: int) -> list[Sender]:
         """The senders that are not silent, first the one that counts: who may drive, came first."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
+        if len(live) < 2:
+            return live
         return sorted(live, key=lambda sender: (sender.state != "free", sender.came_ns))
 
     def latest_ns(self) -> int | None:

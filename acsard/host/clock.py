@@ -7,13 +7,13 @@ that is speed times time, and every delay that a command seems to have had.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 from acsard.values import Instant
 
-
-def mono_ns() -> int:
-    """The monotonic clock alone."""
-    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
+"""The monotonic clock alone. Read a dozen times a period: no Python function around it."""
 
 
 TOGETHER_NS = 50_000

@@ -43,5 +43,9 @@ class NotPermittedError(MendableError, PermissionError):
     """We may not read or open it."""
 
 
+class RouterFileError(MendableError, ValueError):
+    """The file of a router cannot be used."""
+
+
 class CertificateError(MendableError, ValueError):
     """The certificates that the configuration names cannot be used."""

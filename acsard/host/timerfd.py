@@ -34,8 +34,11 @@ class TimerFd:
     """
 
     def __init__(self) -> None:
-        self._libc = ctypes.CDLL(None, use_errno=True)
-        self._fd = self._libc.timerfd_create(CLOCK_MONOTONIC, _FLAGS)
+        libc = ctypes.CDLL(None, use_errno=True)
+        self._spec = _Itimerspec()
+        self._where = ctypes.byref(self._spec)
+        self._settime = libc.timerfd_settime
+        self._fd = libc.timerfd_create(CLOCK_MONOTONIC, _FLAGS)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
 
@@ -46,8 +49,9 @@ class TimerFd:
     def set(self, at_ns: int) -> None:
         """Expire at monotonic `at_ns`, once."""
         wait_ns = max(1, at_ns - clock.mono_ns())
-        spec = _Itimerspec(_Timespec(0, 0), _Timespec(*divmod(wait_ns, NS_PER_S)))
-        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(spec), None) < 0:
+        value = self._spec.it_value
+        value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)
+        if self._settime(self._fd, 0, self._where, None) < 0:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:

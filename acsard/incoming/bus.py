@@ -25,6 +25,10 @@ class BusInput(Struct, frozen=True):
     """The bus has just been found not to take them at all."""
 
 
+NOTHING = BusInput()
+"""What nearly every step hears."""
+
+
 class Waker(Protocol):
     """Whom the bus tells, from whatever thread, that something came in."""
 

@@ -50,14 +50,22 @@ class Codec:
         )
         self._by_letter = {ord(letter): (index, sign) for letter, index, sign in self._wiring}
         self._end = b",\r\n" if trailing_comma else b"\r\n"
-        self.stop = self.encode(STILL)
+        self.stop = self._written(STILL)
         """The line that says zero on all wheels."""
+        self._last = (STILL, self.stop)
 
     def encode(self, speeds: WheelSpeeds) -> bytes:
         """The command line for these speeds, magnitudes clamped to 99.99 and rounded to 0.01.
 
         Raises ValueError for a speed that is not finite: the caller has a bug.
         """
+        last, line = self._last
+        if speeds != last:  # a steady command says the same in each period
+            line = self._written(speeds)
+            self._last = (speeds, line)
+        return line
+
+    def _written(self, speeds: WheelSpeeds) -> bytes:
         wheel = speeds.as_tuple()
         tokens = [_token(letter, sign * wheel[index]) for letter, index, sign in self._wiring]
         return ",".join(tokens).encode() + self._end

@@ -14,7 +14,7 @@ from acsard.config.wire_time import wire_ns
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.asker import asker
-from acsard.incoming.bus import Bus
+from acsard.incoming.bus import NOTHING, Bus
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
@@ -157,6 +157,8 @@ class ControlLoop:
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
+        # Last of all: who sends needs the interpreter, and gets it when the loop waits again.
+        self._bus.flush()
         return outputs
 
     def _from_bus(
@@ -164,6 +166,8 @@ class ControlLoop:
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
         # Before the first step there is nothing to answer with.
         got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        if got is NOTHING:
+            return (), (), ()
         commands, refusals, requests = [], [], []
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
@@ -240,7 +244,6 @@ class ControlLoop:
             bus.publish(key, message)
             if key in FEEDBACK:
                 told_ns = self._mono_ns()
-        bus.flush()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
         for answer in outputs.answers:

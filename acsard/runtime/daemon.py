@@ -126,7 +126,7 @@ async def _run(
                 tasks.create_task(_repeat_latched(bus, control)),
             ]
             if door is not None and config.bus.outside:
-                helpers.append(tasks.create_task(keep_door(door, events.append)))
+                helpers.append(tasks.create_task(_keep_door(door, events.append)))
             await _control(config, control, departure, wake, manager)
             for helper in helpers:
                 helper.cancel()
@@ -186,6 +186,10 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
         yield
     finally:
         task.cancel()
+
+
+async def _keep_door(door: Sequence[str], log: Callable[[Event], None]) -> None:
+    await keep_door(door, log)
 
 
 async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:

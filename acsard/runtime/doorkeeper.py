@@ -1,20 +1,27 @@
 """Keeps the door to the network, or a fleet's router, open: a process of its own, again and again.
 
-As a service the door is a unit of its own (`acsard-door.service`), with limits that only systemd
-can set.
+It says all the time that it is alive; one that does not (stopped, or hung as a whole) is ended. As
+a service the door is a unit of its own (`acsard-door.service`), where systemd does that, with
+limits that only it can set.
 """
 
 from __future__ import annotations
 
 import asyncio
 import os
+import select
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 
+from msgspec import Struct
+
+from acsard.host import clock
 from acsard.host.exits import Exit
+from acsard.host.silence import Silence
 from acsard.host.threads import in_thread
-from acsard.values import Event
+from acsard.values import NS_PER_S, Event, EventName
 
 AGAIN_S = 0.1
 """Before a door is opened anew that had to be."""
@@ -22,21 +29,52 @@ AGAIN_S = 0.1
 LATER_S = 2.0
 """Before one is tried again that could not be opened."""
 
+BEAT_S = 0.5
+"""How often to look whether it has said something; it does so twice in that time."""
 
-async def keep_door(
-    words: Sequence[str], log: Callable[[Event], None], what: str = "the door to the network"
-) -> None:
-    """`acsard` with these words ("door", ...), again whenever it ends, until cancelled."""
+SILENT_NS = 3 * NS_PER_S
+"""It judges itself after a second (`door/watch.py`), and waits for nobody longer than that; this is
+for one that cannot even do that."""
+
+START_NS = 15 * NS_PER_S
+"""How long it may take to say something for the first time: Python's start, on a busy machine."""
+
+
+class Kind(Struct, frozen=True):
+    """What is kept open."""
+
+    name: str
+    ended: EventName
+    final: frozenset[int] = frozenset()
+    """Exit codes after which it is not tried again."""
+
+
+DOOR = Kind("the door to the network", "door_ended")
+"""Tried for ever: the robot drives on, and its files may be mended meanwhile."""
+
+ROUTER = Kind("the router", "router_ended", frozenset({Exit.USAGE, Exit.BAD_CONFIG}))
+
+
+async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Kind = DOOR) -> int:
+    """`acsard` with these words ("door", ...), again whenever it ends, until cancelled.
+
+    Returns an exit code that is final.
+    """
     while True:
         door = _Door(words)
         try:
             code = await in_thread(door.run, None)
-            why = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+            why = door.silent or (
+                f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+            )
         except (OSError, RuntimeError) as error:  # no room for a process, or for a thread
             code, why = Exit.USAGE, f"could not be started ({error})"
+        else:
+            if code in kind.final:
+                return code
         finally:
             door.let_go()
-        log(Event("door_ended", f"{what} {why}; it is opened anew", "warning"))
+        log(Event(kind.ended, f"{kind.name} {why}; it is opened anew", "warning"))
         await asyncio.sleep(AGAIN_S if code <= Exit.FAILURE else LATER_S)
 
 
@@ -46,8 +84,10 @@ class _Door:
     def __init__(self, words: Sequence[str]) -> None:
         # -P: what is installed, and not what lies in the directory that we were started in.
         self._command = [sys.executable, "-P", "-m", "acsard", *words, "--held"]
-        self._process: subprocess.Popen[bytes] | None = None
+        self._ours: socket.socket | None = None
         self._over = False
+        self.silent = ""
+        """Why it was ended, if we did that."""
 
     def run(self) -> int:
         """Start it and wait for its end, in one thread: the process ends with its thread at last.
@@ -56,16 +96,40 @@ class _Door:
         """
         hidden = ("NOTIFY_SOCKET", "INVOCATION_ID")
         env = {key: value for key, value in os.environ.items() if key not in hidden}
-        # A session of its own: what is typed at the terminal is for the daemon, which ends it.
-        self._process = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=2, start_new_session=True, env=env
-        )
-        if self._over:  # let go of while it was started
-            self.let_go()
-        return self._process.wait()
+        ours, its = socket.socketpair()
+        with ours:
+            # A session of its own: what is typed at the terminal is for the daemon, which ends it.
+            with its:
+                process: subprocess.Popen[bytes] = subprocess.Popen(
+                    self._command, stdin=its.fileno(), stdout=2, start_new_session=True, env=env
+                )
+            self._ours = ours
+            if self._over:  # let go of while it was started
+                self.let_go()
+            if self._falls_silent(ours):
+                process.kill()
+            return process.wait()
+
+    def _falls_silent(self, ours: socket.socket) -> bool:
+        """Listen to it; False when it has ended, or been let go of."""
+        silence, before_ns, heard = Silence(START_NS), clock.mono_ns(), False
+        while True:
+            said = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
+            if said == b"":
+                return False
+            if said and not heard:
+                heard, silence = True, Silence(SILENT_NS)
+            now_ns = clock.mono_ns()
+            if silence.too_long(bool(said), now_ns - before_ns):
+                self.silent = "did not say any more that it is alive (stopped, or hung): ended"
+                return True
+            before_ns = now_ns
 
     def let_go(self) -> None:
-        """Close its standard input, which ends it."""
+        """End its standard input, which ends it."""
         self._over = True
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
+        if self._ours is not None:
+            try:
+                self._ours.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass  # it has ended, or nobody holds it any more

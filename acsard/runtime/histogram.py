@@ -19,6 +19,10 @@ LAST = PER_DECADE * DECADES
 """The end bucket."""
 
 
+ENDS = [math.pow(10.0, index / PER_DECADE) for index in range(LAST)]
+"""The upper end of each bucket but the last, which has none."""
+
+
 class Histogram:
     """Counts measurements of one quantity."""
 
@@ -29,8 +33,7 @@ class Histogram:
 
     def add(self, value: float) -> None:
         """Count one measurement."""
-        index = min(LAST, math.ceil(PER_DECADE * math.log10(value))) if value > 1.0 else 0
-        self._buckets[index] += 1
+        self._buckets[bisect_left(ENDS, value)] += 1
         self._count += 1
         if value > self._max:
             self._max = value

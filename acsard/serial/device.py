@@ -26,9 +26,25 @@ DRAIN_STEP_S = 0.001
 """Between two looks at what has not left yet: a tenth of a line's time."""
 
 
+class _Device(serial.Serial):  # type: ignore[misc]
+    """A port that is read when it has something to read, and does not ask once more whether."""
+
+    def read(self, size: int = 1) -> bytes:
+        """What is there, at most `size` bytes; raises `SerialException` when it is lost."""
+        try:
+            data = os.read(self.fd, size)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise serial.SerialException(f"read failed: {error}") from error
+        if not data:
+            raise serial.SerialException("the device has hung up")
+        return data
+
+
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
     """The port opened, locked for us alone, raw, flushed; raises OSError."""
-    device = serial.Serial(baudrate=baud_rate, timeout=0, write_timeout=0, exclusive=True)
+    device = _Device(baudrate=baud_rate, timeout=0, write_timeout=0, exclusive=True)
     device.port = path
     try:
         device.open()

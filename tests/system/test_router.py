@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.network, pytest.mark.timeout(60)]
 def listens(program: Program, times: int = 1) -> None:
     """It has opened so often."""
     until(
-        lambda: sum("door_open" in line for line in list(program.err)) >= times,
+        lambda: sum("router_open" in line for line in list(program.err)) >= times,
         10.0,
         f"the router listens\n{program}",
     )
@@ -50,6 +50,16 @@ def test_one_that_is_killed_is_there_again(where: Path) -> None:
         assert "was ended by signal 9" in router.stderr
 
 
+def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
+    with watched_router(where, free_tls_endpoint()) as router:
+        listens(router)
+        first = the_router(router)
+        os.kill(first, signal.SIGSTOP)
+        listens(router, 2)
+        assert gone(first)
+        assert "stopped, or hung" in router.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
@@ -77,6 +87,14 @@ def test_a_taken_address_is_told_and_tried_again(where: Path) -> None:
 def test_what_is_no_routers_file_is_refused_at_once(tmp_path: Path, text: str) -> None:
     (tmp_path / "zenoh.json5").write_text(text)
     done = finish(acsard("router", "zenoh.json5"), tmp_path)
-    assert done.code == 2
+    assert done.code == 78
     assert "zenoh.json5" in done.err
     assert "Traceback" not in done.err
+
+
+def test_one_that_lacks_its_certificates_ends_with_a_sentence(where: Path) -> None:
+    (where / ITS_NAME / "key.pem").unlink()
+    with watched_router(where, free_tls_endpoint()) as router:
+        assert router.ended(10.0) == 78
+        assert [line for line in router.err if "private key" in line and "in place" in line]
+        assert "door" not in router.stderr

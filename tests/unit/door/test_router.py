@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import pytest
 
 from acsard.door.router import Router
-from acsard.host.errors import UsageError
+from acsard.host.errors import InUseError, RouterFileError
 
 ROUTER_FILE = Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5"
 
@@ -31,19 +32,48 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
         ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
         ('{ mode: "router" }', "needs mode"),  # Zenoh would listen everywhere, in clear
         ('{ mode: "ruter" }', "ruter"),
-        ("{ mode", "router.json5"),
+        (
+            '{ mode: "router",\n\n  rulz: [] }',
+            "field `rulz` (line 3, column 3); correct it",
+        ),
+        ("{ mode", "(line 1, column 1)"),
         ("", "router.json5"),
     ],
 )
 def test_what_is_none_is_refused_with_the_file_and_the_mend(
     tmp_path: Path, text: str, says: str
 ) -> None:
-    with pytest.raises(UsageError) as error:
+    with pytest.raises(RouterFileError) as error:
         Router(written(tmp_path, text))
     assert says in str(error.value)
     assert "router.json5" in str(error.value)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"nowhere\.json5"):
+    with pytest.raises(RouterFileError, match=r"nowhere\.json5"):
         Router(tmp_path / "nowhere.json5")
+
+
+def on(where: Path, endpoint: str) -> Router:
+    alone = "scouting: { multicast: { enabled: false } }"
+    text = f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, {alone} }}'
+    return Router(written(where, text))
+
+
+def test_an_address_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as other,
+        pytest.raises(InUseError, match="are the addresses free"),
+    ):
+        on(tmp_path, f"tcp/127.0.0.1:{other.getsockname()[1]}").open()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "says"),
+    [("tls/127.0.0.1:0", "TLS private key"), ("pigeon/127.0.0.1:0", "pigeon protocol")],
+)
+def test_what_no_address_would_mend_is_the_file_s_fault(
+    tmp_path: Path, endpoint: str, says: str
+) -> None:
+    with pytest.raises(RouterFileError, match=rf"router\.json5 cannot be used: .*{says}"):
+        on(tmp_path, endpoint).open()

@@ -1,0 +1,29 @@
+"""How long somebody has been silent, for one who was there to hear it."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.host.silence import MOMENT_NS, Silence
+
+S = 10**9
+MOST = 3 * S
+
+
+def test_it_is_too_long_when_it_is_longer() -> None:
+    silence = Silence(MOST)
+    assert [silence.too_long(False, MOMENT_NS) for _ in range(7)] == [False] * 6 + [True]
+
+
+def test_who_says_something_has_all_the_time_again() -> None:
+    silence = Silence(MOST)
+    for _ in range(5):
+        assert not any(silence.too_long(False, MOMENT_NS) for _ in range(6))
+        assert not silence.too_long(True, MOMENT_NS)
+
+
+@given(st.lists(st.integers(0, 10**13), max_size=6))
+def test_however_long_the_machine_stands_still_that_is_nobodys_silence(stalls: list[int]) -> None:
+    silence = Silence(MOST)
+    assert not any(silence.too_long(False, stall) for stall in stalls)
