@@ -81,14 +81,14 @@ class Drive:
         return np.diff(self.left) / PERIOD, np.diff(self.right) / PERIOD
 
 
-def late(seed: int, seconds: float, jitter: str) -> Told:
+def late(seed: int, seconds: float, how: str) -> Told:
     """Stamps are when lines were read: through an adapter that holds them, or a busy host."""
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
     true, rng = drive.t[1:], drive.rng
-    if jitter == "batches":
+    if how == "batches":
         at = np.ceil(true / 0.016) * 0.016 + rng.exponential(0.0003, len(true))
-    elif jitter == "stalls":
+    elif how == "stalls":
         at = true.copy()
         for begin in np.arange(1.0, seconds, 3.0) + rng.uniform(
             0, 1.0, len(np.arange(1.0, seconds, 3.0))
@@ -116,7 +116,7 @@ def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
     return drive.told(drive.t[1:], left, right, np.full(len(left), PERIOD))
 
 
-def lost(seed: int, seconds: float, share: float, longest: int, stands: bool) -> Told:
+def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = False) -> Told:
     """So many of the lines do not come, up to `longest` in a row; across a loss the next line's
     speed counts for all of it, or the pose `stands`."""
     drive = Drive(seed, seconds)
