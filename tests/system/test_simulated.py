@@ -75,6 +75,19 @@ def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -
         assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
 
 
+def test_who_sends_beside_the_simulated_gyro_is_refused_counted_and_told(tmp_path: Path) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+
+        def counted() -> bool:
+            bus.put("imu", TURNING)
+            return bus.count("imu_second_sender") > 0
+
+        until(counted, 5.0, "the other one is counted")
+        until(lambda: daemon.events("imu_refused") != [], 5.0, "the log has it")
+
+
 TURNING = {"angular_velocity": {"z": 0.0}}
 
 

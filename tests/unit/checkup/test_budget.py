@@ -7,11 +7,9 @@ from collections.abc import Callable
 from functools import partial
 
 import pytest
-from msgspec.structs import replace
 
 from acsard.checkup.budget import Budget, Cause, Heard, Share, budget
-from acsard.checkup.drive_log import Line
-from acsard.config.settings import Config, McuConfig, OdometryConfig
+from acsard.config.settings import Config
 from tests.unit.checkup import drives
 from tests.unit.checkup.drives import Told
 
