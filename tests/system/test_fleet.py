@@ -183,6 +183,8 @@ class Fleet:
         certified(where, "robot1", *NAMES)
         self._stack = ExitStack()
         self._fooled = threading.Event()
+        self.sensed = threading.Event()
+        """Something came on a robot's `imu`, as a gyro's driver beside it would hear it."""
 
     def __enter__(self) -> Fleet:
         enter = self._stack.enter_context
@@ -198,6 +200,13 @@ class Fleet:
             below = (*VALUES, *(f"cmd/{source}" for source in SOURCES))
             keys = [f"{root}/{key}" for root in (ONE, TWO) for key in below]
             self._watched = [witness.declare_subscriber(key, self._judge) for key in keys]
+            for name in ("robot1", "robot2"):
+                itself = enter(self.member(name, name))
+                self._watched.append(
+                    itself.session.declare_subscriber(
+                        f"acsard/{name}/imu", lambda _: self.sensed.set()
+                    )
+                )
         except BaseException:
             self.__exit__()
             raise
@@ -299,9 +308,10 @@ class Visitor:
 
         def obeyed() -> bool:
             stopped = any(robot.state()["mode"] == "stopped" for robot in fleet.robots)
-            return stopped or commands() != before
+            return stopped or commands() != before or fleet.sensed.is_set()
 
         before = commands()
+        fleet.sensed.clear()
         for row in rows:
             if verb == "put":
                 self._session.put(row.key, row.payload)
