@@ -7,6 +7,7 @@ certificate can hold up a router; this one notices, and opens anew within 2 s.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import zenoh
@@ -15,6 +16,22 @@ from acsard.bus.session import first_line
 from acsard.door.watch import Look, Watch
 from acsard.host import clock
 from acsard.host.errors import InUseError, UsageError
+
+_KNOWN = re.compile(
+    r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
+)
+_GRAMMAR = re.compile(r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S)
+
+
+def unread(error: Exception) -> str:
+    """What Zenoh has to say of a configuration that it cannot read, whole, and where."""
+    text = str(error)
+    if match := _KNOWN.search(text):
+        message = re.sub(r"\\(.)", r"\1", match[1])
+        return f"line {match[2]}, column {match[3]}: {message}"
+    if match := _GRAMMAR.search(text):
+        return f"line {match[1]}, column {match[2]}: {match[3]}"
+    return first_line(error)
 
 
 class Router:
@@ -29,7 +46,7 @@ class Router:
             self.most = int(json.loads(self._config.get_json("transport/unicast/max_sessions")))
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
-            raise UsageError(f"{file}: {first_line(error)}") from error
+            raise UsageError(f"{file}: {unread(error)}") from error
         if isinstance(endpoints, dict):  # by mode, as Zenoh has it of itself: everywhere, in clear
             endpoints = []
         if mode != "router" or not endpoints:
