@@ -80,10 +80,10 @@ def clocks(its_ns: int, ours_ns: int, counters: Mapping[str, int]) -> Iterator[F
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     """What does the gyro do, as `state` has it, and are its samples taken?"""
-    words: Mapping[str, str] = WORDS
+    words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = GYRO_MENDS.get(does, "is the daemon of another version?")
-        yield Finding("gyro", "warning" if mend else "ok", words.get(does, does), mend)
+        yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
     if refused:
         most = sorted(refused.items(), key=lambda one: -one[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 from rich.text import Text
 
@@ -144,9 +143,8 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
 
 def _gyro(does: str) -> Text:
     """What the gyro does for the heading."""
-    words: Mapping[str, str] = WORDS
     good = does in ("used", "waiting for rest")
-    told = f"{clean(does)}: {words[does]}" if does in words else clean(does)
+    told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
     return row("gyro", told, "" if good else "yellow")
 
 
