@@ -7,9 +7,11 @@ from collections.abc import Callable
 from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.checkup.budget import Budget, Cause, Heard, Share, budget
-from acsard.config.settings import Config
+from acsard.checkup.drive_log import Line
+from acsard.config.settings import Config, McuConfig, OdometryConfig
 from tests.unit.checkup import drives
 from tests.unit.checkup.drives import Told
 
@@ -106,7 +108,7 @@ def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
     found = budget(Heard(lines, [], gyro=True), CONFIG)
     for cause in ("time", "quantisation", "gaps", "slip"):
-        assert share(found, cause).deg_per_turn == 0.0  # type: ignore[arg-type]
+        assert share(found, cause).deg_per_turn == 0.0
     turns = found.turned / 360
     grown = math.degrees(math.sqrt(lines[-1].yaw_variance / turns))
     assert share(found, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from acsard.checkup.drive_log import motion
-from acsard.checkup.error_steps import Driving, Step, Stood, mirrored
+from acsard.checkup.drive_log import Stood, motion
+from acsard.checkup.error_steps import Driving, Step, mirrored
 from acsard.checkup.rounding import rounding
 from acsard.config.settings import DriveConfig
 from acsard.drive.kinematics import Kinematics

@@ -9,7 +9,7 @@ from acsard.checkup.line_times import places
 
 PERIOD = 0.01
 NONE = np.zeros(0)
-EVEN = np.arange(600) * PERIOD
+EVEN = np.asarray(np.arange(600) * PERIOD, dtype=np.float64)
 
 
 def test_even_lines_are_in_their_places() -> None:
@@ -21,7 +21,8 @@ def test_even_lines_are_in_their_places() -> None:
 
 @pytest.mark.parametrize("period", [0.00997, 0.01, 0.0102, 0.05])
 def test_the_period_need_not_be_known(period: float) -> None:
-    assert places(np.arange(400) * period, NONE).period == pytest.approx(period, rel=1e-6)
+    t = np.asarray(np.arange(400) * period, dtype=np.float64)
+    assert places(t, NONE).period == pytest.approx(period, rel=1e-6)
 
 
 def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:

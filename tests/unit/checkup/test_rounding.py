@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from acsard.checkup.rounding import rounding
+from acsard.checkup.rounding import Floats, rounding
 
 PERIOD, COUNT = 0.01, 4000
 
 
-def four(*columns: object) -> np.ndarray:  # type: ignore[type-arg]
+def four(*columns: Floats) -> Floats:
     return np.column_stack(columns)
 
 
@@ -62,5 +62,5 @@ def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int
 @pytest.mark.parametrize("seed", range(20))
 def test_a_firmware_that_filters_is_not_taken_for_one_that_counts(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    said = np.round(np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0), 2)
+    said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
     assert rounding(said, PERIOD).count == 0.0
