@@ -142,7 +142,10 @@ class Client:
         return Pose(state.x, state.y, state.yaw)
 
     def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
-        """The typed messages of a published key as they come; ends after `timeout` s of silence."""
+        """The typed messages of a published key as they come.
+
+        Ends after `timeout` s of silence, and when the connection is closed.
+        """
         decoder = _decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
             yield decoder.decode(*encoded(sample))
@@ -250,7 +253,10 @@ class AsyncClient:
         subscriber = self._client.subscribe(name)
         try:
             while True:
-                sample = subscriber.try_recv()
+                try:
+                    sample = subscriber.try_recv()
+                except zenoh.ZError:
+                    return  # the connection was closed
                 if sample is None:
                     await asyncio.sleep(0.001)
                     continue

@@ -96,6 +96,7 @@ class Robot:
         session = self.session
         counters = {"lines": session.good_lines}
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
+        counters |= self._odometry.missed()
         return Snapshot(
             pose=self._odometry.pose,
             measured=self._odometry.twist,

@@ -124,7 +124,7 @@ def calls(command: str) -> Iterator[list[str]]:
         if one[:2] == ["sh", "-c"]:
             yield from calls(one[2])
         elif Path(one[0]).name == "acsard":
-            yield one[1:]
+            yield one[1 : one.index(">") if ">" in one else None]
 
 
 @pytest.mark.parametrize("command", [text for text in COMMANDS if "acsard" in text])

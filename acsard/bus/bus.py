@@ -21,10 +21,12 @@ from acsard.host import clock
 from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
 from acsard.incoming.bus import BusInput, Waker
+from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
-from acsard.messages.topics import Topic, full_key
+from acsard.messages.signature import Signature
+from acsard.messages.topics import IMU, Topic, full_key
 from acsard.ros.tokens import gid
 from acsard.ros.transports import Endpoint, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
@@ -135,7 +137,10 @@ class ZenohBus:
                 self._kept.append(session.declare_queryable(key, on_query))
         for topic in self._published:
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
-            self._outlets.declare(session, topic.key, key, "msgpack", encoding, topic.latched)
+            signed = Signature(OWN).pack() if topic.key == IMU else b""
+            self._outlets.declare(
+                session, topic.key, key, "msgpack", encoding, topic.latched, signed=signed
+            )
 
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key

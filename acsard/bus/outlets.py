@@ -47,14 +47,15 @@ def direct(callback: Callable[[Any], None]) -> Any:
 
 
 class _Outlet:
-    def __init__(self, publisher: Any, form: Format, gid: bytes) -> None:
+    def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
         self.wanted = False
         self._gid, self._sequence = gid, 0
+        self._signed = {"attachment": signed} if signed else {}
 
     def put(self, payload: bytes) -> None:
         if not self._gid:
-            self.publisher.put(payload)
+            self.publisher.put(payload, **self._signed)
             return
         self._sequence += 1
         attachment = Attachment(self._sequence, clock.now().wall_ns, self._gid)
@@ -169,8 +170,12 @@ class Outlets:
         encoding: str,
         latched: bool = False,
         gid: bytes = b"",
+        signed: bytes = b"",
     ) -> None:
-        """Open `key` for a topic; with a `gid` its samples carry rmw_zenoh's attachment."""
+        """Open `key` for a topic; with a `gid` its samples carry rmw_zenoh's attachment.
+
+        Without, they carry what they are `signed` with.
+        """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
                 session,
@@ -184,7 +189,7 @@ class Outlets:
         else:
             publisher = session.declare_publisher(key, encoding=encoding, **OPTIONS)
         self._slots.setdefault(topic, deque(maxlen=HELD))
-        outlet = _Outlet(publisher, form, gid)
+        outlet = _Outlet(publisher, form, gid, signed)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:
             self._count(outlet, wanted=True)  # it is kept for those who are still to come

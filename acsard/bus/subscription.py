@@ -32,11 +32,14 @@ class Subscription:
         return None
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """What comes, until nothing has for `timeout` s; then it is undeclared."""
+        """What comes, until nothing has for `timeout` s or the session is closed."""
         quiet_since_ns = clock.mono_ns()
         try:
             while timeout is None or clock.mono_ns() - quiet_since_ns < timeout * NS_PER_S:
-                sample = self.try_recv()
+                try:
+                    sample = self.try_recv()
+                except zenoh.ZError:
+                    return
                 if sample is None:
                     time.sleep(0.001)
                     continue
@@ -47,7 +50,10 @@ class Subscription:
 
     def undeclare(self) -> None:
         """No more of them."""
-        self._queue.undeclare()
+        try:
+            self._queue.undeclare()
+        except zenoh.ZError:
+            pass  # with its session closed it is no more already
 
 
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:

@@ -199,12 +199,17 @@ def rows(
     if not found:
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
     block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
-    if headings is not None and headings.drifts:
-        # What one bias for all would explain is taken out of every column alike.
-        seconds = columns[-1]
-        share = seconds / float(seconds @ seconds)
-        columns[:-1] = [column - seconds * float(share @ column) for column in columns[:-1]]
     return Rows(block.astype(np.int64), *columns)
+
+
+def level(rows: Rows) -> Rows:
+    """What one bias for all would explain is taken out of every column alike: for the fit."""
+    share = rows.seconds / float(rows.seconds @ rows.seconds)
+    turned, left, right, fast = (
+        column - rows.seconds * float(share @ column)
+        for column in (rows.turned, rows.left, rows.right, rows.fast)
+    )
+    return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
 def _fast(run: Run) -> Floats:

@@ -35,6 +35,7 @@ class Prepared(Struct, frozen=True):
 
     parts: list[Block]
     rows: Rows
+    """As they are: of a gyro whose bias was not seen at rest with that in them."""
     spots: list[Spots]
     grids: list[Grid]
     sources: list[Source]
@@ -49,7 +50,9 @@ def prepared(
     parts = blocks(driven, angles, length)
     drives_enough(parts)
     count, start = len(parts), base.start()
-    rows = heading.rows(headings, driven, angles, parts)
+    every = rows = heading.rows(headings, driven, angles, parts)
+    if headings is not None and headings.drifts and len(every.turned):
+        rows = heading.level(every)
     rolls_enough(rows)
     spots = places.spots(driven, angles, parts)
     grids = [places.grid(*pair) for pair in zip(driven, angles, strict=True)] if spots else []
@@ -78,7 +81,7 @@ def prepared(
         start[[LEFT, RIGHT]] = size * sides / mean
         start[TURN] = mean / size
     _units(headings, start, base, begun is not None)
-    return Prepared(parts, rows, spots, grids, sources, start)
+    return Prepared(parts, every, spots, grids, sources, start)
 
 
 def _units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.calibration import fit as fitting
 from acsard.calibration import heading, places, turning
@@ -113,6 +114,10 @@ def _calibration(
         raise RefusedError(f"the search for the parameters does not settle: {DRIVE}")
     told_apart(fitted.apart())
     by_wheels = turning.turned(rows, base, fitted.parameters)
+    bias = headings.bias if headings is not None else 0.0
+    if headings is not None and headings.drifts:
+        bias = turning.bias(rows, by_wheels)
+        rows = replace(rows, turned=rows.turned - bias * rows.seconds)
     rate, truth = rates(rows, by_wheels), rows.turned
     if headings is None:
         turns_enough(by_wheels)
@@ -137,7 +142,6 @@ def _calibration(
         size * float(np.abs(rows.left + rows.right).sum()) / 2,
         float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
     )  # fmt: skip
-    bias = headings.bias if headings is not None else 0.0
     notes += _cuts(log.runs, angles)
     notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))
     return Calibration(

@@ -51,6 +51,17 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
 
 
+def bias(rows: Rows, by_wheels: Floats) -> float:
+    """rad/s that the sensor says more than the wheels, by least squares without outliers."""
+    seconds, found = rows.seconds, 0.0
+    for _ in range(10):
+        off = rows.turned - by_wheels
+        usual = np.hypot(NOISE * seconds, SHARE * by_wheels)
+        weight = huber((off - found * seconds) / usual, 1.0)
+        found = float((weight * seconds) @ off / ((weight * seconds) @ seconds))
+    return found
+
+
 def first(rows: Rows, base: Base) -> Floats:
     """g_l and g_r over the gain of parameters that are all 1: by least squares, whatever sign."""
     columns = base.gain * np.column_stack((-rows.left, rows.right))

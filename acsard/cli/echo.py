@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, count, robot_address
+from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.client import Client
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -13,9 +18,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "echo",
         help="print the messages on a key as JSON lines",
         description="Print each message on a key as one line of JSON, until Ctrl-C. Any key "
-        "below the robot's id works, also `cmd/teleop`.",
+        "below the robot's id works, also `cmd/teleop`. With --csv wheels, gyro and place as one "
+        "file that `acsard calibrate --log` reads: acsard echo wheel_states imu --csv > drive.csv",
     )
-    parser.add_argument("topic", help="for example odom, state, wheel_states, cmd/teleop")
+    parser.add_argument(
+        "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
+    )
+    parser.add_argument(
+        "--csv",
+        action="store_true",
+        help="print rows of a log: of wheel_states, imu, sim/pose or several of them",
+    )
     parser.add_argument("-n", type=count, metavar="N", help="end after N messages")
     parser.add_argument(
         "--timeout", type=float, metavar="S", help="end after S seconds of silence, with exit 1"
@@ -30,11 +43,16 @@ def main(args: argparse.Namespace) -> int:
     from acsard.client import connect
 
     endpoint, robot_id, tls = robot_address(args)
-    left = args.n
-    _hint(args.topic)
+    if args.csv:
+        with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+            return _record(robot, args.topic, args.n, args.timeout)
+    if len(args.topic) > 1:
+        raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
+    left, topic = args.n, args.topic[0]
+    _hint(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         try:
-            for sample in robot.samples(args.topic, args.timeout):
+            for sample in robot.samples(topic, args.timeout):
                 print(json_line(*encoded(sample)), flush=True)
                 left = None if left is None else left - 1
                 if left == 0:
@@ -42,6 +60,39 @@ def main(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             return 0
     return 1
+
+
+def _record(robot: Client, keys: list[str], most: int | None, timeout: float | None) -> int:
+    """Rows of all keys as they come, until Ctrl-C, so many, or a silence."""
+    import time
+
+    from acsard.bus.subscription import encoded
+    from acsard.calibration.recorded import HEADER, KEYS, row
+    from acsard.host import clock
+    from acsard.messages.encodings import Decoder
+    from acsard.messages.schema import MESSAGES
+    from acsard.messages.topics import by_key
+
+    queues = []
+    for key in keys:
+        topic = by_key(key)
+        if key not in KEYS or topic is None:
+            raise ExitError(Exit.USAGE, f"{key} is no part of a log; --csv takes {', '.join(KEYS)}")
+        queues.append((robot.subscribe(key), Decoder(MESSAGES[topic.type])))
+    print(HEADER, flush=True)
+    count, heard = 0, time.monotonic()
+    try:
+        while most is None or count < most:
+            if timeout is not None and time.monotonic() - heard > timeout:
+                return int(Exit.FAILURE)
+            for queue, decoder in queues:
+                while (sample := queue.try_recv()) is not None and count != most:
+                    print(row(decoder.decode(*encoded(sample)), clock.now().wall_ns))
+                    count, heard = count + 1, time.monotonic()
+            time.sleep(0.02)
+    except KeyboardInterrupt:
+        pass
+    return int(Exit.OK)
 
 
 def _hint(topic: str) -> None:

@@ -10,11 +10,21 @@ from acsard.bus.session import reachable
 from acsard.client import connect
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding, Level
+from acsard.drive.gyro import WORDS
 from acsard.host import clock
 from acsard.values import NS_PER_S, AcsardError
 
 APART_S = 0.4
 """From 0.5 s on Zenoh replaces the stamps of the one that is ahead."""
+
+GYRO_MENDS = {
+    "used": "",
+    "waiting for rest": "",
+    "silent": "is its driver running, and does it send to the key imu (ROS: imu/data)?",
+    "disagrees": "slower turns, other ground; if it stays so: its z must point up, in rad/s",
+    "not believed": "its z must point up, in rad/s; then `acsard calibrate` finds the track",
+}
+"""By what `state` says of the gyro; nothing where all is well."""
 
 SIGN = "commands signed as the README says need no common clock"
 
@@ -45,6 +55,7 @@ def daemon(config: Config) -> Iterator[Finding]:
     mend = "see the reason; `acsard call clear` releases it" if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
+    yield from gyro(state.gyro, state.counters)
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"
         yield Finding("door", "warning", text, "take his certificate from [access], or his program")
@@ -65,6 +76,20 @@ def clocks(its_ns: int, ours_ns: int, counters: Mapping[str, int]) -> Iterator[F
     if replaced:
         text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
         yield Finding("clock", "warning", text, f"let NTP set both clocks; {SIGN}")
+
+
+def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
+    """What does the gyro do, as `state` has it, and are its samples taken?"""
+    words = next((text for name, text in WORDS.items() if name == does), does)
+    if does != "off":
+        mend = GYRO_MENDS.get(does, "is the daemon of another version?")
+        yield Finding("gyro", "warning" if mend else "ok", words, mend)
+    refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
+    if refused:
+        most = sorted(refused.items(), key=lambda one: -one[1])
+        told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
+        mend = "the log says by whom (imu_refused); one gyro, rad/s, z up, finite values"
+        yield Finding("gyro", "warning", f"samples on imu that did not count: {told}", mend)
 
 
 def door(config: Config) -> Iterator[Finding]:

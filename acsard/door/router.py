@@ -26,6 +26,22 @@ ROUTER_EVENTS: Events = {
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
 """The part of an endpoint that may be taken, or not there yet."""
 
+_KNOWN = re.compile(
+    r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
+)
+_GRAMMAR = re.compile(r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S)
+
+
+def why(error: zenoh.ZError) -> str:
+    """What Zenoh has to say of a configuration that it cannot use, whole, and where."""
+    text = str(error)
+    if match := _KNOWN.search(text):
+        message = re.sub(r"\\(.)", r"\1", match[1])
+        return f"line {match[2]}, column {match[3]}: {message}"
+    if match := _GRAMMAR.search(text):
+        return f"line {match[1]}, column {match[2]}: {match[3]}"
+    return first_line(error)
+
 
 class Router:
     """What zenohd would open, without its plugins."""
@@ -102,18 +118,3 @@ class Router:
 
     def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
         """It concerns nobody but the log."""
-
-
-PLACE = re.compile(r"line: (\d+), column: (\d+)|--> (\d+):(\d+)")
-
-
-def why(error: zenoh.ZError) -> str:
-    """What Zenoh says, as part of a sentence, with the place where it tells one."""
-    text = str(error)
-    said = re.search(r'msg: "(.*?)(?:, expected one of .*?)?", location', text)
-    missed = re.search(r"= (expected .*)", text)
-    what = said or missed
-    words = re.sub(r" at /\S+\.rs:\d+\.?", "", what[1]) if what else first_line(error)
-    place = PLACE.search(text)
-    where = f" (line {place[1] or place[3]}, column {place[2] or place[4]})" if place else ""
-    return words.rstrip(".") + where

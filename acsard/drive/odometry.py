@@ -58,6 +58,8 @@ class Odometry:
         """Twist of the last feedback."""
         self.speeds = STILL
         """Wheel speeds of the last feedback."""
+        self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
+        """Gaps in which it drove and the pose stood, s of them, and s that were bridged."""
         self.travelled = 0.0
         """m since the start, forwards and backwards."""
 
@@ -70,6 +72,11 @@ class Odometry:
     def pose(self) -> Pose:
         """Pose of base_link in odom now."""
         return self._path.pose
+
+    def missed(self) -> dict[str, int]:
+        """What no line told, as counters: those that are 0 are left out."""
+        ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
+        return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
         """Pass over a line that cannot be true: what it should have told is left to the next one.
@@ -108,6 +115,7 @@ class Odometry:
         self._lost_turned = turned
         self._move((rolled, _times(speeds.as_tuple(), moved_dt)), gyro)
         if bridged > 0.0:
+            self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
         elif feedback.gap:
             self._gaps.interrupt(twist)
@@ -153,6 +161,9 @@ class Odometry:
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
         """What the robot did in so many seconds between two twists is unknown: it has not moved."""
+        if before != REST or after != REST:
+            self.gaps += 1
+            self.unseen += seconds
         self._uncertainty.stand(
             seconds * (before.linear + after.linear) / 2,
             seconds * (before.angular + after.angular) / 2,

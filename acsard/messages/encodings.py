@@ -7,6 +7,7 @@ and nothing else.
 
 from __future__ import annotations
 
+import re
 from typing import Generic, Literal, TypeVar
 
 import msgspec
@@ -34,6 +35,9 @@ class DecodeError(AcsardError):
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
         self.reason = reason
+
+
+_AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
@@ -96,7 +100,20 @@ class Decoder(Generic[T]):
         except msgspec.ValidationError as error:
             raise DecodeError("wrong_shape", str(error)) from None
         except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
-            raise DecodeError("malformed", str(error)) from None
+            words = _where(str(error), payload) if form == "json" else str(error)
+            raise DecodeError("malformed", words) from None
+
+
+def _where(words: str, payload: bytes) -> str:
+    """msgspec's words for what is no JSON, with line and column for the byte in them."""
+    match = _AT_BYTE.fullmatch(words)
+    if match is None:
+        return words
+    before, what = payload[: int(match[2])], match[1]
+    if payload[len(before) :].lower().startswith((b"nan", b"inf")):
+        what, before = "JSON has no NaN and no infinity", before.removesuffix(b"-")
+    line = before.rpartition(b"\n")[2].decode(errors="replace")
+    return f"line {before.count(10) + 1}, column {len(line) + 1}: {what}"
 
 
 def decode_cdr(cls: type[T], payload: bytes) -> T:

@@ -89,7 +89,7 @@ class ControlLoop:
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._door, self._imu = DoorTold(), ImuTold()
+        self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
         self._turn_rates: list[GyroSample] = []
         """What a gyro said since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns

@@ -15,6 +15,7 @@ from acsard.messages.topics import IMU
 from acsard.serial.sim_pty import SimPty
 from acsard.sim.told import true_pose, turn_rate
 from acsard.sim.watched import Sight, WatchedMcu
+from acsard.values import NS_PER_S
 
 POSE = "sim/pose"
 
@@ -26,6 +27,7 @@ class Simulated:
         self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
         self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
         self._gyro = config.odometry.gyro
+        self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
         self._bus: Bus | None = None
         self._last: tuple[Sight, int] | None = None
 
@@ -63,5 +65,6 @@ class Simulated:
         if POSE in bus.wanted:
             bus.publish(POSE, true_pose(sight, wall_ns))
         if self._gyro:  # heard by our own subscriber too, as a gyro on the robot would be
-            bus.publish(IMU, turn_rate(sight, self._frame, self._noise))
+            measured_ns = wall_ns - self._delay_ns
+            bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))
         bus.flush()

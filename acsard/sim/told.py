@@ -17,12 +17,10 @@ def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
 
 
-def turn_rate(sight: Sight, frame: str, deviation: float) -> Imu:
-    """What the gyro says, with the standard deviation of its noise, rad/s.
-
-    It has no clock of its own: the message has no stamp, and counts when it comes.
-    """
+def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
+    """What the gyro measured until `wall_ns`, with the standard deviation of its noise, rad/s."""
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]
     rate = Vector3(z=sight.gyro)
-    return Imu(Header(Time(), frame), Quaternion(), unknown, rate, known, Vector3(), unknown)
+    header = Header(Time.from_ns(wall_ns), frame)
+    return Imu(header, Quaternion(), unknown, rate, known, Vector3(), unknown)

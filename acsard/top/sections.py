@@ -6,6 +6,7 @@ import math
 
 from rich.text import Text
 
+from acsard.drive.gyro import WORDS
 from acsard.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.runtime.figures import NAMES
 from acsard.top.seen import Seen
@@ -134,8 +135,17 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
     ]
     if overrun:
         lines[-1].append(f"  bus overrun {count(overrun)}", "yellow")
+    if state.gyro != "off":
+        lines.append(_gyro(state.gyro))
     lines += _refusals(state, before)
     return lines
+
+
+def _gyro(does: str) -> Text:
+    """What the gyro does for the heading."""
+    good = does in ("used", "waiting for rest")
+    told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
+    return row("gyro", told, "" if good else "yellow")
 
 
 def _port(info: Info) -> str:
@@ -153,7 +163,7 @@ def _missed(state: RobotState, before: RobotState) -> Text:
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
     """What was rejected, by reason, what grows in yellow; and the last refusal in words."""
     kinds = []
-    for kind, prefix in (("lines", "line_"), ("commands", "command_")):
+    for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
         found.sort(key=lambda one: -one[1])
         parts = []

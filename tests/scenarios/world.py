@@ -14,11 +14,13 @@ import msgspec
 from acsard.config.settings import Config
 from acsard.incoming.bus import BusInput
 from acsard.incoming.commands import Arrival
+from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
 from acsard.mcu.port import Gate, Offered
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
+from acsard.messages.signature import Signature
 from acsard.messages.topics import PUBLISHED
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.period import NO_PERIOD, Period
@@ -167,10 +169,11 @@ class World:
     def _see(self, sight: Sight) -> None:
         self.truth = sight.pose
         if not self.gyro_dead:
-            said = turn_rate(sight, "base_link", self.config.sim.gyro_noise)
-            payload = encode(said, "msgpack")
+            wall_ns = sight.at_ns + self.wall_offset_ns - int(self.config.sim.gyro_delay * NS_PER_S)
+            said = turn_rate(sight, "base_link", self.config.sim.gyro_noise, wall_ns)
+            payload, signed = encode(said, "msgpack"), Signature(OWN).pack()
             self.bus.arrivals.append(
-                Arrival("imu", True, payload, "", sight.at_ns, None, "", "native")
+                Arrival("imu", True, payload, "", sight.at_ns, None, "", "native", signed)
             )
 
     @property

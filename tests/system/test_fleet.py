@@ -65,6 +65,7 @@ ONE, TWO = "acsard/robot1", "acsard/robot2"
 TWIST = json.dumps(ZERO).encode()
 WHEELS = json.dumps({"name": astuple(Config().joints), "velocity": [0.0] * 4}).encode()
 POSE = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
+TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
 VALUES = tuple(topic.key for topic in PUBLISHED)
@@ -92,6 +93,8 @@ def _puts() -> Iterator[Try]:
         yield Try(f"{ONE}/cmd/{source}", DRIVERS, TWIST)
     yield Try(f"{ONE}/wheel_cmd/ros2_control", DRIVERS, WHEELS)
     yield Try(f"{TWO}/cmd/app", DRIVERS | ITSELF, TWIST)
+    yield Try(f"{ONE}/imu", KEEPERS, TURNING)
+    yield Try(f"{TWO}/imu", KEEPERS | ITSELF, TURNING)
     yield Try(f"{ONE}/stop", ANYBODY)
     yield Try(f"{TWO}/stop", ANYBODY | ITSELF)
     for key in ("cmd/ghost", "cmd/*", "cmd/**", "wheel_cmd/*", "*/app", "sto$*", "*", "**"):
@@ -180,6 +183,8 @@ class Fleet:
         certified(where, "robot1", *NAMES)
         self._stack = ExitStack()
         self._fooled = threading.Event()
+        self.sensed = threading.Event()
+        """Something came on a robot's `imu`, as a gyro's driver beside it would hear it."""
 
     def __enter__(self) -> Fleet:
         enter = self._stack.enter_context
@@ -195,6 +200,13 @@ class Fleet:
             below = (*VALUES, *(f"cmd/{source}" for source in SOURCES))
             keys = [f"{root}/{key}" for root in (ONE, TWO) for key in below]
             self._watched = [witness.declare_subscriber(key, self._judge) for key in keys]
+            for name in ("robot1", "robot2"):
+                itself = enter(self.member(name, name))
+                self._watched.append(
+                    itself.session.declare_subscriber(
+                        f"acsard/{name}/imu", lambda _: self.sensed.set()
+                    )
+                )
         except BaseException:
             self.__exit__()
             raise
@@ -296,9 +308,10 @@ class Visitor:
 
         def obeyed() -> bool:
             stopped = any(robot.state()["mode"] == "stopped" for robot in fleet.robots)
-            return stopped or commands() != before
+            return stopped or commands() != before or fleet.sensed.is_set()
 
         before = commands()
+        fleet.sensed.clear()
         for row in rows:
             if verb == "put":
                 self._session.put(row.key, row.payload)
@@ -489,11 +502,11 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
     for robot in ("robot1", "robot2"):
         found = {
             kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
-            for kind in ("see", "stop", "drive", "keep")
+            for kind in ("see", "stop", "drive", "keep", "sense")
         }
         assert found["see"] | found["keep"] >= published | asked | {"alive"}
         assert set().union(*found.values()) == (
-            published | asked | services | commands | {"alive", "stop"}
+            published | asked | services | commands | {"alive", "stop", "imu"}
         )
         assert found["drive"] >= commands
         assert not found["see"] & (commands | services - {"srv/stop"})

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 
+from acsard.calibration.runs import runs
+from acsard.calibration.table import read
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.ros.attachments import Attachment
 from acsard.ros.names import rmw_key
-from tests.system.harness import Bus, Daemon, Peer, seconds, until
+from tests.system.harness import Bus, Daemon, Peer, acsard, finish, seconds, until
 
 SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 
@@ -75,6 +77,34 @@ def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -
         believed = yaw(bus.get("odom")["pose"]["pose"])
         assert yaw(bus.get("sim/pose")["pose"]) == pytest.approx(believed, rel=0.03)
         assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
+
+
+def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        words = ("echo", "wheel_states", "imu", "--csv", "-n", "300")
+        ended = finish(acsard(*words, "--config", str(daemon.config)), tmp_path)
+        assert ended.code == 0, ended
+        (run,) = runs(read(ended.out.encode())).runs
+        assert min(len(run.t), len(run.gyro)) > 100
+        # A robot that stood all the time tells nothing, in words of the calibration's own.
+        (tmp_path / "drive.csv").write_text(ended.out)
+        told = finish(acsard("calibrate", "--log", "drive.csv"), tmp_path)
+        assert (told.code, "drive.csv: " in told.err) == (1, True)
+
+
+def test_who_sends_beside_the_simulated_gyro_is_refused_counted_and_told(tmp_path: Path) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+
+        def counted() -> bool:
+            bus.put("imu", TURNING)
+            return bus.count("imu_second_sender") > 0
+
+        until(counted, 5.0, "the other one is counted")
+        until(lambda: daemon.events("imu_refused") != [], 5.0, "the log has it")
 
 
 TURNING = {"angular_velocity": {"z": 0.0}}

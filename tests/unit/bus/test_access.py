@@ -181,9 +181,10 @@ def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:
         assert not any(DEFAULT.lets(role, "put", key) for role in ROLES)
 
 
-def test_nobody_speaks_in_the_simulated_gyros_place_and_everybody_may_follow_it() -> None:
+def test_beside_the_simulated_gyro_only_who_is_at_the_machine_is_heard_and_all_may_follow_it(
+) -> None:  # fmt: skip
     simulated = Access(odometry=GYRO)
-    assert simulated.who("put", simulated.key("imu")) == set()
+    assert simulated.who("put", simulated.key("imu")) == {"local"}  # to be refused, and told
     assert simulated.who("declare_subscriber", simulated.key("imu")) == FROM["viewer"]
 
 

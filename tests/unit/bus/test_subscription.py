@@ -6,6 +6,8 @@ from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
+import zenoh
+
 from acsard.bus.subscription import QUEUED, Subscription
 
 KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
@@ -53,3 +55,23 @@ def test_it_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
     next(reader)
     reader.close()
     assert (silent.open, left.open) == (False, False)
+
+
+class Closed(Queue):
+    """Of a session that has been closed behind it."""
+
+    def try_recv(self) -> Any:
+        if not self.held:
+            raise zenoh.ZError("receiving on a closed channel")
+        return super().try_recv()
+
+    def undeclare(self) -> None:
+        raise zenoh.ZError("already undeclared")
+
+
+def test_it_ends_when_its_session_is_closed() -> None:
+    assert numbers(Subscription(Closed(KEY, KEY))) == [0, 1]
+
+
+def test_a_closed_one_is_undeclared_without_a_word() -> None:
+    Subscription(Closed()).undeclare()

@@ -18,6 +18,7 @@ from tests.unit.calibration.robots import (
     SEPARATION,
     Drive,
     Floats,
+    Plan,
     Robot,
     drive,
     wander,
@@ -90,6 +91,25 @@ def test_bias_and_time_offset_are_told(count: int) -> None:
     for c, _ in robots("gyro", count):
         assert c.bias == pytest.approx(0.01, abs=0.002)
         assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
+
+
+AHEAD: Plan = [
+    (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
+] * 2  # fmt: skip
+"""Never at rest, always ahead, mostly to the left: no mean of it is zero."""
+
+
+def test_a_log_without_a_rest_tells_the_same_of_the_drive_as_one_with_rests() -> None:
+    rests: Plan = [(3, 0, 0), *AHEAD, (3, 0, 0)]
+    moving, resting = (
+        calibrated(drive(Robot(rng=np.random.default_rng(4)), plan).csv(places=False))
+        for plan in (AHEAD, rests)
+    )
+    assert moving.drives.metres == pytest.approx(resting.drives.metres, rel=0.02)
+    assert moving.drives.turns == pytest.approx(resting.drives.turns, rel=0.06)
+    assert moving.drives.fastest == pytest.approx(resting.drives.fastest, rel=0.1)
+    assert moving.gain.turn.now == pytest.approx(resting.gain.turn.now, rel=0.1)
+    assert moving.bias == pytest.approx(0.01, abs=0.01)
 
 
 def test_a_tape_measures_the_wheels() -> None:

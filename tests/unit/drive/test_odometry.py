@@ -603,3 +603,14 @@ def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
     count = 0.05 * math.tau / 20
     assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
     assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+
+
+def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
+    odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+    at, moving = Instant(0, 0), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
+    odometry.fold(Feedback(at, WheelSpeeds(), 0.0, gap=2.0))
+    assert odometry.missed() == {}
+    odometry.fold(Feedback(at, moving, 0.01))
+    odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
+    odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
+    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}

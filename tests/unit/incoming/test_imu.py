@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.incoming.commands import Arrival
-from acsard.incoming.imu import FOLLOWED_NS, MAX_RATE, ImuTold, reading
+from acsard.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, ImuTold, reading
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.values import Event, GyroSample
@@ -123,6 +123,16 @@ def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
     assert daemon.counters == {"imu_second_sender": 2}
     assert daemon.hears(0.2, 2 * FOLLOWED_NS, "other")
     assert not daemon.hears(0.1, 2 * FOLLOWED_NS + 1, "one")
+
+
+def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
+    counters, events = Counter[str](), list[Event]()
+    told = ImuTold(own=True)
+    assert told.hear(turning(0.2, 0, "other"), counters, events) is None
+    assert told.hear(turning(0.1, 10 * FOLLOWED_NS, OWN), counters, events) is not None
+    assert told.hear(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
+    assert counters == {"imu_second_sender": 2}
+    assert "simulat" in events[0].text
 
 
 def test_what_is_refused_keeps_nobody_out() -> None:

@@ -272,3 +272,17 @@ vector = st.builds(Vector3, axis, axis, axis)
 @given(st.builds(Twist, vector, vector), st.sampled_from(FORMATS))
 def test_every_finite_twist_comes_back_bit_for_bit(twist: Twist, form: Format) -> None:
     assert twists.decode("", encode(twist, form)) == twist
+
+
+@pytest.mark.parametrize(
+    ("payload", "says"),
+    [
+        (b'{"linear": {"x": NaN}}', "line 1, column 18: JSON has no NaN and no infinity"),
+        (b'{\n "linear": {"x": -Infinity}}', "line 2, column 18: JSON has no NaN and no infinity"),
+        (b'{"linear":\n}', "line 2, column 1: invalid character"),
+    ],
+)
+def test_what_is_no_json_is_told_with_its_line_and_column(payload: bytes, says: str) -> None:
+    with pytest.raises(DecodeError) as refused:
+        Decoder(Twist).decode("application/json", payload)
+    assert (refused.value.reason, str(refused.value)) == ("malformed", says)

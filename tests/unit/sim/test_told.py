@@ -34,8 +34,8 @@ def test_the_truth_is_in_no_frame_of_odometry() -> None:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_what_its_gyro_says_is_read_as_any_gyros(form: Format) -> None:
-    said = turn_rate(SIGHT, "base_link", 0.02)
+    said = turn_rate(SIGHT, "base_link", 0.02, WALL_NS)
     got = reading(Arrival("imu", True, encode(said, form), "", 7, None, ""))
-    assert (got.at_ns, got.stamp_ns, got.rate) == (7, None, 0.25)
+    assert (got.at_ns, got.stamp_ns, got.rate) == (7, WALL_NS, 0.25)
     assert got.variance == pytest.approx(0.0004)
     assert said.orientation_covariance[0] == said.linear_acceleration_covariance[0] == -1.0

@@ -86,6 +86,17 @@ def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
     assert "nothing" in line_with("rejected")
 
 
+@pytest.mark.parametrize("does", ["used", "silent", "disagrees", "not believed"])
+def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
+    assert line_with("gyro", of(gyro=does)).split(maxsplit=1)[1].startswith(does)
+    assert not any("gyro" in line for line in lines_of(SEEN))
+
+
+def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
+    seen = of(counters={"imu_second_sender": 1200, "imu_absurd": 3})
+    assert "gyro second sender 1,200, absurd 3" in line_with("rejected", seen)
+
+
 def test_the_link_is_told_with_its_port() -> None:
     assert line_with("link ").startswith("link up on /dev/acsar ─")
     long = "/dev/serial/by-id/usb-Arduino__www.arduino.cc__0043_7543331393435190A0A1-if00"

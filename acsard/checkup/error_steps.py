@@ -1,0 +1,132 @@
+"""Driving cut into steps, each with what one cause of error does in it.
+
+An error is either independent of all others, a variance, or points the same way again and again
+and adds up: then it is a way that the pose did not go, as in a gap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.checkup.drive_log import BLOCK_S, Line, Motion, Stood
+from acsard.checkup.rounding import Rounding
+from acsard.drive.kinematics import Kinematics
+from acsard.values import WheelSpeeds
+
+Floats = npt.NDArray[np.float64]
+
+NEVER: dict[int, Stood] = {}
+
+
+class Step(Struct, frozen=True):
+    """m and rad driven; `along` m2 and `yaw` rad2 independent of other steps, `stood` the same in
+    all; `by_gyro` rad2 is the variance of the turn where a gyro tells it."""
+
+    distance: float
+    turn: float
+    along: float = 0.0
+    yaw: float = 0.0
+    stood: Stood | None = None
+    by_gyro: float | None = None
+
+
+class Driving:
+    """What was driven, as steps of about so many seconds."""
+
+    def __init__(
+        self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
+        step_s: float, gyro: bool,
+    ) -> None:  # fmt: skip
+        self._lines, self._motion, self._rounding, self._gyro = lines, motion, rounding, gyro
+        self._each = max(1, round(step_s / motion.period))
+        twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
+        self._weights = np.array([[one.linear for one in twists], [one.angular for one in twists]])
+        """m and rad that a radian of each wheel moves the robot by."""
+
+    def plain(self) -> list[Step]:
+        """Without an error of its own."""
+        return self._steps()
+
+    def turned_by_gyro(self) -> list[Step]:
+        """What odometry holds its gyro's turns for."""
+        return self._steps(gyro=self._motion.yaw_variance)
+
+    def late(self) -> list[Step]:
+        """What hangs together is squared as a whole."""
+        late = self._motion.late
+        starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
+        squares = np.zeros_like(late)
+        squares[starts] = np.add.reduceat(late, starts, axis=0) ** 2
+        return self._steps(squares)
+
+    def missed(self) -> list[Step]:
+        """None when nothing was."""
+        moved = self._motion
+        seen = not moved.stood and not moved.bridged.any()
+        return [] if seen else self._steps(moved.bridged, moved.stood)
+
+    def rounded(self) -> list[Step]:
+        """By the lines; a counter's own count is not in it."""
+        found = self._rounding
+        if found.count:
+            return self._steps(stood=_biased(found.offset[1:] @ self._weights.T))
+        roots = np.sqrt(found.variance[1:])
+        variances = [
+            np.einsum("ki,ij,kj->k", roots * row, found.alike, roots * row) for row in self._weights
+        ]
+        return self._steps(np.column_stack(variances))
+
+    def contradicted(self) -> list[Step]:
+        """Front and rear of a side disagree: their mean is off by half of that if one is right."""
+        turned = np.diff([line.positions for line in self._lines], axis=0)
+        front_right, front_left, rear_left, rear_right = turned.T
+        right, left = (front_right - rear_right) / 2, (front_left - rear_left) / 2
+        off = np.column_stack([right, left, left, right])
+        return self._steps(stood=_biased(off @ self._weights.T)) if off.any() else []
+
+    def _steps(
+        self, variances: Floats | None = None, stood: dict[int, Stood] = NEVER,
+        gyro: Floats | None = None,
+    ) -> list[Step]:  # fmt: skip
+        """`variances` (rows of m2, rad2), `stood` and `gyro` are of the lines."""
+        moved, each = self._motion, self._each
+        starts = np.arange(0, len(moved.distance), each)
+        distance, turn = (np.add.reduceat(all_, starts) for all_ in (moved.distance, moved.turn))
+        of = np.zeros((len(starts), 2))
+        if variances is not None:
+            of = np.add.reduceat(variances, starts, axis=0)
+        heading = np.zeros(len(starts)) if gyro is None else np.add.reduceat(gyro, starts)
+        lost: dict[int, Stood] = {}
+        for line, one in stood.items():
+            lost[line // each] = _both(lost.get(line // each, Stood()), one)
+        rows = zip(distance.tolist(), turn.tolist(), of.tolist(), heading.tolist(), strict=True)
+        if not self._gyro:
+            return [
+                Step(d, w, row[0], row[1], lost.get(i)) for i, (d, w, row, _) in enumerate(rows)
+            ]
+        # A gyro turns the heading, whatever becomes of the wheels.
+        for i, one in lost.items():
+            lost[i] = replace(one, turn=0.0, yaw=0.0)
+        return [Step(d, w, row[0], 0.0, lost.get(i), h) for i, (d, w, row, h) in enumerate(rows)]
+
+
+def mirrored(step: Step) -> Step:
+    """The same, turning left."""
+    if step.turn >= 0.0:
+        return step
+    stood = step.stood
+    if stood is not None:
+        stood = replace(stood, turn=-stood.turn)
+    return replace(step, turn=-step.turn, stood=stood)
+
+
+def _biased(off: Floats) -> dict[int, Stood]:
+    """Rows of m and rad that each line is off, ever the same way."""
+    return {k: Stood(*row) for k, row in enumerate(off.tolist()) if any(row)}
+
+
+def _both(a: Stood, b: Stood) -> Stood:
+    return Stood(a.distance + b.distance, a.turn + b.turn, a.along + b.along, a.yaw + b.yaw)

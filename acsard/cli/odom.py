@@ -1,0 +1,149 @@
+"""`acsard odom`: what makes odometry wrong now, and what to do about it.
+
+How that is found is `checkup/budget.py`'s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import add_bus, load, robot_address
+from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.checkup.budget import Budget
+    from acsard.checkup.budget_feed import Feed
+    from acsard.client import Client, Subscription
+    from acsard.config.settings import Config
+
+DESCRIPTION = """\
+Follow the robot while somebody drives it, and tell how much each cause alone makes its odometry
+wrong, in mm after 100 m and in degrees after a turn of 360, if it is driven on like that: the time
+of the lines, what they round away, gaps, slip, wheel radii and track, and the gyro where one is
+used; and what to do about the largest. It sends nothing. Of a robot that stands it says what the
+settings tell.
+"""
+
+FIRST_S = 3.0
+"""How long the first line is waited for."""
+
+LOOK_S = 0.05
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "odom", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
+    )
+    parser.add_argument(
+        "--seconds", type=_seconds, default=10.0, metavar="S", help="how long to look; 10 s"
+    )
+    parser.add_argument(
+        "--follow",
+        action="store_true",
+        help="go on until Ctrl-C, and tell every S seconds of all since the start, at most of "
+        "the last ten minutes",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Look and tell."""
+    from acsard.checkup.budget import budget
+    from acsard.checkup.budget_feed import KEYS, Feed
+    from acsard.client import connect
+
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        config = _config(robot, args.config)
+        queues = {key: robot.subscribe(key) for key in KEYS}
+        try:
+            _await_line(robot, queues["wheel_states"])
+            feed = Feed(config, robot.get("state"))
+            while True:
+                _follow(feed, queues, args.seconds)
+                heard = feed.heard(robot.get("state"), robot.get("diagnostics"))
+                _print(budget(heard, config), args.json)
+                if not args.follow:
+                    return int(Exit.OK)
+        except KeyboardInterrupt:
+            return int(Exit.OK)
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 1.0 <= seconds <= 600.0:
+        raise argparse.ArgumentTypeError(f"{text} is not from 1 to 600")
+    return seconds
+
+
+def _config(robot: Client, path: str | None) -> Config:
+    """The daemon's, which only maintainers may ask a robot on the network for; else the file's."""
+    import msgspec
+
+    from acsard.config.settings import Config
+    from acsard.host.errors import NoAnswerError
+
+    try:
+        return msgspec.convert(robot.get("config"), Config)
+    except (NoAnswerError, msgspec.ValidationError):
+        where, config = load(path)
+        print(
+            f"acsard: the robot does not tell its configuration: taken is {where}", file=sys.stderr
+        )
+        return config
+
+
+def _await_line(robot: Client, lines: Subscription) -> None:
+    """From the first line on all keys come; raises `ExitError` when there is none."""
+    end = time.monotonic() + FIRST_S
+    while lines.try_recv() is None:
+        if time.monotonic() > end:
+            state = robot.get("state")
+            raise ExitError(Exit.FAILURE, f"no feedback lines come: {state.reason}")
+        time.sleep(LOOK_S)
+
+
+def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None:
+    """Hand over all that comes."""
+    from acsard.bus.subscription import encoded
+    from acsard.messages.encodings import DecodeError, Decoder
+    from acsard.messages.schema import MESSAGES
+    from acsard.messages.topics import by_key
+
+    decoders = {}
+    for key in queues:
+        topic = by_key(key)
+        assert topic is not None
+        decoders[key] = Decoder(MESSAGES[topic.type])
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(LOOK_S)
+        for key, queue in queues.items():
+            while (sample := queue.try_recv()) is not None:
+                try:
+                    feed.add(decoders[key].decode(*encoded(sample)))
+                except DecodeError as error:
+                    raise ExitError(
+                        Exit.FAILURE,
+                        f"cannot read {key} ({error}); is the daemon of another version?",
+                    ) from None
+
+
+def _print(found: Budget, as_json: bool) -> None:
+    import msgspec
+
+    from acsard.checkup.budget_text import advice, text
+
+    if not as_json:
+        print(text(found), flush=True)
+        return
+    millimetres, degrees = found.total()
+    told = msgspec.to_builtins(found)
+    told |= {"mm_per_100_m": millimetres, "deg_per_turn": degrees, "advice": advice(found)}
+    print(msgspec.json.encode(told).decode(), flush=True)

@@ -1,0 +1,66 @@
+"""What two decimals leave unsaid, against sums of what they did."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from acsard.checkup.rounding import Floats, rounding
+
+PERIOD, COUNT = 0.01, 4000
+
+
+def four(*columns: Floats) -> Floats:
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("ripple", [0.0, 0.03])
+def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
+    """A steady wheel errs the same way all the time, one that trembles ever anew."""
+    rng = np.random.default_rng(1)
+    errors, told = [], []
+    for _ in range(60):
+        true = rng.uniform(5, 15) + rng.normal(0, ripple, COUNT)
+        said = np.round(true, 2)
+        errors.append(float((said - true).sum()) * PERIOD)
+        told.append(float(rounding(four(said, said, said, said), PERIOD).variance[:, 0].sum()))
+    assert np.mean(np.square(errors)) == pytest.approx(np.mean(told), rel=0.6)
+
+
+def test_a_wheel_that_passes_through_its_speeds_hardly_errs() -> None:
+    true = np.linspace(0.0, 10.0, 20_000)  # twenty lines at each hundredth
+    said = np.round(true, 2)
+    found = rounding(four(said, said, said, said), PERIOD)
+    assert math.sqrt(found.variance[:, 0].sum()) < 20 * 0.01 * PERIOD
+
+
+def test_wheels_that_always_say_the_same_err_together_and_others_by_themselves() -> None:
+    rng = np.random.default_rng(2)
+    one, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
+    alike = rounding(four(one, other, other, one), PERIOD).alike
+    assert alike.tolist() == [[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]]
+
+
+def test_a_wheel_that_stands_does_not_err() -> None:
+    assert not rounding(np.zeros((COUNT, 4)), PERIOD).variance.any()
+
+
+@pytest.mark.parametrize("counts", [96, 400, 1000, 4000])
+def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int) -> None:
+    rng = np.random.default_rng(counts)
+    step = math.tau / counts
+    turned = np.cumsum(8.0 + 6.0 * np.sin(np.arange(COUNT) / 300) + rng.normal(0, 0.1, COUNT))
+    said = np.round(np.diff(np.floor(turned * PERIOD / step)) * step / PERIOD, 2)
+    found = rounding(four(said, said, said, said), PERIOD)
+    assert found.count == pytest.approx(step, rel=1e-3)
+    counted = np.diff(np.floor(turned * PERIOD / step)) * step
+    assert found.offset[:, 0].sum() == pytest.approx((said * PERIOD - counted).sum(), abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_firmware_that_filters_is_not_taken_for_one_that_counts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
+    assert rounding(said, PERIOD).count == 0.0

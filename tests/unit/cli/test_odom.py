@@ -1,0 +1,26 @@
+"""The options of `acsard odom`."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from acsard.cli import odom
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    odom.add(parser.add_subparsers())
+    return parser.parse_args(["odom", *words])
+
+
+def test_it_looks_for_ten_seconds_and_ends() -> None:
+    args = parsed()
+    assert (args.seconds, args.follow, args.json) == (10.0, False, False)
+
+
+@pytest.mark.parametrize("seconds", ["0", "0.5", "601", "nan", "-3", "long"])
+def test_times_that_tell_nothing_are_refused(seconds: str) -> None:
+    with pytest.raises(SystemExit):
+        parsed("--seconds", seconds)
