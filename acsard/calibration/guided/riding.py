@@ -1,0 +1,166 @@
+"""One leg: what is commanded now, from what the daemon tells and what the person presses.
+
+Zeros until the daemon counts them, the moves by their times, zeros until the wheels stand. What is
+not as it must be halts it, for good and with the reason: `halted`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from acsard.calibration.guided.steps import Leg
+from acsard.messages.schema import RobotState
+from acsard.values import REST, Twist
+
+OPENING_S, OPENED_S = 0.4, 4.0
+"""Zeros at first for so long at least, and until they count; then it is given up."""
+
+SILENT_S = 0.5
+"""Without a word from the daemon."""
+
+OBEYED_S = 1.5
+"""After a command has changed the robot has to do it: a ramp takes a part of that."""
+
+LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
+"""m/s, rad/s and the share of what is commanded that it may do otherwise."""
+
+STILL = 0.02
+"""rad/s; wheels that turn slower stand."""
+
+STANDING_S, STANDS_S = 0.5, 6.0
+"""They have to stand for so long, and within so long."""
+
+LATCHED = ("inactive", "stopped", "fault", "leaving", "waiting")
+"""Modes in which no command counts."""
+
+PRESSED = "a key was pressed"
+
+
+class Phase(StrEnum):
+    OPENING = "opening"
+    MOVING = "moving"
+    SETTLING = "settling"
+    DONE = "done"
+    HALTED = "halted"
+
+
+class Riding:
+    """A leg while it is driven; times are s of one clock."""
+
+    def __init__(self, leg: Leg, source: str, now: float) -> None:
+        self._leg, self._source = leg, source
+        self.phase = Phase.OPENING
+        self.halted = ""
+        """Why it ended before its end."""
+        self._begun = self._heard = self._changed = now
+        self._number, self._ends = -1, now
+        self._command = REST
+        self._waits: str | None = "a daemon that hears us"
+        self._still_since: float | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.phase in (Phase.DONE, Phase.HALTED)
+
+    @property
+    def progress(self) -> float:
+        """Share of the moves that are done."""
+        return max(0, self._number) / len(self._leg.moves) if not self.over else 1.0
+
+    def key(self, now: float) -> None:
+        """A key was pressed. The hand that has just pressed Enter may still lie on it."""
+        if self.phase is Phase.OPENING:
+            return
+        last = self._number == len(self._leg.moves) - 1
+        if self.phase is Phase.MOVING and self._leg.by_key and last:
+            self._settle(now)
+        elif self.phase is Phase.MOVING or not self._leg.by_key:
+            self._halt(PRESSED)
+
+    def state(self, state: RobotState, now: float) -> None:
+        """The daemon tells how the robot is."""
+        self._heard = now
+        if state.mode in LATCHED:
+            self._halt(f"the robot is {state.mode}: {state.reason}")
+        elif state.source not in ("", self._source):
+            self._halt(f"{state.source} commands the robot now")
+        elif self.phase is Phase.OPENING:
+            self._waits = _waits(state, self._source)
+        elif self.phase is Phase.MOVING:
+            if waits := _waits(state, self._source):
+                self._halt(f"the daemon does not follow us: {waits}")
+            elif now - self._changed > OBEYED_S:
+                self._obeys(state)
+
+    def wheels(self, fastest: float, now: float) -> None:
+        """The fastest wheel turns at so many rad/s."""
+        if fastest > STILL:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = now
+
+    def step(self, now: float) -> Twist:
+        """What is to be commanded at this time."""
+        if not self.over and now - self._heard > SILENT_S:
+            self._halt("no word from the daemon")
+        if self.phase is Phase.OPENING:
+            self._open(now)
+        if self.phase is Phase.MOVING and now >= self._ends:
+            self._next(now)
+        if self.phase is Phase.SETTLING:
+            self._stand(now)
+        return self._command
+
+    def _open(self, now: float) -> None:
+        passed = now - self._begun
+        if passed >= OPENING_S and not self._waits:
+            self.phase, self._ends = Phase.MOVING, now
+        elif passed >= OPENED_S:
+            self._halt(f"the daemon does not take our commands: it waits for {self._waits}")
+
+    def _next(self, now: float) -> None:
+        self._number += 1
+        if self._number >= len(self._leg.moves):
+            if self._leg.by_key:
+                self._halt("no key was pressed when the robot had come round")
+            else:
+                self._settle(now)
+            return
+        move = self._leg.moves[self._number]
+        self._command = Twist(move.linear, move.angular)
+        # From when the last one was to end: what comes late is not driven on top.
+        self._ends, self._changed = self._ends + move.seconds, now
+
+    def _settle(self, now: float) -> None:
+        self.phase, self._command = Phase.SETTLING, REST
+        self._ends, self._still_since = now, None
+
+    def _stand(self, now: float) -> None:
+        if self._still_since is not None and now - self._still_since >= STANDING_S:
+            self.phase = Phase.DONE
+        elif now - self._ends > STANDS_S:
+            self._halt("the wheels do not come to rest though zero is commanded")
+
+    def _obeys(self, state: RobotState) -> None:
+        for told, does, off, unit in (
+            (self._command.linear, state.linear, LINEAR_OFF, "m/s"),
+            (self._command.angular, state.angular, ANGULAR_OFF, "rad/s"),
+        ):
+            if abs(does - told) > off + OFF_SHARE * abs(told):
+                why = state.refused or "another commander, a limit or an obstacle"
+                self._halt(
+                    f"the robot does {does:.2f} {unit} where {told:.2f} are commanded ({why})"
+                )
+
+    def _halt(self, why: str) -> None:
+        if not self.over:
+            self.phase, self._command, self.halted = Phase.HALTED, REST, why
+
+
+def _waits(state: RobotState, source: str) -> str:
+    """What our commands wait for before they count; "" when they do."""
+    for one in state.sources:
+        if one.name == source:
+            heard = one.age is not None and one.age < OPENING_S
+            return one.waits_for if heard else one.waits_for or "a command"
+    return f"a source {source} in commands.sources"
