@@ -82,9 +82,7 @@ def _sure(told: Found) -> None:
             )
 
 
-def _gain(
-    readings: Sequence[Reading], base: Base, told: Found, now: Floats, rate: Rates
-) -> Gain:
+def _gain(readings: Sequence[Reading], base: Base, told: Found, now: Floats, rate: Rates) -> Gain:
     """Each reading tried on what was found without it."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     one = with_one_track(told.parameters, rate)

@@ -41,7 +41,7 @@ class Recorder:
         self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
 
     def wheels(self, message: JointState, came: float) -> float:
-        """Take the wheels' speeds; the largest of them, rad/s. Raises `KeyError` for other joints."""
+        """Take the wheels' speeds; the largest of them, rad/s."""
         speeds = dict(zip(message.name, message.velocity, strict=False))
         left, right = (
             (speeds[one] + speeds[other]) / 2 for one, other in (self._left, self._right)

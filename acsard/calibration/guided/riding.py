@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from acsard.calibration.guided.steps import Leg
+from acsard.config.settings import DriveConfig
 from acsard.messages.schema import RobotState
 from acsard.values import REST, Twist
 
@@ -47,8 +48,8 @@ class Phase(StrEnum):
 class Riding:
     """A leg while it is driven; times are s of one clock."""
 
-    def __init__(self, leg: Leg, source: str, now: float) -> None:
-        self._leg, self._source = leg, source
+    def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float) -> None:
+        self._leg, self._source, self._drive = leg, source, drive
         self.phase = Phase.OPENING
         self.halted = ""
         """Why it ended before its end."""
@@ -142,14 +143,19 @@ class Riding:
             self._halt("the wheels do not come to rest though zero is commanded")
 
     def _obeys(self, state: RobotState) -> None:
+        """By its wheels: a gyro sees what skidding leaves of a turn, which is no disobedience."""
+        right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
+        linear = self._drive.wheel_radius * (right + left) / 4
+        track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier
+        angular = self._drive.wheel_radius * (right - left) / 2 / track
         for told, does, off, unit in (
-            (self._command.linear, state.linear, LINEAR_OFF, "m/s"),
-            (self._command.angular, state.angular, ANGULAR_OFF, "rad/s"),
+            (self._command.linear, linear, LINEAR_OFF, "m/s"),
+            (self._command.angular, angular, ANGULAR_OFF, "rad/s"),
         ):
             if abs(does - told) > off + OFF_SHARE * abs(told):
-                why = state.refused or "another commander, a limit or an obstacle"
                 self._halt(
-                    f"the robot does {does:.2f} {unit} where {told:.2f} are commanded ({why})"
+                    f"the wheels do {does:.2f} {unit} where {told:.2f} are commanded: another "
+                    "commander, a limit or an obstacle"
                 )
 
     def _halt(self, why: str) -> None:

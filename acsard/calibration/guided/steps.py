@@ -1,4 +1,4 @@
-"""What a way of calibrating has done, one step at a time: legs are driven, numbers are asked for."""
+"""What a way of calibrating yields: legs to be driven, numbers to be asked for."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def ride(leg: Leg) -> Part[Run]:
     return run
 
 
-def ask(words: str, unit: str, least: float, most: float, usual: float | None = None) -> Part[float]:
+def ask(
+    words: str, unit: str, least: float, most: float, usual: float | None = None
+) -> Part[float]:
     """What was read off."""
     number: float = yield Ask(words, unit, least, most, usual)
     return number

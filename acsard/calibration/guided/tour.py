@@ -1,4 +1,4 @@
-"""With a sensor: of how the robot turns, or of where it is. What goes anywhere goes there and back."""
+"""With a sensor of turns or places: legs that go there and back, whatever the track is."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def straight(setup: Setup) -> Leg:
     """Along a line."""
     return Leg(
         f"Set the robot {setup.from_edge:.2f} m (its middle) from the near edge of a free floor of "
-        f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge. Mark on "
-        "the floor where one of its wheels stands. Do not move it by hand until all is done. It "
+        f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge. Mark "
+        "on the floor where one of its wheels stands. Do not move it by hand until all is done. It "
         f"stands for {STANDING_S:g} s, then drives {setup.length:.2f} m straight ahead.",
         (Move(STANDING_S), setup.ahead(setup.length), Move(PAUSE_S)),
     )
@@ -80,10 +80,14 @@ def _there_and_back(setup: Setup, rate: float, metres: float) -> list[Move]:
     ]  # fmt: skip
 
 
-def longest_s(setup: Setup, track: float, *, by_positions: bool = False) -> float:
-    """Of driving, s, whatever the effective track is."""
-    second = petals(setup) if by_positions else spins(setup)
-    return straight(setup).seconds + second.seconds
+def spinning_s(setup: Setup, track: float) -> float:
+    """Of driving with a gyro, s, whatever the effective track is."""
+    return straight(setup).seconds + spins(setup).seconds
+
+
+def petals_s(setup: Setup, track: float) -> float:
+    """The same for positions."""
+    return straight(setup).seconds + petals(setup).seconds
 
 
 def gyro(setup: Setup) -> Way:

@@ -64,7 +64,8 @@ def there_and_back(setup: Setup, side: int, track: float) -> Leg:
     half = setup.turn(side * math.pi, HALF, track)
     which = "left" if side > 0 else "right"
     return Leg(
-        f"{SQUARE}. It drives away from the wall, turns half round to the {which}, and drives back.",
+        f"{SQUARE}. It drives away from the wall, turns half round to the {which}, and drives "
+        "back.",
         (
             STANDING, setup.ahead(setup.length), STANDING, half, STANDING,
             setup.ahead(setup.length - 2 * GAP_M), STANDING,

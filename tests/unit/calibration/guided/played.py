@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from acsard.calibration.runs import Run
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import Config
 from tests.unit.calibration.cut import log_of
-from tests.unit.calibration.robots import SEPARATION, Drive, Plan, Robot, drive
+from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
 """m of the robot's sides and ends that the person measures at."""
