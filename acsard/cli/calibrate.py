@@ -57,8 +57,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--distance",
         type=_distance,
         metavar="[RUN=]METRES",
-        help="with --log: how far from its start a run ends, in a straight line by tape measure: tells "
-        "how large the wheels are; without RUN it is the straightest run",
+        help="with --log: how far from its start a run ends, in a straight line by tape measure: "
+        "tells how large the wheels are; without RUN it is the straightest run",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(

@@ -17,7 +17,7 @@ READ_M = 0.002
 FIRST = 1.2
 """rad/s that the wheels turn against each other, as if they did not skid, in the first turn."""
 
-LATE = 1.15
+LATE = 1.1
 """A first turn that takes longer than this times the slowest has been missed."""
 
 MOST_SPIN_S = 24.0

@@ -32,11 +32,11 @@ def straight(setup: Setup) -> Leg:
     """The first leg."""
     return Leg(
         f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
-        "middle (a joint of tiles, a board, chalk). Set the robot to the right of the line, about 300 mm "
-        f"off, its middle {setup.from_edge:.2f} m from the near edge, looking along the line, so "
-        "that its front left and rear left wheel are equally far from it, to the millimetre. Mark "
-        "where one wheel stands. Do not move it by hand until all is done. It drives "
-        f"{setup.length:.2f} m straight ahead.",
+        "middle (a joint of tiles, a board, chalk). Set the robot to the right of the line, about "
+        f"300 mm off, its middle {setup.from_edge:.2f} m from the near edge, looking along the "
+        "line, so that its front left and rear left wheel are equally far from it, to the "
+        "millimetre. Mark where one wheel stands. Do not move it by hand until all is done. It "
+        f"drives {setup.length:.2f} m straight ahead.",
         (STANDING, setup.ahead(setup.length), STANDING),
     )
 

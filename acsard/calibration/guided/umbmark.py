@@ -64,8 +64,8 @@ def square(setup: Setup, side: int, track: float) -> Leg:
     return Leg(
         f"Set the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far from the "
         f"{other} one, looking to the far edge. Mark on the floor exactly beside the middle of "
-        f"its left and of its right side. It drives a square of {edge:.2f} m, round to the {which}, "
-        "and ends about where it began.",
+        f"its left and of its right side. It drives a square of {edge:.2f} m, round to the "
+        f"{which}, and ends about where it began.",
         (STANDING, *(setup.ahead(edge), STANDING, turn, STANDING) * 4),
     )
 

@@ -22,14 +22,14 @@ TAPE_M = 0.005
 GAP_M = 0.2
 """m from the wall that it comes back to."""
 
-OUT_M = 1.0
+OUT_M = 0.9
 """Before the turns on the spot."""
 
 HALF, FAST = 0.8, 1.2
 """rad/s that the robot truly turns."""
 
 MOST_TURNS = 2
-STANDING = Move(0.7)
+STANDING = Move(0.6)
 
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"

@@ -10,11 +10,11 @@ import numpy as np
 
 from acsard.calibration.guided.setup import Setup, setup
 from acsard.calibration.guided.steps import Ask, Leg, Way
-from acsard.calibration.runs import Run
+from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
+from acsard.calibration.table import Table
 from acsard.config.settings import Config
-from tests.unit.calibration.cut import log_of
-from tests.unit.calibration.robots import Drive, Plan, Robot, drive
+from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
 """m of the robot's sides and ends that the person measures at."""
@@ -61,7 +61,28 @@ class Player:
         self.drives.append(made)
         self.place += complex(made.where[-1]) * cmath.exp(1j * self.yaw)
         self.yaw += float(made.yaw[-1])
-        return log_of(made.csv(gyro=self.gyro, places=self.places)).runs[0]
+        return self._run(made)
+
+    def _run(self, made: Drive) -> Run:
+        """What was told, without the way through a file."""
+        streams: list[tuple[Floats, dict[str, Floats]]] = [
+            (made.t, {"left": made.left, "right": made.right})
+        ]
+        if self.gyro:
+            streams.append((made.gyro_t, {"yaw_rate": made.gyro}))
+        if self.places:
+            streams.append((made.place_t, {"x": made.place.real, "y": made.place.imag}))
+        t = np.concatenate([times for times, _ in streams])
+        order = np.argsort(t)
+        columns = {"t": t[order]}
+        at = 0
+        for times, values in streams:
+            for name, column in values.items():
+                whole = np.full(len(t), np.nan)
+                whole[at : at + len(times)] = column
+                columns[name] = whole[order]
+            at += len(times)
+        return runs(Table(columns, np.zeros(len(t), dtype=np.int64), ("",), ())).runs[0]
 
     def _round_s(self, angular: float) -> float:
         rate = abs(angular)
