@@ -23,7 +23,7 @@ LATE = 1.1
 MOST_SPIN_S = 24.0
 """For some turns on the spot."""
 
-BELIEVABLE = 0.8, 3.0
+BELIEVABLE = 0.85, 3.0
 """Effective track over the geometric one: what lies beyond was misread."""
 
 

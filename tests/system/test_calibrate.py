@@ -1,0 +1,174 @@
+"""`acsard calibrate` at a terminal, with the real daemon and the simulated robot."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from acsard.config.parsing import parse
+from tests.system.bystander import lost
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Peer,
+    Program,
+    acsard,
+    finish,
+    until,
+)  # fmt: skip
+from tests.system.test_cli import ON_TERMINAL, Terminal
+
+SKIDDING: dict[str, dict[str, object]] = {
+    "odometry": {"gyro": True},
+    "sim": {
+        "track_multiplier": 1.6, "track_rate_dependence": 0.08, "left_radius_multiplier": 0.99,
+        "gyro_bias": 0.01, "gyro_noise": 0.01,
+    },
+}  # fmt: skip
+
+STARTS = "Enter starts it"
+RIDES_S = 120.0
+
+
+@contextmanager
+def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard calibrate` at a terminal of its own; what it finds goes into a pipe."""
+    given = ["calibrate", "--config", str(daemon.config), *words]
+    with (
+        Terminal() as terminal,
+        Program(
+            [sys.executable, "-c", ON_TERMINAL, *given],
+            daemon.config.parent,
+            stdin=terminal.slave,
+            stderr=terminal.slave,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        ) as program,
+    ):
+        yield terminal, program
+
+
+def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
+    """The screen has those words so often; a program that has ended has not."""
+
+    def look() -> bool:
+        assert program.process.poll() is None, terminal.screen
+        return terminal.screen.count(words) >= times
+
+    until(look, within, f"{words!r} for the {times}. time")
+
+
+def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
+    """The first leg moves."""
+    asks(terminal, program, STARTS, 1, 10.0)
+    terminal.press("\n")
+    until(lambda: bus.state()["linear"] > 0.25, 10.0, "the first leg moves")
+    assert bus.state()["source"] == "app"
+
+
+@pytest.mark.slow
+def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon, "--write", "--json") as (terminal, program):
+            asks(terminal, program, STARTS, 1, 10.0)
+            terminal.press("\n")
+            asks(terminal, program, "from its mark", 1, RIDES_S)
+            where = bus.get("sim/pose")["pose"]["position"]
+            terminal.press(f"{(where['x'] ** 2 + where['y'] ** 2) ** 0.5:.3f}\n")
+            asks(terminal, program, STARTS, 2, 10.0)
+            terminal.press("\n")
+            assert program.ended(RIDES_S) == 0, terminal.screen
+        found = json.loads(program.stdout)
+        written = parse(daemon.config.read_bytes())
+    print(f"turn: {found['turn_error_before']:.0f} -> {found['turn_error_after']:.1f} deg in 360")
+    assert found["turn_error_after"] < found["turn_error_before"] / 10
+    assert found["scale"] == "distance"
+    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert found["left_wheel_radius"] == pytest.approx(0.0495, rel=0.01)
+    drive = written.drive
+    assert drive.wheel_separation_multiplier == pytest.approx(
+        found["wheel_separation_multiplier"], abs=1e-5
+    )
+    assert written.odometry.wheel_separation_multiplier_std > 0
+
+
+def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        before = daemon.config.read_bytes()
+        with calibrating(daemon, "--write") as (terminal, program):
+            begun(terminal, program, bus)
+            pressed = time.monotonic()
+            terminal.press(" ")
+            bus.at_rest()
+            took = time.monotonic() - pressed
+            print(f"space -> at rest: {took:.2f} s")
+            # 0.3 m/s at 1 m/s2, and some of the way.
+            assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
+            assert program.ended(5.0) == 1
+            assert "a key was pressed" in terminal.screen
+            assert "nothing is written" in terminal.screen
+        assert daemon.config.read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["stop", "teleop", "interrupt"])
+def test_whatever_else_ends_a_leg_is_told(tmp_path: Path, how: str) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon) as (terminal, program):
+            begun(terminal, program, bus)
+            if how == "stop":
+                bus.put("stop", {})
+                why = "the robot is stopped"
+            elif how == "teleop":
+                with bus.commanding(0.0, source="teleop"):
+                    assert program.ended(5.0) == 1
+                why = "teleop commands the robot now"
+            else:
+                terminal.press("\x03")
+                why = "ended by the person"
+            assert program.ended(5.0) == 1
+            until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
+            assert why in terminal.screen
+
+
+@pytest.mark.slow
+def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon) as (terminal, program):
+            begun(terminal, program, bus)
+            daemon.process.kill()
+            assert program.ended(10.0) == 1
+            assert "no word from the daemon" in terminal.screen
+
+
+@pytest.mark.slow
+def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
+        with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
+            assert program.ended(RIDES_S) == 0, program.stderr
+        found = json.loads(program.stdout)
+    assert found["way"] == "positions"
+    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+
+
+def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:
+    with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
+            ended = finish(acsard("calibrate", *words, "--config", str(daemon.config)), tmp_path)
+            assert ended.code == 2
+            assert why in ended.err
