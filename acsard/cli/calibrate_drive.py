@@ -64,9 +64,10 @@ def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibr
     from acsard.calibration.guided.ways import KINDS
     from acsard.cli.calibrate_robot import SOURCE, Robot
     from acsard.client import connect
+    from acsard.messages.topics import full_key
 
-    _usable(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
+    _usable(args, full_key(robot_id, "odom"))
     with ExitStack() as stack:
         client = stack.enter_context(connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls))
         _may(args, client)
@@ -85,11 +86,15 @@ def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibr
             raise GuideError("ended by the person. Nothing is written") from None
 
 
-def _usable(args: argparse.Namespace) -> None:
+def _usable(args: argparse.Namespace, odometry: str) -> None:
     if args.way == "positions" and not args.positions:
         raise UsageError("--way positions needs the key they come on: --positions KEY")
     if args.positions and args.way not in (None, "positions"):
         raise UsageError(f"--positions is for another way than --way {args.way}; leave one out")
+    if args.positions in ("odom", odometry):
+        raise UsageError(
+            "odom is what the wheels say already: positions have to come from elsewhere"
+        )
     if args.positions_at and not args.positions:
         raise UsageError("--positions-at says where --positions KEY is; give that as well")
     if not args.yes and not sys.stdin.isatty():
@@ -126,13 +131,7 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
 
 
 def _way(args: argparse.Namespace, config: Config) -> str:
-    from acsard.cli.calibrate_robot import own_odometry
-
     if args.positions:
-        if own_odometry(config.robot.id, args.positions):
-            raise UsageError(
-                "odom is what the wheels say already: positions have to come from elsewhere"
-            )
         return "positions"
     if args.way == "gyro" and args.imu == "imu" and not config.odometry.gyro:
         raise UsageError(

@@ -21,7 +21,7 @@ from acsard.client import SEND_PERIOD_S, Client
 from acsard.config.settings import Config
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
-from acsard.messages.topics import by_key, full_key
+from acsard.messages.topics import by_key
 
 SOURCE = "app"
 
@@ -128,7 +128,7 @@ class Robot:
                 self._client.send(command.linear, command.angular)
                 last, sent = command, now
             if now - shown > SHOWN_S:
-                self._attendant.progress(riding.progress)
+                self._attendant.progress(riding.progress(now))
                 shown = now
         self._attendant.progress(1.0)
 
@@ -153,8 +153,3 @@ class Robot:
     def _full(self, key: str) -> str:
         """A key of the table is this robot's; any other is as it is written."""
         return self._client.key(key) if by_key(key) is not None else key
-
-
-def own_odometry(robot_id: str, key: str) -> bool:
-    """It says what the wheels say already."""
-    return key in ("odom", full_key(robot_id, "odom"))

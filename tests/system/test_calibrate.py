@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -60,7 +61,7 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
 
     def look() -> bool:
         assert program.process.poll() is None, terminal.screen
-        return terminal.screen.count(words) >= times
+        return shown(terminal).count(words) >= times
 
     until(look, within, f"{words!r} for the {times}. time")
 
@@ -98,6 +99,76 @@ def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_p
         found["wheel_separation_multiplier"], abs=1e-5
     )
     assert written.odometry.wheel_separation_multiplier_std > 0
+
+
+LINE_M, LENGTH_M, WIDTH_M = 0.45, 0.25, 0.30
+"""m from where the robot's middle begins to the line on its left, between its wheels, and its
+width."""
+
+
+def measured(bus: Bus, words: str) -> str:
+    """What a person reads off who sees where the robot truly is; mm, and m for the long one."""
+    pose = bus.get("sim/pose")["pose"]
+    where, turn = pose["position"], pose["orientation"]
+    yaw = 2 * math.atan2(turn["z"], turn["w"])
+    if "apart" in words:
+        return f"{1000 * LENGTH_M:.0f}"
+    if "from its mark" in words:
+        return f"{math.hypot(where['x'], where['y']):.3f}"
+    ahead = LENGTH_M / 2 if "Front" in words else -LENGTH_M / 2
+    left = where["y"] + ahead * math.sin(yaw) + WIDTH_M / 2 * math.cos(yaw)
+    return f"{1000 * (LINE_M - left):.0f}"
+
+
+ENDED = "ended"
+
+
+def shown(terminal: Terminal) -> str:
+    """All of the screen, whatever its lines."""
+    return " ".join(terminal.screen.split())
+
+
+def question(terminal: Terminal, program: Program, seen: int) -> str | None:
+    """What is asked behind what has been seen; `ENDED` when nothing will be any more."""
+    words = shown(terminal)[seen:]
+    if words.endswith((" mm:", " m:", "q leaves.")):
+        return words
+    return ENDED if program.process.poll() is not None else None
+
+
+def once_round(bus: Bus) -> None:
+    """It has turned to the left until it looks as before."""
+
+    def yaw() -> float:
+        turn = bus.get("sim/pose")["pose"]["orientation"]
+        return 2 * math.atan2(turn["z"], turn["w"])
+
+    until(lambda: abs(math.remainder(yaw(), 2 * math.pi)) > 2.5, RIDES_S, "half round")
+    until(lambda: abs(math.remainder(yaw(), 2 * math.pi)) < 0.15, RIDES_S, "once round")
+
+
+@pytest.mark.slow
+def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon, "--way", "tape", "--write") as (terminal, program):
+            seen = 0
+            while program.process.poll() is None:
+                words = until(lambda: question(terminal, program, seen), RIDES_S, "a question")  # noqa: B023
+                seen = len(shown(terminal))
+                if STARTS in words:
+                    terminal.press("\n")
+                    if "SPACE" in words:
+                        once_round(bus)
+                        terminal.press(" ")
+                elif words != ENDED:
+                    terminal.press(measured(bus, words) + "\n")
+            assert program.ended(5.0) == 0, terminal.screen
+        written = parse(daemon.config.read_bytes()).drive
+    assert "a turn of 360 deg ends" in program.stdout
+    assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
+    assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
+    assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
 
 
 def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:

@@ -22,6 +22,9 @@ SILENT_S = 0.5
 OBEYED_S = 1.5
 """After a command has changed the robot has to do it: a ramp takes a part of that."""
 
+DOUBT_S = 0.5
+"""That it does not do as it is told, before it is given up."""
+
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
 """m/s, rad/s and the share of what is commanded that it may do otherwise."""
 
@@ -58,15 +61,20 @@ class Riding:
         self._command = REST
         self._waits: str | None = "a daemon that hears us"
         self._still_since: float | None = None
+        self._doubted: float | None = None
 
     @property
     def over(self) -> bool:
         return self.phase in (Phase.DONE, Phase.HALTED)
 
-    @property
-    def progress(self) -> float:
-        """Share of the moves that are done."""
-        return max(0, self._number) / len(self._leg.moves) if not self.over else 1.0
+    def progress(self, now: float) -> float:
+        """Share of the leg that is done; 1 when it is over."""
+        if self.over:
+            return 1.0
+        if self._number < 0:
+            return 0.0
+        behind = sum(move.seconds for move in self._leg.moves[: self._number + 1])
+        return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
 
     def key(self, now: float) -> None:
         """A key was pressed. The hand that has just pressed Enter may still lie on it."""
@@ -88,10 +96,7 @@ class Riding:
         elif self.phase is Phase.OPENING:
             self._waits = _waits(state, self._source)
         elif self.phase is Phase.MOVING:
-            if waits := _waits(state, self._source):
-                self._halt(f"the daemon does not follow us: {waits}")
-            elif now - self._changed > OBEYED_S:
-                self._obeys(state)
+            self._doubt(self._objection(state, now), now)
 
     def wheels(self, fastest: float, now: float) -> None:
         """The fastest wheel turns at so many rad/s."""
@@ -142,8 +147,22 @@ class Riding:
         elif now - self._ends > STANDS_S:
             self._halt("the wheels do not come to rest though zero is commanded")
 
-    def _obeys(self, state: RobotState) -> None:
-        """By its wheels: a gyro sees what skidding leaves of a turn, which is no disobedience."""
+    def _doubt(self, why: str, now: float) -> None:
+        """A machine that is busy for a moment sends late, and the robot slows down: that passes."""
+        if not why:
+            self._doubted = None
+        elif self._doubted is None:
+            self._doubted = now
+        elif now - self._doubted >= DOUBT_S:
+            self._halt(why)
+
+    def _objection(self, state: RobotState, now: float) -> str:
+        """What speaks against its doing as it is told, by its wheels: a gyro sees what skidding
+        leaves of a turn, which is no disobedience."""
+        if waits := _waits(state, self._source):
+            return f"the daemon does not follow us, it waits for {waits}"
+        if now - self._changed < OBEYED_S:
+            return ""
         right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
         linear = self._drive.wheel_radius * (right + left) / 4
         track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier
@@ -153,10 +172,11 @@ class Riding:
             (self._command.angular, angular, ANGULAR_OFF, "rad/s"),
         ):
             if abs(does - told) > off + OFF_SHARE * abs(told):
-                self._halt(
+                return (
                     f"the wheels do {does:.2f} {unit} where {told:.2f} are commanded: another "
                     "commander, a limit or an obstacle"
                 )
+        return ""
 
     def _halt(self, why: str) -> None:
         if not self.over:

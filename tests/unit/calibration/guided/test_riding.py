@@ -71,7 +71,7 @@ def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -
     assert times[Twist(0.3, 0.0)] == pytest.approx(1.0, abs=2 * TICK)
     assert times[Twist(0.0, 0.5)] == pytest.approx(2.0, abs=2 * TICK)
     assert (world.riding.phase, world.said[-1]) == (Phase.DONE, REST)
-    assert world.riding.progress == 1.0
+    assert world.riding.progress(world.now) == 1.0
 
 
 def test_nothing_moves_until_zeros_count() -> None:
@@ -117,6 +117,20 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.run(SILENT_S + 2 * TICK)
     assert world.said[-1] == REST
     assert world.riding.halted == "no word from the daemon"
+
+
+def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
+    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
+    world.run(0.3)
+    world.tells = lambda state: state
+    assert not world.run(3.0).riding.halted
+
+
+def test_progress_is_the_share_of_the_time() -> None:
+    world = World(LEG).until_moving()
+    told = [world.run(0.5).riding.progress(world.now) for _ in range(5)]
+    assert told == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
 
 
 def test_a_key_stops_it_in_the_same_step() -> None:
