@@ -33,8 +33,8 @@ class Attendant(Protocol):
     def number(self, ask: Ask) -> float:
         """What was read off; raises `KeyboardInterrupt` or `GuideError`."""
 
-    def keys(self, wait_s: float) -> int:
-        """How many keys were pressed; waits that long for one."""
+    def keys(self, wait_s: float) -> str:
+        """The keys that were pressed; waits that long for one."""
 
     def progress(self, share: float) -> None:
         """So much of the leg is done."""
@@ -54,9 +54,9 @@ class Nobody:
             raise GuideError("this way needs a person who measures: leave --yes out")
         return ask.usual
 
-    def keys(self, wait_s: float) -> int:
+    def keys(self, wait_s: float) -> str:
         select.select([], [], [], wait_s)
-        return 0
+        return ""
 
     def progress(self, share: float) -> None:
         pass
@@ -105,10 +105,8 @@ class Person:
                     return number
                 _print(f"a number of {ask.unit} from {ask.least:g} to {ask.most:g} (q leaves)")
 
-    def keys(self, wait_s: float) -> int:
-        if not select.select([self._input], [], [], wait_s)[0]:
-            return 0
-        return len(self._read())
+    def keys(self, wait_s: float) -> str:
+        return self._read() if select.select([self._input], [], [], wait_s)[0] else ""
 
     def progress(self, share: float) -> None:
         if sys.stderr.isatty():

@@ -118,8 +118,8 @@ class Robot:
         begun = sent = shown = time.monotonic()
         last = None
         while not riding.over:
-            for _ in range(self._attendant.keys(LOOK_S)):
-                riding.key(time.monotonic())
+            for key in self._attendant.keys(LOOK_S):
+                riding.key(key, time.monotonic())
             now = time.monotonic()
             self._hear(riding, recorder, now)
             command = riding.step(now)

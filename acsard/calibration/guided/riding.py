@@ -37,6 +37,7 @@ STANDING_S, STANDS_S = 0.5, 6.0
 LATCHED = ("inactive", "stopped", "fault", "leaving", "waiting")
 """Modes in which no command counts."""
 
+ENTER = "\r\n"
 PRESSED = "a key was pressed"
 
 
@@ -76,14 +77,14 @@ class Riding:
         behind = sum(move.seconds for move in self._leg.moves[: self._number + 1])
         return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
 
-    def key(self, now: float) -> None:
-        """A key was pressed. The hand that has just pressed Enter may still lie on it."""
-        if self.phase is Phase.OPENING:
+    def key(self, pressed: str, now: float) -> None:
+        """A key was pressed; the hand that has just pressed Enter may still lie on it."""
+        if self.phase is Phase.OPENING and pressed in ENTER:
             return
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
             self._settle(now)
-        elif self.phase is Phase.MOVING or not self._leg.by_key:
+        elif self.phase is not Phase.SETTLING or not self._leg.by_key:
             self._halt(PRESSED)
 
     def state(self, state: RobotState, now: float) -> None:
@@ -100,6 +101,7 @@ class Riding:
 
     def wheels(self, fastest: float, now: float) -> None:
         """The fastest wheel turns at so many rad/s."""
+        self._heard = now
         if fastest > STILL:
             self._still_since = None
         elif self._still_since is None:

@@ -102,7 +102,7 @@ STOPS: dict[str, Late] = {
 def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.tells = STOPS[why]
-    world.run(2.0)
+    world.run(3.0)
     stopped = world.said.index(REST, world.said.index(Twist(0.3, 0.0)))
     assert set(world.said[stopped:]) == {REST}
     assert world.riding.phase is Phase.HALTED
@@ -135,22 +135,31 @@ def test_progress_is_the_share_of_the_time() -> None:
 
 def test_a_key_stops_it_in_the_same_step() -> None:
     world = World(LEG).until_moving()
-    world.riding.key(world.now)
+    world.riding.key(" ", world.now)
     assert world.riding.step(world.now) == REST
     assert world.riding.phase is Phase.HALTED
 
 
 def test_the_hand_that_lies_on_enter_while_zeros_go_out_stops_nothing() -> None:
     world = World(LEG).run(0.1)
-    world.riding.key(world.now)
+    world.riding.key("\n", world.now)
     world.until_moving()
     assert not world.riding.halted
+
+
+@pytest.mark.parametrize("leg", [LEG, TURN], ids=["leg", "turn"])
+def test_any_other_key_meanwhile_keeps_it_from_moving_at_all(leg: Leg) -> None:
+    world = World(leg).run(0.1)
+    world.riding.key(" ", world.now)
+    world.run(3.0)
+    assert set(world.said) == {REST}
+    assert world.riding.phase is Phase.HALTED
 
 
 def test_a_turn_that_a_key_ends_ends_well_by_it() -> None:
     world = World(TURN).until_moving()
     world.run(1.0)
-    world.riding.key(world.now)
+    world.riding.key(" ", world.now)
     assert world.riding.step(world.now) == REST
     assert world.run(1.0).riding.phase is Phase.DONE
 
