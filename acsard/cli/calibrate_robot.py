@@ -37,6 +37,9 @@ SHOWN_S = 0.2
 FIRST_S = 3.0
 """For the first sample of a sensor."""
 
+POSITIONS = (Odometry, PoseStamped)
+"""In this order: CDR says no type, and what is too short for odometry is a pose."""
+
 Take = Callable[[Any, float], object]
 
 
@@ -95,8 +98,7 @@ class Robot:
 
     def positions(self, key: str, session: zenoh.Session | None) -> None:
         """The same for positions."""
-        types = (PoseStamped, Odometry)
-        sensor = Sensor(session or self._client.session, self._full(key), types)
+        sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
         self._sensors.append((sensor, "place"))
 

@@ -11,9 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
+import zenoh
 
+from acsard.bus.session import client_session
+from acsard.calibration.guided.recorder import Recorder, Sample
+from acsard.calibration.guided.steps import GuideError
+from acsard.cli import calibrate_robot
+from acsard.cli.calibrate_robot import POSITIONS, Sensor
 from acsard.config.parsing import parse
+from acsard.config.settings import JointsConfig
+from acsard.messages.encodings import FORMATS, encode
+from acsard.messages.schema import Odometry, PoseStamped
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -22,6 +32,7 @@ from tests.system.harness import (
     Program,
     acsard,
     finish,
+    free_endpoint,
     until,
 )  # fmt: skip
 from tests.system.test_cli import ON_TERMINAL, Terminal
@@ -33,6 +44,23 @@ SKIDDING: dict[str, dict[str, object]] = {
         "gyro_bias": 0.01, "gyro_noise": 0.01,
     },
 }  # fmt: skip
+
+
+@pytest.fixture
+def free() -> str:
+    return free_endpoint()
+
+
+@contextmanager
+def router(endpoint: str) -> Iterator[zenoh.Session]:
+    """Somebody else's router, who has positions."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        yield session
+
 
 STARTS = "Enter starts it"
 RIDES_S = 120.0
@@ -234,6 +262,53 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
     assert found["way"] == "positions"
     assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
     assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+
+
+POSE = {
+    "position": {"x": 1.5, "y": -2.0, "z": 0.0},
+    "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+}
+HEADER = {"stamp": {"sec": 7, "nanosec": 0}, "frame_id": "map"}
+AS_POSE = {"header": HEADER, "pose": POSE}
+AS_ODOMETRY = {
+    "header": HEADER, "child_frame_id": "base_link",
+    "pose": {"pose": POSE, "covariance": [0.0] * 36},
+    "twist": {"twist": {"linear": {}, "angular": {}}, "covariance": [0.0] * 36},
+}  # fmt: skip
+
+
+def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free: str) -> None:
+    with router(free) as said, client_session(free, "") as heard:
+        for cls, value in ((PoseStamped, AS_POSE), (Odometry, AS_ODOMETRY)):
+            message = msgspec.convert(value, cls)
+            for form in FORMATS:
+                key = f"slam/{cls.__name__}/{form}"
+                sensor = Sensor(heard, key, POSITIONS)
+                recorder = Recorder(JointsConfig().as_tuple())
+
+                def came() -> bool:
+                    said.put(key, encode(message, form))  # noqa: B023
+                    return sensor.hear(recorder.place, 9.0) > 0  # noqa: B023
+
+                until(came, 5.0, f"a position on {key}")
+                assert recorder.samples["places"][0] == Sample(9.0, 7.0, (1.5, -2.0))
+
+
+def test_what_is_no_position_and_what_does_not_come_is_told(
+    free: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrate_robot, "FIRST_S", 0.2)
+    with router(free) as said, client_session(free, "") as heard:
+        sensor = Sensor(heard, "slam/pose", POSITIONS)
+        with pytest.raises(GuideError, match="does not come on slam/pose"):
+            sensor.await_first("a position")
+
+        def came() -> int:
+            said.put("slam/pose", b'{"x": 1}')
+            return sensor.hear(lambda message, now: None, 0.0)
+
+        with pytest.raises(GuideError, match="cannot be read"):
+            until(came, 5.0, "a sample")
 
 
 def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:

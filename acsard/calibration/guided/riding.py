@@ -22,7 +22,7 @@ SILENT_S = 0.5
 OBEYED_S = 1.5
 """After a command has changed the robot has to do it: a ramp takes a part of that."""
 
-DOUBT_S = 0.5
+DOUBT_S = 1.0
 """That it does not do as it is told, before it is given up."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3

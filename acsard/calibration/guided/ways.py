@@ -10,9 +10,6 @@ from acsard.calibration.guided import tape, tour, umbmark, wall
 from acsard.calibration.guided.setup import WIDEST, Setup
 from acsard.calibration.guided.steps import Way
 
-USUAL = 1.6
-"""Effective over geometric track of a robot that skids as most do."""
-
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """More turns in the time there is make a lesser one take longer, here and there."""
 
@@ -29,9 +26,8 @@ class Kind(Struct, frozen=True):
 
     def told(self, setup: Setup) -> str:
         """How long it drives, in words."""
-        usual = self.longest_s(setup, USUAL)
         most = max(self.longest_s(setup, track) for track in TRACKS)
-        return f"It drives for {usual:.0f} s in all, at most {most:.0f} s."
+        return f"It drives for at most {most:.0f} s in all."
 
 
 KINDS: dict[str, Kind] = {
