@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,20 +25,32 @@ for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
 
+# Where bytecode may not be written, as in many containers, each of the hundreds of daemons here
+# would compile all of acsard anew, and so would each worker the tests: it goes to pytest's cache.
+if sys.dont_write_bytecode:
+    sys.pycache_prefix = str(Path(__file__).parent.parent / ".pytest_cache" / "bytecode")
+    sys.dont_write_bytecode = False
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 
 TIMED = ("bench", "firmware", "system", "systemd")
-"""Where real time passes: these run one after the other. All else is only computed beside them."""
+"""Where real time passes: these run one after the other. All else is only computed beside them, or
+says by a mark of its own that it does not mind."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for the default run; one, which shows what is printed, for any other."""
+    """Two processes for what `.ci/run` runs; one, which shows what is printed, for any other."""
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
-    other = config.option.capture == "no" or "not (slow or soak" not in config.option.markexpr
+    other = (
+        config.option.capture == "no" or "soak" not in config.option.markexpr.partition("not")[2]
+    )
     return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
-        if item.path.relative_to(here).parts[0] in TIMED:
+        timed = item.path.relative_to(here).parts[0] in TIMED
+        if timed and not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group("timed"))

@@ -61,7 +61,7 @@ def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
     return drive
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turned(
     seed: int,
 ) -> None:
@@ -71,6 +71,7 @@ def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turne
     assert drive.world.state.gyro == "used"
 
 
+@pytest.mark.slow
 def test_to_turn_on_and_on_the_same_way_costs_no_more() -> None:
     with_gyro, without = Drive(world()), Drive(world(gyro=False))
     for drive in (with_gyro, without):
@@ -82,6 +83,7 @@ def test_to_turn_on_and_on_the_same_way_costs_no_more() -> None:
     assert without.error > 0.6
 
 
+@pytest.mark.slow
 def test_the_position_follows_the_truth_too() -> None:
     made = world()
     wandering(made, 3, seconds=30.0)
@@ -89,6 +91,7 @@ def test_the_position_follows_the_truth_too() -> None:
     assert math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.02 * made.loop.robot.travelled
 
 
+@pytest.mark.slow
 def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
     made = world(SimConfig(track_multiplier=1.6, gyro_bias=0.01, gyro_delay=0.04))
     wandering(made, 4)

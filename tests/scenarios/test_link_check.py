@@ -182,7 +182,7 @@ def test_a_slow_wire_carries_checked_lines_with_samples() -> None:
 # resets
 
 
-@pytest.mark.parametrize("deaf_ms", [20, 60, 500, 2000])
+@pytest.mark.parametrize("deaf_ms", [20, pytest.param(60, marks=pytest.mark.slow), 500, 2000])
 @pytest.mark.parametrize(("check", "counts"), [("off", 0), ("auto", 0), ("require", 3200)])
 def test_a_reset_mcu_does_not_move_before_it_is_asked_and_commanders_are_neutral(
     check: str, counts: int, deaf_ms: int
@@ -408,6 +408,7 @@ def test_when_the_host_reads_the_lines_does_not_bend_the_pose() -> None:
     assert by_counts < min(0.001, by_speeds)
 
 
+@pytest.mark.slow
 def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
     fine = replace(config("require", 40_000), sim=SimConfig(encoder_counts=40_000))
     world = World(fine)

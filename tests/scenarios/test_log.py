@@ -184,6 +184,7 @@ def most_lines(world: World) -> int:
     return most
 
 
+@pytest.mark.slow
 def test_a_cable_that_flaps_for_a_minute_is_some_lines_a_second(world: World) -> None:
     most = []
     for _ in range(60):
@@ -197,6 +198,7 @@ def test_a_cable_that_flaps_for_a_minute_is_some_lines_a_second(world: World) ->
     assert max(most[LINES_A_SECOND:]) <= 2  # one is due each second, and a second has two ends
 
 
+@pytest.mark.slow
 def test_a_commander_slower_than_its_timeout_is_a_line_a_second(world: World) -> None:
     most = []
     for _ in range(20):
@@ -207,6 +209,7 @@ def test_a_commander_slower_than_its_timeout_is_a_line_a_second(world: World) ->
     assert max(most[LINES_A_SECOND:]) <= 2
 
 
+@pytest.mark.slow
 def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: World) -> None:
     for turn in range(200):
         world.send(0.0, source=("teleop", "app")[turn % 2])
@@ -229,6 +232,7 @@ def test_a_thousand_names_are_a_short_line(world: World) -> None:
     assert max(len(event.by) + len(event.text) for event in told(world, "stop")) < 700
 
 
+@pytest.mark.slow
 def test_a_quiet_day_is_silent(world: World) -> None:
     world.run(60.0)
     assert world.events == []

@@ -28,7 +28,7 @@ ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 DAY_NS = 86_400 * NS_PER_S
 
 
-def slow(count: int) -> object:
+def slow(count: float) -> object:
     """A run too slow for every day."""
     return pytest.param(count, marks=pytest.mark.slow)
 
@@ -178,7 +178,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     return world
 
 
-@pytest.mark.parametrize("count", [16, slow(48), long(1_000, 1800)])
+@pytest.mark.parametrize("count", [8, slow(48), long(1_000, 1800)])
 def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
     world = quiet_bus(World())
@@ -256,7 +256,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     return stale, backward, accepted
 
 
-@pytest.mark.parametrize("count", [4, slow(10), long(200, 1800)])
+@pytest.mark.parametrize("count", [2, slow(10), long(200, 1800)])
 def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
     dice, stale, backward, accepted = random.Random(3), 0, 0, 0
     for trial in range(count):
@@ -471,7 +471,7 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [6, slow(24), long(500, 1800)])
+@pytest.mark.parametrize("count", [3, slow(24), long(500, 1800)])
 def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
     count: int,
 ) -> None:
@@ -521,7 +521,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
     return "" if driving_again(world, speaker) else f"after the cut: {world.state.reason}"
 
 
-@pytest.mark.parametrize("count", [5, slow(16), long(400, 1800)])
+@pytest.mark.parametrize("count", [2, slow(16), long(400, 1800)])
 def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()
     for trial in range(count):
@@ -536,7 +536,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
     assert not +wrong
 
 
-@pytest.mark.parametrize("rate", [0.92, 1.08])
+@pytest.mark.parametrize("rate", [0.92, slow(1.08)])
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     way: Way, rate: float
@@ -552,7 +552,10 @@ def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     assert driving_again(world, speaker), world.state.reason
 
 
-@pytest.mark.parametrize("ahead", [-86400.0, -3600.0, -2.0, -0.3, 0.3, 2.0, 3600.0, 86400.0])
+@pytest.mark.parametrize(
+    "ahead",
+    [slow(-86400.0), slow(-3600.0), -2.0, slow(-0.3), 0.3, slow(2.0), slow(3600.0), 86400.0],
+)
 @pytest.mark.parametrize("way", ["signed", "rmw", "header", "zenoh"])
 def test_two_senders_never_arm_each_other_whatever_their_clocks(way: Way, ahead: float) -> None:
     world = quiet_bus(World())
@@ -609,7 +612,7 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [2, slow(6), long(100, 1800)])
+@pytest.mark.parametrize("count", [1, slow(6), long(100, 1800)])
 @pytest.mark.parametrize("kind", ["steady", "stalls", "cuts", "another"])
 def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> None:
     dice, found = random.Random(9), Counter[str]()

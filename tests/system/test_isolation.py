@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import pytest
 import zenoh
@@ -42,8 +42,6 @@ from tests.system.identities import Certificates, Identity, free_tls_endpoint
 from tests.system.strangers import HOSTILE, words
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(120)]
-
-SHORT, LONG = 1.5, pytest.param(30.0, marks=pytest.mark.soak)
 
 CALM_S = 5.0
 
@@ -252,9 +250,32 @@ def undisturbed(figures: Figures) -> None:
     assert figures.back <= BACK_S
 
 
-@pytest.mark.parametrize("seconds", [SHORT, LONG])
-@pytest.mark.parametrize("who", ["viewer", "unlisted"])
-@pytest.mark.parametrize("form", FORMS)
+Forms = Mapping[Identity, Sequence[str]]
+
+
+def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
+    """Each for half a minute in the long runs; for a moment, every time, those that differ most."""
+    return [
+        pytest.param(form, who, seconds, marks=marks)
+        for forms, seconds, marks in ((a_moment, 1.5, ()), (half_a_minute, 30.0, pytest.mark.soak))
+        for who in forms
+        for form in forms[who]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("form", "who", "seconds"),
+    attacks(
+        {"viewer": FORMS, "unlisted": FORMS},
+        {
+            "viewer": (
+                "subscribe", "chunk", "ask", "many", "many_exact", "publish", "querier",
+                "come_and_go", "as_router", "as_peer",
+            ),
+            "unlisted": ("name", "publish", "sessions", "flood"),
+        },
+    ),
+)  # fmt: skip
 def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
     tmp_path: Path, door: Door, form: str, who: Identity, seconds: float
 ) -> None:
@@ -263,11 +284,15 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
     undisturbed(figures)
 
 
-@pytest.mark.parametrize("seconds", [SHORT, LONG])
 @pytest.mark.parametrize(
-    ("form", "who"),
-    [(form, "viewer") for form in FORMS]
-    + [(form, "unlisted") for form in ("publish", "sessions", "come_and_go", "flood")],
+    ("form", "who", "seconds"),
+    attacks(
+        {"viewer": FORMS, "unlisted": ("publish", "sessions", "come_and_go", "flood")},
+        {
+            "viewer": ("subscribe", "many", "publish", "querier", "as_peer"),
+            "unlisted": ("publish", "sessions"),
+        },
+    ),
 )
 def test_who_attacks_the_fleets_router_does_not_disturb_the_robot_behind_it(
     tmp_path: Path, form: str, who: Identity, seconds: float
@@ -310,7 +335,7 @@ def test_who_takes_all_connections_is_in_the_log_and_in_the_state(
     tmp_path: Path, door: Door
 ) -> None:
     robot = Robot(tmp_path, door.network())
-    robot.attacked("sessions", "unlisted", 1.5)
+    robot.attacked("sessions", "unlisted", 5.0)
     (line,) = robot.daemon.events("door_crowded")
     assert line["text"].startswith("all 255 connections are taken, 255 by unlisted")
     assert robot.counters["door_crowded"] > 0

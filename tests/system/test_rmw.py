@@ -566,6 +566,7 @@ def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> Non
 @pytest.mark.parametrize(
     ("attachment", "reason"),
     [(b"", "no_attachment"), (bytes(20), "bad_attachment"), (NOW[:-1], "bad_attachment")],
+    ids=["none", "short", "cut"],
 )
 @pytest.mark.parametrize("service", ["acsard/activate", "acsard/get_parameters"])
 def test_a_call_with_a_wrong_attachment_is_counted_and_ends_without_an_answer(

@@ -33,6 +33,7 @@ def yaw(pose: Any) -> float:
     return 2 * math.atan2(turn["z"], turn["w"])
 
 
+@pytest.mark.slow
 def test_the_truth_is_another_than_odometry_by_what_the_robot_truly_is(skidding: Bus) -> None:
     with skidding.commanding(0.0, 1.0):
         until(lambda: skidding.state()["yaw"] > 1.6, 10.0, "most of a quarter turn")
@@ -62,6 +63,7 @@ def test_where_there_is_a_real_port_nobody_has_the_truth(tmp_path: Path, peer: P
 # the gyro
 
 
+@pytest.mark.slow
 def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import select
 import shutil
 import statistics
+import struct
 import subprocess
 import termios
 import time
@@ -24,6 +26,9 @@ from tests.system.harness import ROOT, ZERO_LINE
 SCRIPT = ROOT / "deploy" / "systemd" / "acsard-stop"
 
 STOP = b"\r\n" + 3 * ZERO_LINE
+
+UNREAD_AT_MOST = 4095
+"""A terminal's buffer in Linux; what is more waits behind it."""
 
 pytestmark = pytest.mark.skipif(
     shutil.which("stty") is None or shutil.which("awk") is None, reason="needs stty and awk"
@@ -43,6 +48,11 @@ class Wire:
             return os.read(self.master, 65536)
         except BlockingIOError:
             return b""
+
+    def unread(self) -> int:
+        """How many bytes wait at the master end."""
+        waiting = fcntl.ioctl(self.master, termios.FIONREAD, struct.pack("i", 0))
+        return int(struct.unpack("i", waiting)[0])
 
     def close(self) -> None:
         os.close(self.master)
@@ -170,11 +180,12 @@ def test_without_a_configuration_it_does_nothing(tmp_path: Path) -> None:
 def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wire) -> None:
     tty.setraw(wire.slave)
     os.set_blocking(wire.slave, False)
-    # Full, and still so when the kernel has moved on what it can.
-    while select.select([], [wire.slave], [], 0.1)[1]:
+    # Full only when the reading end is, too: a busy kernel moves on what it can much later.
+    while wire.unread() < UNREAD_AT_MOST or select.select([], [wire.slave], [], 0)[1]:
         with contextlib.suppress(BlockingIOError):
             while True:
                 os.write(wire.slave, b"\r\n" * 100)
+        time.sleep(0.001)
     ended = stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\n'))
     print(f"full port: given up after {ended.seconds:.3f} s")
     assert ended.code == 1

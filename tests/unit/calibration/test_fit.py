@@ -33,6 +33,7 @@ def test_it_finds_what_is_there() -> None:
     assert fitted(np.random.default_rng(1), 0.0, 0.0).parameters[:3] == pytest.approx(TRUTH)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shared", "own"), [(0.0, 0.05), (0.02, 0.0), (0.02, 0.05)])
 def test_its_deviations_cover_the_truth_however_errors_hang_together(
     shared: float, own: float

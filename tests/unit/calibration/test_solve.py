@@ -104,6 +104,7 @@ def test_a_tape_measures_the_wheels() -> None:
     assert made.scale == "distance"
 
 
+@pytest.mark.slow
 @each_way
 def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
@@ -113,6 +114,7 @@ def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
+@pytest.mark.slow
 def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     rng = np.random.default_rng(5)
     made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
@@ -120,6 +122,7 @@ def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
+@pytest.mark.slow
 def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
     made = drive(Robot(rng=np.random.default_rng(4)), [(200, 0, 0), *GUIDED, (100, 0, 0)], 1.7e9)
     head, *body = made.csv(places=False).splitlines()

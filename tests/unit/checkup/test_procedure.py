@@ -21,6 +21,12 @@ from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configu
 
 MOTORS = "abcd"
 
+
+def slow(value: object) -> object:
+    """One more of a kind."""
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 # robots that are right
 
 GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
@@ -51,6 +57,7 @@ def test_a_slow_wire_passes(baud: int) -> None:
     assert check(config=config).failed == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 0.2])
 def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
     for faults in ((), ("plain_only",), ("unprompted",)):
@@ -59,7 +66,7 @@ def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
         assert int(checked["watchdog"].figure.split()[0]) == pytest.approx(300, abs=60)
 
 
-@pytest.mark.parametrize("per_turn", [16, 24, 48, 64])
+@pytest.mark.parametrize("per_turn", [16, slow(24), slow(48), slow(64)])
 @pytest.mark.parametrize("fault", [(), ("no_check",)])
 def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -> None:
     config = Config(sim=SimConfig(encoder_counts=per_turn))
@@ -73,7 +80,7 @@ def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_tur
     assert checked["damaged lines"].verdict == "PASS"
 
 
-@pytest.mark.parametrize("lag", [0.8, 1.0])
+@pytest.mark.parametrize("lag", [slow(0.8), 1.0])
 @pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
 def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
     checked = check(fault, config=Config(sim=SimConfig(motor_time_constant=lag)))

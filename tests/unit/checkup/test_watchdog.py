@@ -84,7 +84,7 @@ def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
 
 
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
-@pytest.mark.parametrize("lag", [0.0, 0.6])
+@pytest.mark.parametrize("lag", [0.0, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], lag: float) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag))
     for robot in (Robot,) if lag else (Robot, ByItsOwnClock):
@@ -102,6 +102,7 @@ def test_broken_lines_are_never_taken_for_more_than_was_told() -> None:
     assert max(abs(value) for values in told for value in values) == SPEED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [(), ("no_check",)])
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 96])
 @pytest.mark.parametrize("time_s", [0.3, 0.52])
