@@ -80,7 +80,7 @@ class Person:
         _print("Enter starts it, any key then stops it; q leaves.", end="\n")
         while True:
             pressed = self._read()
-            if pressed in ("\n", "\r"):
+            if not pressed.strip("\r\n"):
                 return
             if LEAVES in pressed:
                 raise KeyboardInterrupt
@@ -95,12 +95,7 @@ class Person:
                 line = self._read().strip()
                 if line == LEAVES:
                     raise KeyboardInterrupt
-                try:
-                    number = (
-                        float(line.replace(",", ".")) if line or ask.usual is None else ask.usual
-                    )
-                except ValueError:
-                    number = float("nan")
+                number = _number(line, ask.usual)
                 if ask.least <= number <= ask.most:
                     return number
                 _print(f"a number of {ask.unit} from {ask.least:g} to {ask.most:g} (q leaves)")
