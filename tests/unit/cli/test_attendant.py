@@ -26,7 +26,7 @@ def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
     """What a person types who has read the question, for what is typed ahead is thrown away;
     standard input is the terminal."""
     master, slave = pty.openpty()
-    hands = []
+    hands: list[threading.Timer] = []
 
     def types(text: str) -> None:
         hands.append(threading.Timer(0.1 * (len(hands) + 1), os.write, [master, text.encode()]))
