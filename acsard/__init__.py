@@ -28,7 +28,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     sim/           P  the vehicle, the fake microcontroller, its faults
     checkup/       P  what `acsard mcu check` does: one module a question to the board
     calibration/   P  what `acsard calibrate` does: table and runs (a log), heading and places (what
-                      it shows), fit, solve (the order), report
+                      it shows), fit, solve (the order), report; calibration/guided/ is the
+                      drive without a log: the ways, the legs, what a person reads off
     host/          S  the machine: clock, timers, threads, files, systemd, journal, logs, errors
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates

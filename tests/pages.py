@@ -111,6 +111,7 @@ ROUTER = "tests/system/test_router.py"
 SERVICE = "tests/systemd/test_service.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
+GUIDED = "tests/system/test_calibrate.py"
 
 NO_ROS = Shown("needs ROS 2; the page says that it was not tried")
 TWO_MACHINES = Shown("needs a second machine")
@@ -199,6 +200,15 @@ COMMANDS: dict[str, How] = {
         SIMULATED, "test_a_drive_is_recorded_as_calibrate_reads_it"
     ),
     "acsard odom": Run("told by|stands still"),
+    "acsard calibrate": Elsewhere(
+        GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
+    ),
+    "acsard calibrate --way tape --write": Elsewhere(
+        GUIDED, "test_a_person_with_a_tape_alone_is_guided_to_the_written_file"
+    ),
+    "acsard calibrate --positions sim/pose --yes": Elsewhere(
+        GUIDED, "test_the_simulator_is_calibrated_by_its_true_pose_without_a_person"
+    ),
     "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
     "acsard calibrate --log drive.csv --distance straight=4.03 --write": Elsewhere(
         CALIBRATE, "test_a_distance_measures_the_wheels"

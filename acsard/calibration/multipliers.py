@@ -74,21 +74,25 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def found(fit: Fit, rate: Rates) -> Multipliers:
-    """The constants that serve best at the rates that were driven.
+    """The constants that serve best at the rates that were driven."""
+    return constant(fit.parameters, fit.covariance(), rate, fit.varies)
+
+
+def constant(parameters: Floats, every: Floats, rate: Rates, varies: float) -> Multipliers:
+    """The same of parameters and their covariance; `varies`: from block to block, a share.
 
     The variance of the track has how far it is from this constant at the slowest or fastest of
     them, or from block to block, whichever is more.
     """
-    turn, slope = fit.parameters[TURN], fit.parameters[RATE]
+    turn, slope = parameters[TURN], parameters[RATE]
     left = 1.0 - slope * rate.mean
-    values = np.array([1 / (turn * left), fit.parameters[LEFT], fit.parameters[RIGHT]])
-    jacobian = np.zeros((3, len(fit.parameters)))
+    values = np.array([1 / (turn * left), parameters[LEFT], parameters[RIGHT]])
+    jacobian = np.zeros((3, len(parameters)))
     jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
     jacobian[SEPARATION, TURN] = -values[SEPARATION] / turn
     jacobian[SEPARATION, RATE] = values[SEPARATION] * rate.mean / left
-    every = fit.covariance()
     covariance = jacobian @ every @ jacobian.T
     slopes = float(np.hypot(slope, min(USUAL[RATE], np.sqrt(every[RATE, RATE]))))
-    share = max(slopes * max(rate.mean, rate.fastest - rate.mean), fit.varies)
+    share = max(slopes * max(rate.mean, rate.fastest - rate.mean), varies)
     covariance[SEPARATION, SEPARATION] += (values[SEPARATION] * share) ** 2
     return Multipliers(values, covariance)

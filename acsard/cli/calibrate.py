@@ -1,16 +1,19 @@
-"""`acsard calibrate`: wheel radii and effective track from a recorded drive.
+"""`acsard calibrate`: wheel radii and effective track, from a guided drive or a recorded one.
 
-How they are found is `calibration/`'s.
+How they are found is `calibration/`'s; the guided drive is in `calibrate_drive.py`.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_config, find, load
+from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, guided
+from acsard.cli.common import add_bus, find, load
+from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
@@ -21,15 +24,20 @@ if TYPE_CHECKING:
     from acsard.config.settings import DriveConfig
 
 DESCRIPTION = """\
-Find the wheels' radii and the effective track from a log of a drive, each with its standard
-deviation, and tell what they improve. The log is a CSV file with a header: column t (s) and the
-wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right"; and yaw_rate (rad/s, of a gyro), or x and y
-(m, of any source of positions) with or without yaw (rad), or both; run (any name) tells several
-drives apart. Columns may be in any order, cells empty where a sensor has nothing to say. Good logs
-begin with 3 s of standing, and have straight drives, turns to both sides, slow and fast, and
-curves, for 60 s or more. Exit 0 when something was found, 1 when the log gives nothing, with what
-to drive instead.
+Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
+improve. Without --log the robot is driven, guided in words: a person at this terminal stands beside
+it on a free floor of 3 m x 3 m, starts each leg by Enter, stops it by any key, and reads off a tape
+what is asked for; at most 90 s of driving. With --log from a drive that was recorded: a CSV file
+with a header: column t (s) and the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right"; and
+yaw_rate (rad/s, of a gyro), or x and y (m, of any source of positions) with or without yaw (rad),
+or both; run (any name) tells several drives apart. Columns may be in any order, cells empty where a
+sensor has nothing to say. Good logs begin with 3 s of standing, and have straight drives, turns to
+both sides, slow and fast, and curves, for 60 s or more. Exit 0 when something was found, 1 when
+not, with what to do instead.
 """
+
+DRIVEN = "the drive"
+"""What a guided drive is called where a log has its name."""
 
 MOST_BYTES = 1 << 30
 """Of a log: it is read into memory."""
@@ -39,19 +47,18 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb."""
     parser = verbs.add_parser(
         "calibrate",
-        help="wheel radii and effective track from a recorded drive",
+        help="wheel radii and effective track, by a guided drive or from a recorded one",
         description=DESCRIPTION,
     )
-    add_config(parser)
-    parser.add_argument(
-        "--log", type=Path, required=True, metavar="FILE", help="the recorded drive, CSV"
-    )
+    add_bus(parser)
+    add_options(parser)
+    parser.add_argument("--log", type=Path, metavar="FILE", help="a recorded drive, CSV")
     parser.add_argument(
         "--distance",
         type=_distance,
         metavar="[RUN=]METRES",
-        help="how far from its start a run ends, in a straight line by tape measure: tells how "
-        "large the wheels are; without RUN it is the straightest run",
+        help="with --log: how far from its start a run ends, in a straight line by tape measure: "
+        "tells how large the wheels are; without RUN it is the straightest run",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
@@ -68,6 +75,7 @@ def main(args: argparse.Namespace) -> int:
     import msgspec
 
     from acsard.calibration.doubts import RefusedError
+    from acsard.calibration.guided.steps import GuideError
     from acsard.calibration.report import Refusal, keys, report, text
     from acsard.calibration.table import LogError
 
@@ -80,18 +88,41 @@ def main(args: argparse.Namespace) -> int:
                 "--write has no configuration file to write to: name it by --config, or make an "
                 "acsard.toml here (an empty one is valid)",
             )
+    source = str(args.log) if args.log else DRIVEN
     try:
-        found = _calibrated(args.log, config.drive, args.distance)
-    except (LogError, RefusedError) as error:
+        if args.log:
+            found = _calibrated(_only_log(args), config.drive, args.distance)
+        else:
+            found, config = guided(_no_log(args), config, where)
+    except (LogError, RefusedError, GuideError) as error:
         if args.json:
-            refusal = Refusal(str(args.log), str(error))
-            print(msgspec.json.encode(refusal).decode(), flush=True)
-        raise ExitError(Exit.FAILURE, f"{args.log}: {error}") from None
+            print(msgspec.json.encode(Refusal(source, str(error))).decode(), flush=True)
+        raise ExitError(Exit.FAILURE, f"{source}: {error}") from None
     if args.write:
         change(Path(where), keys(found))
-    told = report(str(args.log), found, config.drive, where if args.write else "")
+    told = report(source, found, config.drive, where if args.write else "")
     print(msgspec.json.encode(told).decode() if args.json else text(told, found, where))
+    if args.write and not args.log:
+        print("restart the daemon: it takes them at its start", file=sys.stderr)
     return int(Exit.OK)
+
+
+def _only_log(args: argparse.Namespace) -> Path:
+    """The log; raises `UsageError` for what only a drive takes."""
+    for name in DRIVE_OPTIONS:
+        if getattr(args, name):
+            option = "--" + name.replace("_", "-")
+            raise UsageError(
+                f"{option} is for a guided drive, --log for a recorded one: one of both"
+            )
+    log: Path = args.log
+    return log
+
+
+def _no_log(args: argparse.Namespace) -> argparse.Namespace:
+    if args.distance:
+        raise UsageError("--distance goes with --log; a guided drive asks for what it needs")
+    return args
 
 
 def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:

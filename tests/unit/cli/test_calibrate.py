@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import re
 from pathlib import Path
 
 import pytest
 
 from acsard.cli import calibrate
 from acsard.config.parsing import parse
+from acsard.host.errors import UnreachableError, UsageError
 from acsard.host.exits import Exit, ExitError
 from tests.unit.calibration.cut import usual
 
@@ -101,3 +104,42 @@ def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
 def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
     with pytest.raises(SystemExit):
         called(tmp_path, GOOD, f"--distance={word}")
+
+
+# without a log
+
+
+def driving(*words: str) -> int:
+    """`acsard calibrate` with these words, where nobody is at a terminal."""
+    parser = argparse.ArgumentParser()
+    calibrate.add(parser.add_subparsers())
+    args = parser.parse_args(["calibrate", *words])
+    return int(args.main(args))
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ([], "person at the terminal"),
+        (["--distance", "2.0"], "--distance goes with --log"),
+        (["--way", "positions"], "--positions KEY"),
+        (["--way", "tape", "--positions", "sim/pose"], "leave one out"),
+        (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
+        (["--positions", "odom"], "what the wheels say"),
+        (["--positions", "acsard/acsar/odom"], "what the wheels say"),
+        (["--log", "drive.csv", "--way", "tape"], "--way is for a guided drive"),
+        (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
+    ],
+)
+def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(
+    words: list[str], why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", open(os.devnull))  # noqa: SIM115
+    with pytest.raises(UsageError, match=re.escape(why)):
+        driving(*words)
+
+
+def test_without_a_daemon_it_is_said_where_none_is(tmp_path: Path) -> None:
+    with pytest.raises(UnreachableError):
+        driving("--yes", "--connect", "tcp/127.0.0.1:9")

@@ -1,0 +1,123 @@
+"""What was found from readings, as a calibration: settings, what they improve, what was driven."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from acsard.calibration import heading, turning
+from acsard.calibration.doubts import RefusedError, remarks
+from acsard.calibration.evidence import RATE, TURN, Base
+from acsard.calibration.gain import Error, Gain
+from acsard.calibration.gain import constant as with_one_track
+from acsard.calibration.guided.readings import Found, Reading, found, joined, predicted
+from acsard.calibration.multipliers import (
+    LEFT_RADIUS,
+    RIGHT_RADIUS,
+    Rates,
+    configured,
+    constant,
+    rates,
+)  # fmt: skip
+from acsard.calibration.paths import blocks, wheels
+from acsard.calibration.solve import Calibration, Drives
+from acsard.calibration.table import Floats
+from acsard.config.settings import DriveConfig
+
+BLOCK_S = 4.0
+
+WORST_TRACK, WORST_RATIO = 0.1, 0.02
+"""Standard deviations, as shares, that are too large for the result to be of use."""
+
+TURNED, STRAIGHT = np.pi, 0.5
+"""rad that the robot turned at least where a reading is one of turns, and at most where it is one
+of a straight drive."""
+
+
+def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
+    """By what was read off; raises `RefusedError`."""
+    base = Base(
+        drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
+        drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
+    )  # fmt: skip
+    rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
+    told = found(readings, base)
+    angles = [wheels(ride) for ride in rides]
+    rows = heading.rows(None, rides, angles, blocks(rides, angles, BLOCK_S))
+    by_wheels = turning.turned(rows, base, told.parameters)
+    rate = rates(rows, by_wheels)
+    result = constant(told.parameters, told.covariance, rate, 0.0)
+    _sure(told)
+    size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
+    drives = Drives(
+        len(rides), sum(float(ride.t[-1]) for ride in rides),
+        size * float(np.abs(rows.left + rows.right).sum()) / 2,
+        float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
+    )  # fmt: skip
+    now = told.parameters.copy()
+    now[: RATE + 1] = base.start()[: RATE + 1]
+    notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
+    return Calibration(
+        way, drives, configured(base), result, "distance", float(told.parameters[RATE]),
+        float(np.sqrt(told.covariance[RATE, RATE])), _gain(readings, base, told, now, rate),
+        {}, 0.0, tuple(notes),
+    )  # fmt: skip
+
+
+def _sure(told: Found) -> None:
+    every = told.covariance
+    track = float(np.sqrt(every[TURN, TURN])) / abs(told.parameters[TURN])
+    apart = np.zeros(len(told.parameters))
+    apart[:2] = -1.0, 1.0
+    ratio = float(np.sqrt(apart @ every @ apart)) / float(told.parameters[:2].mean())
+    for name, deviation, worst in (
+        ("the effective track", track, WORST_TRACK), ("left to right", ratio, WORST_RATIO),
+    ):  # fmt: skip
+        if not deviation <= worst:
+            raise RefusedError(
+                f"{name} comes out of these readings only to {deviation:.1%}, which is of no use: "
+                "they contradict each other, or the robot skids much. Begin again on even ground, "
+                "set the robot exactly, and read off to the millimetre"
+            )
+
+
+def _gain(readings: Sequence[Reading], base: Base, told: Found, now: Floats, rate: Rates) -> Gain:
+    """Each reading tried on what was found without it."""
+    sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
+    one = with_one_track(told.parameters, rate)
+    for number, reading in enumerate(readings):
+        steps = joined(reading.rides)
+        then = predicted(steps, reading.what, base, told.parameters).value
+        truth = then + told.left[number]
+        off = truth - predicted(steps, reading.what, base, now).value
+        # With one track for all rates, as the robot will have it.
+        moved = predicted(steps, reading.what, base, one).value - then
+        rest = told.without[number] - moved
+        if np.isnan(rest):
+            rest = told.left[number] - moved
+        turn = abs(predicted(steps, "turned", base, told.parameters).value)
+        if reading.what in ("turned", "angle"):
+            if turn > TURNED:
+                sums["turn"] += abs(off), abs(rest), turn
+            elif turn < STRAIGHT:
+                rolled = abs(predicted(steps, "distance", base, told.parameters).value)
+                sums["straight"] += abs(off), abs(rest), rolled
+        elif reading.what in ("ahead", "aside"):
+            sums["place"] += off**2, rest**2, 1.0
+    return Gain(
+        _error(sums["turn"], 360.0), _error(sums["straight"], float(np.degrees(10.0))),
+        _rms(sums["place"]),
+    )  # fmt: skip
+
+
+def _error(sums: Floats, unit: float) -> Error:
+    if not sums[2]:
+        return Error(None, None)
+    return Error(float(unit * sums[0] / sums[2]), float(unit * sums[1] / sums[2]))
+
+
+def _rms(sums: Floats) -> Error:
+    if not sums[2]:
+        return Error(None, None)
+    return Error(float(np.sqrt(sums[0] / sums[2])), float(np.sqrt(sums[1] / sums[2])))

@@ -1,0 +1,214 @@
+"""What a person read off with a tape -> wheel radii and effective track.
+
+Each reading tells where the robot ended, from where it last stood as it was told to: how far, how
+turned, or where in x and y. Gauss-Newton on all, as with positions (`calibration/places.py` sums
+the path). A reading is off by what a tape and an eye are, and by what skidding adds on the way; how
+much that was here, the readings say themselves, as far as they are many.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.doubts import RefusedError, in_range
+from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.fit import USUAL
+from acsard.calibration.paths import wheels
+from acsard.calibration.places import Grid, grid, path
+from acsard.calibration.runs import Run
+from acsard.calibration.table import Floats
+
+What = Literal["turned", "angle", "distance", "ahead", "aside"]
+"""`turned` is an angle with its whole turns counted, `angle` one without, both rad to the left;
+the others are m."""
+
+SKIDDING = 0.015
+"""rad by which a metre of rolling turns the robot more or less than it should; of two metres, the
+root of two times that."""
+
+STRETCH = 0.002
+"""Share by which a way is longer or shorter than it should."""
+
+UNKNOWN = 1.0
+"""Standard deviation of the mean radius, as a share, before anything was read off."""
+
+PRIOR_FREE = 4.0
+"""Readings that what is said here of their noise is worth."""
+
+LEAST_FREE = 3.0
+MOST_STEPS = 50
+SMALL = 1e-9
+
+ACTIVE = [LEFT, RIGHT, TURN, RATE]
+
+TELLS = 0.2
+"""rad of a reading's standard deviation that still tell how far the robot turned."""
+
+
+class Reading(Struct, frozen=True):
+    """What was read off after some rides, one behind the other, and how well one can."""
+
+    rides: tuple[Run, ...]
+    what: What
+    value: float
+    deviation: float
+
+
+class Predicted(Struct, frozen=True):
+    """By some parameters: the value of a reading, its slopes, and the variance of skidding."""
+
+    value: float
+    slopes: Floats
+    variance: float
+
+
+class Found(Struct, frozen=True):
+    """Parameters with their covariance; and of each reading what is left, with all readings and
+    with the parameters found without it."""
+
+    parameters: Floats
+    covariance: Floats
+    left: Floats
+    without: Floats
+
+
+def joined(rides: Sequence[Run]) -> Grid:
+    """Several rides as one."""
+    grids = [grid(ride, wheels(ride)) for ride in rides]
+    ends = np.cumsum([0.0] + [float(one.t[-1]) for one in grids])
+    t = np.concatenate([grids[0].t[:1]] + [g.t[1:] + e for g, e in zip(grids, ends, strict=False)])
+    columns = zip(*((g.left, g.right, g.fast) for g in grids), strict=True)
+    return Grid(t, *(np.concatenate(column) for column in columns))
+
+
+def predicted(steps: Grid, what: What, base: Base, parameters: Floats) -> Predicted:
+    """What would be read off."""
+    way = path(steps, base, parameters)
+    rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
+    slopes = np.zeros(COUNT)
+    place, swing = complex(way.place[-1]), SKIDDING**2 * rolled
+    if what in ("turned", "angle"):
+        for index, bend in way.bends.items():
+            slopes[index] = bend[-1]
+        return Predicted(float(way.heading[-1]), slopes, swing)
+    # Along the way to where it ended, ahead, or to the left.
+    along = {"ahead": 1.0 + 0j, "aside": 1j}.get(what, place / (abs(place) or 1.0))
+    for index, values in way.slopes.items():
+        slopes[index] = (np.conj(along) * values[-1]).real
+    variance = (STRETCH * abs(place)) ** 2
+    if what != "distance":
+        # A turn on the way moves the end by as much as is still to go, a third of it in the mean.
+        span = float(np.ptp(way.place.real) + np.ptp(way.place.imag))
+        variance += swing * span**2 / 3
+    return Predicted(float((np.conj(along) * place).real), slopes, variance)
+
+
+def found(readings: Sequence[Reading], base: Base) -> Found:
+    """Of the robot that these were read off; raises `RefusedError`."""
+    steps = [joined(reading.rides) for reading in readings]
+    start = _begun(readings, steps, base)
+    parameters, normal, _ = _solved(readings, steps, base, start)
+    in_range(np.array([1 / parameters[TURN], parameters[LEFT], parameters[RIGHT]]))
+    left, weights = _left(readings, steps, base, parameters)
+    # What chance did here, with what it was said to do; few are answered for with Student's t.
+    free = PRIOR_FREE + max(0.0, len(readings) - len(ACTIVE) + 1.0)
+    scale = (PRIOR_FREE + float(weights @ left**2)) / free
+    free = max(LEAST_FREE, free)
+    covariance = np.zeros((COUNT, COUNT))
+    inner = np.linalg.inv(normal[np.ix_(ACTIVE, ACTIVE)])
+    covariance[np.ix_(ACTIVE, ACTIVE)] = inner * max(1.0, scale) * free / (free - 2)
+    without = np.array([_without(n, readings, steps, base, parameters) for n in range(len(left))])
+    return Found(parameters, covariance, left, without)
+
+
+def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Floats:
+    """Where angles are told right by whole turns: as the turns that were counted say."""
+    start = base.start()
+    for reading, grid_ in zip(readings, steps, strict=True):
+        if reading.what == "turned" and reading.deviation < TELLS * abs(reading.value):
+            told = predicted(grid_, "turned", base, start).value
+            if not 0.1 < told / reading.value < 10.0:
+                raise RefusedError(
+                    f"the wheels say that the robot turned by {math.degrees(told):.0f} deg, the "
+                    f"person {math.degrees(reading.value):.0f}: begin again, and let it turn once "
+                    "round, to the left"
+                )
+            start[TURN] *= reading.value / told
+            break
+    return start
+
+
+def _solved(
+    readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Parameters and normal equations."""
+    parameters, begun = start.copy(), base.start()
+    for _ in range(MOST_STEPS):
+        normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
+        for reading, grid_ in zip(readings, steps, strict=True):
+            told = predicted(grid_, reading.what, base, parameters)
+            weight = 1 / (reading.deviation**2 + told.variance)
+            normal += weight * np.outer(told.slopes, told.slopes)
+            score += weight * told.slopes * _off(reading, told.value)
+        normal[RATE, RATE] += USUAL[RATE] ** -2
+        score[RATE] -= parameters[RATE] * USUAL[RATE] ** -2
+        both = np.zeros(COUNT)
+        both[[LEFT, RIGHT]] = 0.5
+        normal += np.outer(both, both) / UNKNOWN**2
+        score += both * float(both @ (begun - parameters)) / UNKNOWN**2
+        inner = normal[np.ix_(ACTIVE, ACTIVE)]
+        if np.linalg.cond(_correlated(inner)) > 1e8:
+            raise RefusedError(
+                "what was measured does not tell the wheels from the track: the robot hardly moved "
+                "or hardly turned. See that it can, and begin again"
+            )
+        step = np.linalg.solve(inner, score[ACTIVE])
+        parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
+        if float(np.abs(step).max()) < SMALL:
+            return parameters, normal, score
+    raise RefusedError(
+        "what was measured does not fit together: is each number in its unit, and of the end that "
+        "was asked for? Begin again"
+    )
+
+
+def _correlated(normal: Floats) -> Floats:
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.asarray(normal / np.outer(size, size))
+
+
+def _off(reading: Reading, told: float) -> float:
+    off = reading.value - told
+    return math.remainder(off, 2 * math.pi) if reading.what == "angle" else off
+
+
+def _left(
+    readings: Sequence[Reading], steps: Sequence[Grid], base: Base, parameters: Floats
+) -> tuple[Floats, Floats]:
+    """What the parameters leave of each reading, and its weight."""
+    left, weights = [], []
+    for reading, grid_ in zip(readings, steps, strict=True):
+        told = predicted(grid_, reading.what, base, parameters)
+        left.append(_off(reading, told.value))
+        weights.append(1 / (reading.deviation**2 + told.variance))
+    return np.array(left), np.array(weights)
+
+
+def _without(
+    number: int, readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
+) -> float:
+    """What is left of one reading with the parameters found without it; nan where they are not."""
+    kept = [n for n in range(len(readings)) if n != number]
+    try:
+        parameters, _, _ = _solved(
+            [readings[n] for n in kept], [steps[n] for n in kept], base, start
+        )
+    except RefusedError:
+        return math.nan
+    told = predicted(steps[number], readings[number].what, base, parameters)
+    return _off(readings[number], told.value)

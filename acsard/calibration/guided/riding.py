@@ -1,0 +1,194 @@
+"""One leg: what is commanded now, from what the daemon tells and what the person presses.
+
+Zeros until the daemon counts them, the moves by their times, zeros until the wheels stand. What is
+not as it must be halts it, for good and with the reason: `halted`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from acsard.calibration.guided.steps import Leg
+from acsard.config.settings import DriveConfig
+from acsard.messages.schema import RobotState
+from acsard.values import REST, Twist
+
+OPENING_S, OPENED_S = 0.4, 4.0
+"""Zeros at first for so long at least, and until they count; then it is given up."""
+
+SILENT_S = 0.5
+"""Without a word from the daemon."""
+
+OBEYED_S = 1.5
+"""After a command has changed the robot has to do it: a ramp takes a part of that."""
+
+DOUBT_S = 1.0
+"""That it does not do as it is told, before it is given up."""
+
+LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
+"""m/s, rad/s and the share of what is commanded that it may do otherwise."""
+
+STILL = 0.02
+"""rad/s; wheels that turn slower stand."""
+
+STANDING_S, STANDS_S = 0.5, 6.0
+"""They have to stand for so long, and within so long."""
+
+LATCHED = ("inactive", "stopped", "fault", "leaving", "waiting")
+"""Modes in which no command counts."""
+
+ENTER = "\r\n"
+PRESSED = "a key was pressed"
+
+
+class Phase(StrEnum):
+    OPENING = "opening"
+    MOVING = "moving"
+    SETTLING = "settling"
+    DONE = "done"
+    HALTED = "halted"
+
+
+class Riding:
+    """A leg while it is driven; times are s of one clock."""
+
+    def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float) -> None:
+        self._leg, self._source, self._drive = leg, source, drive
+        self.phase = Phase.OPENING
+        self.halted = ""
+        """Why it ended before its end."""
+        self._begun = self._heard = self._changed = now
+        self._number, self._ends = -1, now
+        self._command = REST
+        self._waits: str | None = "a daemon that hears us"
+        self._still_since: float | None = None
+        self._doubted: float | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.phase in (Phase.DONE, Phase.HALTED)
+
+    def progress(self, now: float) -> float:
+        """Share of the leg that is done; 1 when it is over."""
+        if self.over:
+            return 1.0
+        if self._number < 0:
+            return 0.0
+        behind = sum(move.seconds for move in self._leg.moves[: self._number + 1])
+        return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
+
+    def key(self, pressed: str, now: float) -> None:
+        """A key was pressed; the hand that has just pressed Enter may still lie on it."""
+        if self.phase is Phase.OPENING and pressed in ENTER:
+            return
+        last = self._number == len(self._leg.moves) - 1
+        if self.phase is Phase.MOVING and self._leg.by_key and last:
+            self._settle(now)
+        elif self.phase is not Phase.SETTLING or not self._leg.by_key:
+            self._halt(PRESSED)
+
+    def state(self, state: RobotState, now: float) -> None:
+        """The daemon tells how the robot is."""
+        self._heard = now
+        if state.mode in LATCHED:
+            self._halt(f"the robot is {state.mode}: {state.reason}")
+        elif state.source not in ("", self._source):
+            self._halt(f"{state.source} commands the robot now")
+        elif self.phase is Phase.OPENING:
+            self._waits = _waits(state, self._source)
+        elif self.phase is Phase.MOVING:
+            self._doubt(self._objection(state, now), now)
+
+    def wheels(self, fastest: float, now: float) -> None:
+        """The fastest wheel turns at so many rad/s."""
+        self._heard = now
+        if fastest > STILL:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = now
+
+    def step(self, now: float) -> Twist:
+        """What is to be commanded at this time."""
+        if not self.over and now - self._heard > SILENT_S:
+            self._halt("no word from the daemon")
+        if self.phase is Phase.OPENING:
+            self._open(now)
+        if self.phase is Phase.MOVING and now >= self._ends:
+            self._next(now)
+        if self.phase is Phase.SETTLING:
+            self._stand(now)
+        return self._command
+
+    def _open(self, now: float) -> None:
+        passed = now - self._begun
+        if passed >= OPENING_S and not self._waits:
+            self.phase, self._ends = Phase.MOVING, now
+        elif passed >= OPENED_S:
+            self._halt(f"the daemon does not take our commands: it waits for {self._waits}")
+
+    def _next(self, now: float) -> None:
+        self._number += 1
+        if self._number >= len(self._leg.moves):
+            if self._leg.by_key:
+                self._halt("no key was pressed when the robot had come round")
+            else:
+                self._settle(now)
+            return
+        move = self._leg.moves[self._number]
+        self._command = Twist(move.linear, move.angular)
+        # From when the last one was to end: what comes late is not driven on top.
+        self._ends, self._changed = self._ends + move.seconds, now
+
+    def _settle(self, now: float) -> None:
+        self.phase, self._command = Phase.SETTLING, REST
+        self._ends, self._still_since = now, None
+
+    def _stand(self, now: float) -> None:
+        if self._still_since is not None and now - self._still_since >= STANDING_S:
+            self.phase = Phase.DONE
+        elif now - self._ends > STANDS_S:
+            self._halt("the wheels do not come to rest though zero is commanded")
+
+    def _doubt(self, why: str, now: float) -> None:
+        """A machine that is busy for a moment sends late, and the robot slows down: that passes."""
+        if not why:
+            self._doubted = None
+        elif self._doubted is None:
+            self._doubted = now
+        elif now - self._doubted >= DOUBT_S:
+            self._halt(why)
+
+    def _objection(self, state: RobotState, now: float) -> str:
+        """What speaks against its doing as it is told, by its wheels: a gyro sees what skidding
+        leaves of a turn, which is no disobedience."""
+        if waits := _waits(state, self._source):
+            return f"the daemon does not follow us, it waits for {waits}"
+        if now - self._changed < OBEYED_S:
+            return ""
+        right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
+        linear = self._drive.wheel_radius * (right + left) / 4
+        track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier
+        angular = self._drive.wheel_radius * (right - left) / 2 / track
+        for told, does, off, unit in (
+            (self._command.linear, linear, LINEAR_OFF, "m/s"),
+            (self._command.angular, angular, ANGULAR_OFF, "rad/s"),
+        ):
+            if abs(does - told) > off + OFF_SHARE * abs(told):
+                return (
+                    f"the wheels do {does:.2f} {unit} where {told:.2f} are commanded: another "
+                    "commander, a limit or an obstacle"
+                )
+        return ""
+
+    def _halt(self, why: str) -> None:
+        if not self.over:
+            self.phase, self._command, self.halted = Phase.HALTED, REST, why
+
+
+def _waits(state: RobotState, source: str) -> str:
+    """What our commands wait for before they count; "" when they do."""
+    for one in state.sources:
+        if one.name == source:
+            heard = one.age is not None and one.age < OPENING_S
+            return one.waits_for if heard else one.waits_for or "a command"
+    return f"a source {source} in commands.sources"

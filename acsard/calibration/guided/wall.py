@@ -1,0 +1,129 @@
+"""With a wall that the robot is squared against, and a tape measure."""
+
+from __future__ import annotations
+
+import math
+
+from acsard.calibration.guided.measured import calibrated
+from acsard.calibration.guided.readings import Reading
+from acsard.calibration.guided.setup import ROOM, Setup
+from acsard.calibration.guided.spins import (
+    deviation,
+    effective,
+    millimetres,
+    once_round,
+    slant,
+    turns,
+)  # fmt: skip
+from acsard.calibration.guided.steps import Leg, Move, Part, Way, ask, ride
+from acsard.calibration.tape import LEAST_M
+
+TAPE_M = 0.005
+GAP_M = 0.2
+"""m from the wall that it comes back to."""
+
+OUT_M = 0.9
+"""Before the turns on the spot."""
+
+HALF, FAST = 0.8, 1.2
+"""rad/s that the robot truly turns."""
+
+MOST_TURNS = 2
+STANDING = Move(0.6)
+
+SQUARE = (
+    "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
+)
+
+
+def out(setup: Setup) -> Leg:
+    """Away from the wall."""
+    return Leg(
+        f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle of "
+        f"that. It drives {setup.length:.2f} m away from the wall.",
+        (STANDING, setup.ahead(setup.length), STANDING),
+    )
+
+
+def first_turn(setup: Setup) -> Leg:
+    """Until the person says that it is round."""
+    return once_round(
+        setup,
+        "It turns to the left, on the spot. Press SPACE when it has turned once round and looks "
+        "straight away from the wall as before; 10 deg too far or too short do not matter.",
+    )
+
+
+def home(setup: Setup) -> Leg:
+    """Back, as it came."""
+    return Leg("It drives back towards the wall.", (setup.ahead(GAP_M - setup.length), STANDING))
+
+
+def there_and_back(setup: Setup, side: int, track: float) -> Leg:
+    """Out, half a turn, and home again ahead."""
+    half = setup.turn(side * math.pi, HALF, track)
+    which = "left" if side > 0 else "right"
+    return Leg(
+        f"{SQUARE}. It drives away from the wall, turns half round to the {which}, and drives "
+        "back.",
+        (
+            STANDING, setup.ahead(setup.length), STANDING, half, STANDING,
+            setup.ahead(setup.length - 2 * GAP_M), STANDING,
+        ),
+    )  # fmt: skip
+
+
+def spun(setup: Setup, track: float) -> Leg:
+    """Out, some turns, and back."""
+    count = turns(setup, FAST, track, MOST_TURNS)
+    around = setup.turn(-2 * math.pi * count, FAST, track)
+    return Leg(
+        f"{SQUARE}. It drives away from the wall, turns {count} times round to the right, and "
+        "drives back.",
+        (
+            STANDING, setup.ahead(OUT_M), STANDING, around, STANDING, setup.ahead(GAP_M - OUT_M),
+            STANDING,
+        ),
+    )  # fmt: skip
+
+
+def longest_s(setup: Setup, track: float) -> float:
+    """Of driving, s, with this effective over geometric track."""
+    legs = [out(setup), first_turn(setup), home(setup), spun(setup, track)]
+    legs += [there_and_back(setup, side, track) for side in (1, -1)]
+    return sum(leg.seconds for leg in legs)
+
+
+def way(setup: Setup) -> Way:
+    """All of it."""
+    apart = yield from millimetres(
+        "How far apart are the robot's rear corners, where they touch the wall?", 50, 2000
+    )
+    front = yield from millimetres("And its front corners?", 50, 2000)
+    first = yield from ride(out(setup))
+    metres = yield from ask(
+        "How far is the robot's back from the wall now?", "m", LEAST_M, 2 * ROOM
+    )
+    readings = [Reading((first,), "distance", metres, TAPE_M)]
+    round_ = yield from ride(first_turn(setup))
+    last = yield from ride(home(setup))
+    angle = yield from _off(apart, "rear")
+    once = Reading((first, round_, last), "turned", 2 * math.pi + angle, deviation(apart))
+    track = effective(once, setup.drive)
+    readings.append(once)
+    for side in (1, -1):
+        ridden = yield from ride(there_and_back(setup, side, track))
+        angle = yield from _off(front, "front")
+        readings.append(Reading((ridden,), "angle", side * math.pi + angle, deviation(front)))
+    ridden = yield from ride(spun(setup, track))
+    angle = yield from _off(apart, "rear")
+    readings.append(Reading((ridden,), "angle", angle, deviation(apart)))
+    return calibrated("a wall", readings, setup.drive)
+
+
+def _off(apart: float, end: str) -> Part[float]:
+    """rad to the left of where it should look, at a right angle to the wall."""
+    left = yield from millimetres(f"From the wall to the robot's {end} left corner?", 0, 2500)
+    right = yield from millimetres(f"And to its {end} right corner?", 0, 2500)
+    # What lies to the left goes to the wall as the back does, and away from it as the front does.
+    return slant(left, right, apart) if end == "rear" else slant(right, left, apart)

@@ -1,0 +1,39 @@
+"""**The** table of the ways to calibrate by a guided drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from msgspec import Struct
+
+from acsard.calibration.guided import tape, tour, umbmark, wall
+from acsard.calibration.guided.setup import WIDEST, Setup
+from acsard.calibration.guided.steps import Way
+
+TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
+"""More turns in the time there is make a lesser one take longer, here and there."""
+
+
+class Kind(Struct, frozen=True):
+    """One way."""
+
+    needs: str
+    begin: Callable[[Setup], Way]
+    longest_s: Callable[[Setup, float], float]
+    """Of driving, s, with an effective over geometric track."""
+    person: bool
+    """Somebody has to read off numbers."""
+
+    def told(self, setup: Setup) -> str:
+        """How long it drives, in words."""
+        most = max(self.longest_s(setup, track) for track in TRACKS)
+        return f"It drives for at most {most:.0f} s in all."
+
+
+KINDS: dict[str, Kind] = {
+    "gyro": Kind("a gyro on the key imu, and a tape measure", tour.gyro, tour.spinning_s, False),
+    "positions": Kind("positions on a key", tour.positions, tour.petals_s, False),
+    "tape": Kind("a tape measure and a straight line on the floor", tape.way, tape.longest_s, True),
+    "wall": Kind("a straight wall and a tape measure", wall.way, wall.longest_s, True),
+    "umbmark": Kind("a tape measure and marks", umbmark.way, umbmark.longest_s, True),
+}

@@ -1,0 +1,182 @@
+"""Who stands beside the robot while it is calibrated: a person at this terminal, or nobody."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Protocol
+
+from acsard.calibration.guided.steps import Ask, GuideError
+
+COLUMNS = 88
+BAR = 30
+
+LEAVES = "q"
+
+
+class Attendant(Protocol):
+    """What is asked of whoever stands there; all of it goes to standard error."""
+
+    def say(self, text: str) -> None:
+        """Tell."""
+
+    def start(self, text: str) -> None:
+        """Return when the leg may begin; raises `KeyboardInterrupt`."""
+
+    def number(self, ask: Ask) -> float:
+        """What was read off; raises `KeyboardInterrupt` or `GuideError`."""
+
+    def keys(self, wait_s: float) -> str:
+        """The keys that were pressed; waits that long for one."""
+
+    def progress(self, share: float) -> None:
+        """So much of the leg is done."""
+
+
+class Nobody:
+    """Agrees to every leg and measures nothing: for the simulator."""
+
+    def say(self, text: str) -> None:
+        _print(text)
+
+    def start(self, text: str) -> None:
+        _print(text)
+
+    def number(self, ask: Ask) -> float:
+        if ask.usual is None:
+            raise GuideError("this way needs a person who measures: leave --yes out")
+        return ask.usual
+
+    def keys(self, wait_s: float) -> str:
+        select.select([], [], [], wait_s)
+        return ""
+
+    def progress(self, share: float) -> None:
+        pass
+
+
+class Person:
+    """At the terminal that standard input is: single keys while the robot drives, lines else."""
+
+    def __init__(self) -> None:
+        self._input = sys.stdin.fileno()
+
+    def say(self, text: str) -> None:
+        _print(text)
+
+    def start(self, text: str) -> None:
+        import termios
+
+        _print(text)
+        # Keys from before these words were read start nothing.
+        termios.tcflush(self._input, termios.TCIFLUSH)
+        _print("Enter starts it, any key then stops it; q leaves.", end="\n")
+        while True:
+            pressed = self._read()
+            if not pressed.strip("\r\n"):
+                return
+            if LEAVES in pressed:
+                raise KeyboardInterrupt
+
+    def number(self, ask: Ask) -> float:
+        import termios
+
+        with _lines(self._input):
+            termios.tcflush(self._input, termios.TCIFLUSH)
+            while True:
+                print(f"\n{_wrapped(ask.words)}\n{ask.unit}: ", end="", file=sys.stderr, flush=True)
+                line = self._read().strip()
+                if line == LEAVES:
+                    raise KeyboardInterrupt
+                number = _number(line, ask.usual)
+                if ask.least <= number <= ask.most:
+                    return number
+                _print(f"a number of {ask.unit} from {ask.least:g} to {ask.most:g} (q leaves)")
+
+    def keys(self, wait_s: float) -> str:
+        return self._read() if select.select([self._input], [], [], wait_s)[0] else ""
+
+    def progress(self, share: float) -> None:
+        if sys.stderr.isatty():
+            done = round(BAR * share)
+            bar = "#" * done + "." * (BAR - done)
+            end = "\n" if share >= 1.0 else ""
+            print(f"\r[{bar}] any key stops ", end=end, file=sys.stderr, flush=True)
+
+    def _read(self) -> str:
+        read = os.read(self._input, 256)
+        if not read:  # the terminal has been closed
+            raise KeyboardInterrupt
+        return read.decode(errors="replace")
+
+
+@contextmanager
+def attending() -> Iterator[Person]:
+    """A person whose keys come one by one; the terminal is left as it was."""
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield Person()
+    finally:
+        try:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        except (OSError, termios.error):
+            pass  # the terminal has been closed
+
+
+@contextmanager
+def interrupted_by(numbers: Sequence[signal.Signals]) -> Iterator[None]:
+    """These signals end it as Ctrl-C does, so that zeros go out; Ctrl-Z would leave it driving."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = [signal.signal(number, end) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _lines(terminal: int) -> Iterator[None]:
+    """Whole lines, shown as they are typed."""
+    import termios
+
+    before = termios.tcgetattr(terminal)
+    cooked = termios.tcgetattr(terminal)
+    cooked[3] |= termios.ICANON | termios.ECHO
+    termios.tcsetattr(terminal, termios.TCSANOW, cooked)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(terminal, termios.TCSANOW, before)
+
+
+def _number(line: str, usual: float | None) -> float:
+    """nan for what is none."""
+    if not line and usual is not None:
+        return usual
+    try:
+        return float(line.replace(",", "."))
+    except ValueError:
+        return math.nan
+
+
+def _print(text: str, end: str = "\n") -> None:
+    print(f"\n{_wrapped(text)}", end=end, file=sys.stderr, flush=True)
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, COLUMNS))

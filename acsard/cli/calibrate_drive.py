@@ -1,0 +1,188 @@
+"""`acsard calibrate` without a log: a guided drive, from the first question to the result."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+from acsard.host.errors import UsageError
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from acsard.calibration.guided.setup import Setup
+    from acsard.calibration.guided.ways import Kind
+    from acsard.calibration.solve import Calibration
+    from acsard.cli.attendant import Attendant
+    from acsard.cli.calibrate_robot import Robot
+    from acsard.client import Client
+    from acsard.config.settings import Config
+
+DRIVE_OPTIONS = ("way", "positions", "positions_at", "yes")
+WAYS = ("gyro", "positions", "tape", "wall", "umbmark")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What only a guided drive takes."""
+    parser.add_argument(
+        "--way",
+        choices=WAYS,
+        help="what the drive is compared with; without it a gyro where the robot has one "
+        "([odometry] gyro), else a tape",
+    )
+    parser.add_argument(
+        "--positions",
+        metavar="KEY",
+        help="with positions on this key (PoseStamped or Odometry, in JSON, msgpack or CDR): as "
+        "`acsard topics` lists it (sim/pose), or any full key",
+    )
+    parser.add_argument(
+        "--positions-at",
+        metavar="ENDPOINT",
+        help="where that key is, when the daemon does not have it: a router, say",
+    )
+    parser.add_argument(
+        "--imu", metavar="KEY", default="imu", help="the gyro's key (imu): as listed, or a full key"
+    )
+    parser.add_argument(
+        "--yes",
+        action="store_true",
+        help="start every leg without Enter; only with the built-in simulator",
+    )
+
+
+def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibration, Config]:
+    """What was found, and the configuration of the robot it was found for. Raises `GuideError`,
+    `LogError` and `RefusedError`; a key and Ctrl-C end it with zeros."""
+    from acsard.bus.address import address_of
+    from acsard.calibration.guided.setup import setup
+    from acsard.calibration.guided.steps import GuideError
+    from acsard.calibration.guided.ways import KINDS
+    from acsard.cli.calibrate_robot import SOURCE, Robot
+    from acsard.client import connect
+    from acsard.messages.topics import full_key
+
+    endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
+    _usable(args, full_key(robot_id, "odom"))
+    with ExitStack() as stack:
+        client = stack.enter_context(connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls))
+        _may(args, client)
+        config = _in_force(client, config, where, write=args.write)
+        name = _way(args, config)
+        made, kind = setup(config), KINDS[name]
+        attendant = stack.enter_context(_attendant(args))
+        robot = Robot(client, config, attendant)
+        if name == "gyro":
+            robot.gyro(args.imu)
+        elif name == "positions":
+            robot.positions(args.positions, _elsewhere(args, tls, stack))
+        try:
+            return _played(kind, made, robot, attendant), config
+        except KeyboardInterrupt:
+            raise GuideError("ended by the person. Nothing is written") from None
+
+
+def _usable(args: argparse.Namespace, odometry: str) -> None:
+    if args.way == "positions" and not args.positions:
+        raise UsageError("--way positions needs the key they come on: --positions KEY")
+    if args.positions and args.way not in (None, "positions"):
+        raise UsageError(f"--positions is for another way than --way {args.way}; leave one out")
+    if args.positions in ("odom", odometry):
+        raise UsageError(
+            "odom is what the wheels say already: positions have to come from elsewhere"
+        )
+    if args.positions_at and not args.positions:
+        raise UsageError("--positions-at says where --positions KEY is; give that as well")
+    if not args.yes and not sys.stdin.isatty():
+        raise UsageError(
+            "calibrate drives the robot, and a person at the terminal starts and stops it: run it "
+            "in one. --yes without one is for the built-in simulator; --log takes a recorded drive"
+        )
+
+
+def _may(args: argparse.Namespace, client: Client) -> None:
+    """Nothing real moves without a person."""
+    if args.yes and not client.get("info").simulated:
+        raise UsageError(
+            "--yes is for the built-in simulator: this robot is real, and somebody has to stand "
+            "beside it and start each leg. Leave --yes out"
+        )
+
+
+def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Config:
+    """The configuration the daemon runs with."""
+    import msgspec
+
+    from acsard.calibration.guided.steps import GuideError
+    from acsard.config.settings import Config
+
+    config = msgspec.convert(client.get("config"), Config)
+    same = config.drive.wheel_radius, config.drive.wheel_separation
+    if write and same != (mine.drive.wheel_radius, mine.drive.wheel_separation):
+        raise GuideError(
+            f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation = "
+            f"{same[1]:g}, and {where} says otherwise: give --config the file it runs with"
+        )
+    return config
+
+
+def _way(args: argparse.Namespace, config: Config) -> str:
+    if args.positions:
+        return "positions"
+    if args.way == "gyro" and args.imu == "imu" and not config.odometry.gyro:
+        raise UsageError(
+            "this robot's daemon hears no gyro: set odometry.gyro = true and restart it, or give "
+            "--way tape, wall or umbmark"
+        )
+    way: str = args.way or ("gyro" if config.odometry.gyro else "tape")
+    return way
+
+
+@contextmanager
+def _attendant(args: argparse.Namespace) -> Iterator[Attendant]:
+    from acsard.cli.attendant import Nobody, attending, interrupted_by
+
+    if args.yes:
+        yield Nobody()
+        return
+    numbers = signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+    with attending() as person, interrupted_by(numbers):
+        yield person
+
+
+def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Session | None:
+    """A session of its own for positions that the daemon does not have."""
+    if not args.positions_at:
+        return None
+    from acsard.bus.session import client_session
+
+    session = client_session(args.positions_at, tls)
+    stack.callback(session.close)
+    return session
+
+
+def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Calibration:
+    from acsard.calibration.guided.steps import Leg
+
+    attendant.say(
+        f"Calibration with {kind.needs}. {kind.told(made)} Stay beside the robot: any key stops it "
+        "at once."
+    )
+    way, number = kind.begin(made), 0
+    step = next(way)
+    while True:
+        if isinstance(step, Leg):
+            number += 1
+            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)")
+            answer: object = robot.ride(step)
+        else:
+            answer = attendant.number(step)
+        try:
+            step = way.send(answer)
+        except StopIteration as end:
+            found: Calibration = end.value
+            return found

@@ -1,0 +1,157 @@
+"""The robot on the bus while it is calibrated: a leg is driven, and what was told of it recorded.
+
+What is decided on the way is `calibration/guided/riding.py`'s.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.calibration.guided.recorder import Recorder
+from acsard.calibration.guided.riding import Riding
+from acsard.calibration.guided.steps import GuideError, Leg
+from acsard.calibration.runs import Run
+from acsard.cli.attendant import Attendant
+from acsard.client import SEND_PERIOD_S, Client
+from acsard.config.settings import Config
+from acsard.messages.encodings import DecodeError, Decoder
+from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
+from acsard.messages.topics import by_key
+
+SOURCE = "app"
+
+LOOK_S = 0.005
+"""Between two looks at keys and messages: so late a key stops it at most."""
+
+OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
+"""Zeros come closer at first: the daemon learns by them how late we are."""
+
+ZEROS = 3
+SHOWN_S = 0.2
+
+FIRST_S = 3.0
+"""For the first sample of a sensor."""
+
+POSITIONS = (Odometry, PoseStamped)
+"""In this order: CDR says no type, and what is too short for odometry is a pose."""
+
+Take = Callable[[Any, float], object]
+
+
+class Sensor:
+    """What one key says, decoded as the first type that fits."""
+
+    def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
+        self.key = key
+        self._samples = Subscription(queue_on(session, key, latched=False), key)
+        self._decoders: list[Decoder[Any]] = [Decoder(one) for one in types]
+
+    def hear(self, take: Take, now: float) -> int:
+        """Hand over what has come; how many samples. Raises `GuideError` for what is none."""
+        count = 0
+        while (sample := self._samples.try_recv()) is not None:
+            take(self._decoded(sample), now)
+            count += 1
+        return count
+
+    def await_first(self, what: str) -> None:
+        """Raises `GuideError` when nothing comes."""
+        end = time.monotonic() + FIRST_S
+        while not self.hear(lambda message, now: None, 0.0):
+            if time.monotonic() > end:
+                raise GuideError(f"{what} does not come on {self.key}")
+            time.sleep(LOOK_S)
+
+    def _decoded(self, sample: zenoh.Sample) -> Any:
+        errors = []
+        for at, decoder in enumerate(self._decoders):
+            try:
+                message = decoder.decode(*encoded(sample))
+            except DecodeError as error:
+                errors.append(str(error))
+                continue
+            self._decoders = self._decoders[at : at + 1]
+            return message
+        raise GuideError(f"what comes on {self.key} cannot be read: {'; '.join(errors)}")
+
+
+class Robot:
+    """A robot that drives legs."""
+
+    def __init__(self, client: Client, config: Config, attendant: Attendant) -> None:
+        self._client, self._attendant = client, attendant
+        self._joints, self._geometry = config.joints.as_tuple(), config.drive
+        self._sensors: list[tuple[Sensor, str]] = []
+        self._wheels = self._own("wheel_states", JointState)
+        self._states = self._own("state", RobotState)
+
+    def gyro(self, key: str) -> None:
+        """Record turn rates of a key; raises `GuideError` when none come."""
+        sensor = Sensor(self._client.session, self._full(key), (Imu,))
+        sensor.await_first("a gyro's turn rate")
+        self._sensors.append((sensor, "gyro"))
+
+    def positions(self, key: str, session: zenoh.Session | None) -> None:
+        """The same for positions."""
+        sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
+        sensor.await_first("a position (PoseStamped or Odometry)")
+        self._sensors.append((sensor, "place"))
+
+    def ride(self, leg: Leg) -> Run:
+        """Drive it; raises `GuideError` when it ends before its end."""
+        recorder = Recorder(self._joints)
+        self._drain()
+        riding = Riding(leg, SOURCE, self._geometry, time.monotonic())
+        try:
+            self._drive(riding, recorder)
+        finally:
+            for _ in range(ZEROS):
+                self._client.send(0.0, 0.0)
+        if riding.halted:
+            raise GuideError(f"{riding.halted}. Zero was commanded, and nothing is written")
+        return recorder.run()
+
+    def _drive(self, riding: Riding, recorder: Recorder) -> None:
+        begun = sent = shown = time.monotonic()
+        last = None
+        while not riding.over:
+            for key in self._attendant.keys(LOOK_S):
+                riding.key(key, time.monotonic())
+            now = time.monotonic()
+            self._hear(riding, recorder, now)
+            command = riding.step(now)
+            period = OPENING_PERIOD_S if now - begun < OPENING_S else SEND_PERIOD_S
+            if command != last or now - sent >= period:
+                self._client.send(command.linear, command.angular)
+                last, sent = command, now
+            if now - shown > SHOWN_S:
+                self._attendant.progress(riding.progress(now))
+                shown = now
+        self._attendant.progress(1.0)
+
+    def _hear(self, riding: Riding, recorder: Recorder, now: float) -> None:
+        self._states.hear(riding.state, now)
+
+        def turned(message: JointState, came: float) -> None:
+            riding.wheels(recorder.wheels(message, came), came)
+
+        self._wheels.hear(turned, now)
+        for sensor, name in self._sensors:
+            sensor.hear(getattr(recorder, name), now)
+
+    def _drain(self) -> None:
+        """What came before is of no leg."""
+        for sensor in (self._wheels, self._states, *(one for one, _ in self._sensors)):
+            sensor.hear(lambda message, now: None, 0.0)
+
+    def _own(self, name: str, cls: type) -> Sensor:
+        return Sensor(self._client.session, self._client.key(name), (cls,))
+
+    def _full(self, key: str) -> str:
+        """A key of the table is this robot's; any other is as it is written."""
+        return self._client.key(key) if by_key(key) is not None else key

@@ -1,0 +1,320 @@
+"""`acsard calibrate` at a terminal, with the real daemon and the simulated robot."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+
+from acsard.bus.session import client_session
+from acsard.calibration.guided.recorder import Recorder, Sample
+from acsard.calibration.guided.steps import GuideError
+from acsard.cli import calibrate_robot
+from acsard.cli.calibrate_robot import POSITIONS, Sensor
+from acsard.config.parsing import parse
+from acsard.config.settings import JointsConfig
+from acsard.messages.encodings import FORMATS, encode
+from acsard.messages.schema import Odometry, PoseStamped
+from tests.system.bystander import lost
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Peer,
+    Program,
+    acsard,
+    finish,
+    free_endpoint,
+    until,
+)  # fmt: skip
+from tests.system.test_cli import ON_TERMINAL, Terminal
+
+SKIDDING: dict[str, dict[str, object]] = {
+    "odometry": {"gyro": True},
+    "sim": {
+        "track_multiplier": 1.6, "track_rate_dependence": 0.08, "left_radius_multiplier": 0.99,
+        "gyro_bias": 0.01, "gyro_noise": 0.01,
+    },
+}  # fmt: skip
+
+
+@pytest.fixture
+def free() -> str:
+    return free_endpoint()
+
+
+@contextmanager
+def router(endpoint: str) -> Iterator[zenoh.Session]:
+    """Somebody else's router, who has positions."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        yield session
+
+
+STARTS = "Enter starts it"
+RIDES_S = 120.0
+
+
+@contextmanager
+def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard calibrate` at a terminal of its own; what it finds goes into a pipe."""
+    given = ["calibrate", "--config", str(daemon.config), *words]
+    with (
+        Terminal() as terminal,
+        Program(
+            [sys.executable, "-c", ON_TERMINAL, *given],
+            daemon.config.parent,
+            stdin=terminal.slave,
+            stderr=terminal.slave,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        ) as program,
+    ):
+        yield terminal, program
+
+
+def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
+    """The screen has those words so often; a program that has ended has not."""
+
+    def look() -> bool:
+        assert program.process.poll() is None, terminal.screen
+        return shown(terminal).count(words) >= times
+
+    until(look, within, f"{words!r} for the {times}. time")
+
+
+def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
+    """The first leg moves."""
+    asks(terminal, program, STARTS, 1, 10.0)
+    terminal.press("\n")
+    until(lambda: bus.state()["linear"] > 0.25, 10.0, "the first leg moves")
+    assert bus.state()["source"] == "app"
+
+
+@pytest.mark.slow
+def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon, "--write", "--json") as (terminal, program):
+            asks(terminal, program, STARTS, 1, 10.0)
+            terminal.press("\n")
+            asks(terminal, program, "from its mark", 1, RIDES_S)
+            where = bus.get("sim/pose")["pose"]["position"]
+            terminal.press(f"{(where['x'] ** 2 + where['y'] ** 2) ** 0.5:.3f}\n")
+            asks(terminal, program, STARTS, 2, 10.0)
+            terminal.press("\n")
+            assert program.ended(RIDES_S) == 0, terminal.screen
+        found = json.loads(program.stdout)
+        written = parse(daemon.config.read_bytes())
+    print(f"turn: {found['turn_error_before']:.0f} -> {found['turn_error_after']:.1f} deg in 360")
+    assert found["turn_error_after"] < found["turn_error_before"] / 10
+    assert found["scale"] == "distance"
+    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert found["left_wheel_radius"] == pytest.approx(0.0495, rel=0.01)
+    drive = written.drive
+    assert drive.wheel_separation_multiplier == pytest.approx(
+        found["wheel_separation_multiplier"], abs=1e-5
+    )
+    assert written.odometry.wheel_separation_multiplier_std > 0
+
+
+LINE_M, LENGTH_M, WIDTH_M = 0.45, 0.25, 0.30
+"""m from where the robot's middle begins to the line on its left, between its wheels, and its
+width."""
+
+
+def measured(bus: Bus, words: str) -> str:
+    """What a person reads off who sees where the robot truly is; mm, and m for the long one."""
+    pose = bus.get("sim/pose")["pose"]
+    where, turn = pose["position"], pose["orientation"]
+    yaw = 2 * math.atan2(turn["z"], turn["w"])
+    if "apart" in words:
+        return f"{1000 * LENGTH_M:.0f}"
+    if "from its mark" in words:
+        return f"{math.hypot(where['x'], where['y']):.3f}"
+    ahead = LENGTH_M / 2 if "Front" in words else -LENGTH_M / 2
+    left = where["y"] + ahead * math.sin(yaw) + WIDTH_M / 2 * math.cos(yaw)
+    return f"{1000 * (LINE_M - left):.0f}"
+
+
+ENDED = "ended"
+
+
+def shown(terminal: Terminal) -> str:
+    """All of the screen, whatever its lines."""
+    return " ".join(terminal.screen.split())
+
+
+def question(terminal: Terminal, program: Program, seen: int) -> str | None:
+    """What is asked behind what has been seen; `ENDED` when nothing will be any more."""
+    words = shown(terminal)[seen:]
+    if words.endswith((" mm:", " m:", "q leaves.")):
+        return words
+    return ENDED if program.process.poll() is not None else None
+
+
+def once_round(bus: Bus) -> None:
+    """It has turned to the left until it looks as before."""
+
+    def yaw() -> float:
+        turn = bus.get("sim/pose")["pose"]["orientation"]
+        return 2 * math.atan2(turn["z"], turn["w"])
+
+    until(lambda: abs(math.remainder(yaw(), 2 * math.pi)) > 2.5, RIDES_S, "half round")
+    until(lambda: abs(math.remainder(yaw(), 2 * math.pi)) < 0.15, RIDES_S, "once round")
+
+
+@pytest.mark.slow
+def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon, "--way", "tape", "--write") as (terminal, program):
+            seen = 0
+            while program.process.poll() is None:
+                words = until(lambda: question(terminal, program, seen), RIDES_S, "a question")  # noqa: B023
+                seen = len(shown(terminal))
+                if STARTS in words:
+                    terminal.press("\n")
+                    if "SPACE" in words:
+                        once_round(bus)
+                        terminal.press(" ")
+                elif words != ENDED:
+                    terminal.press(measured(bus, words) + "\n")
+            assert program.ended(5.0) == 0, terminal.screen
+        written = parse(daemon.config.read_bytes()).drive
+    assert "a turn of 360 deg ends" in program.stdout
+    assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
+    assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
+    assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
+
+
+def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        before = daemon.config.read_bytes()
+        with calibrating(daemon, "--write") as (terminal, program):
+            begun(terminal, program, bus)
+            pressed = time.monotonic()
+            terminal.press(" ")
+            bus.at_rest()
+            took = time.monotonic() - pressed
+            print(f"space -> at rest: {took:.2f} s")
+            # 0.3 m/s at 1 m/s2, and some of the way.
+            assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
+            assert program.ended(5.0) == 1
+            assert "a key was pressed" in terminal.screen
+            assert "nothing is written" in terminal.screen
+        assert daemon.config.read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["stop", "teleop", "interrupt"])
+def test_whatever_else_ends_a_leg_is_told(tmp_path: Path, how: str) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon) as (terminal, program):
+            begun(terminal, program, bus)
+            if how == "stop":
+                bus.put("stop", {})
+                why = "the robot is stopped"
+            elif how == "teleop":
+                with bus.commanding(0.0, source="teleop"):
+                    assert program.ended(5.0) == 1
+                why = "teleop commands the robot now"
+            else:
+                terminal.press("\x03")
+                why = "ended by the person"
+            assert program.ended(5.0) == 1
+            until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
+            assert why in terminal.screen
+
+
+@pytest.mark.slow
+def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with calibrating(daemon) as (terminal, program):
+            begun(terminal, program, bus)
+            daemon.process.kill()
+            assert program.ended(10.0) == 1
+            assert "no word from the daemon" in terminal.screen
+
+
+@pytest.mark.slow
+def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path: Path) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
+        with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
+            assert program.ended(RIDES_S) == 0, program.stderr
+        found = json.loads(program.stdout)
+    assert found["way"] == "positions"
+    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+
+
+POSE = {
+    "position": {"x": 1.5, "y": -2.0, "z": 0.0},
+    "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+}
+HEADER = {"stamp": {"sec": 7, "nanosec": 0}, "frame_id": "map"}
+AS_POSE = {"header": HEADER, "pose": POSE}
+AS_ODOMETRY = {
+    "header": HEADER, "child_frame_id": "base_link",
+    "pose": {"pose": POSE, "covariance": [0.0] * 36},
+    "twist": {"twist": {"linear": {}, "angular": {}}, "covariance": [0.0] * 36},
+}  # fmt: skip
+
+
+def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free: str) -> None:
+    with router(free) as said, client_session(free, "") as heard:
+        for cls, value in ((PoseStamped, AS_POSE), (Odometry, AS_ODOMETRY)):
+            message = msgspec.convert(value, cls)
+            for form in FORMATS:
+                key = f"slam/{cls.__name__}/{form}"
+                sensor = Sensor(heard, key, POSITIONS)
+                recorder = Recorder(JointsConfig().as_tuple())
+
+                def came() -> bool:
+                    said.put(key, encode(message, form))  # noqa: B023
+                    return sensor.hear(recorder.place, 9.0) > 0  # noqa: B023
+
+                until(came, 5.0, f"a position on {key}")
+                assert recorder.samples["places"][0] == Sample(9.0, 7.0, (1.5, -2.0))
+
+
+def test_what_is_no_position_and_what_does_not_come_is_told(
+    free: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrate_robot, "FIRST_S", 0.2)
+    with router(free) as said, client_session(free, "") as heard:
+        sensor = Sensor(heard, "slam/pose", POSITIONS)
+        with pytest.raises(GuideError, match="does not come on slam/pose"):
+            sensor.await_first("a position")
+
+        def came() -> int:
+            said.put("slam/pose", b'{"x": 1}')
+            return sensor.hear(lambda message, now: None, 0.0)
+
+        with pytest.raises(GuideError, match="cannot be read"):
+            until(came, 5.0, "a sample")
+
+
+def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:
+    with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
+            ended = finish(acsard("calibrate", *words, "--config", str(daemon.config)), tmp_path)
+            assert ended.code == 2
+            assert why in ended.err

@@ -1,0 +1,137 @@
+"""Ways of calibrating played through: a simulated robot drives the legs, a person reads off."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from acsard.calibration.guided.setup import Setup, setup
+from acsard.calibration.guided.steps import Ask, Leg, Way
+from acsard.calibration.runs import Run, runs
+from acsard.calibration.solve import Calibration
+from acsard.calibration.table import Table
+from acsard.config.settings import Config
+from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
+
+LENGTH, WIDTH = 0.25, 0.30
+"""m of the robot's sides and ends that the person measures at."""
+
+REACTION_RAD = 0.12
+READ_M = 0.002
+
+
+def anyone(seed: int) -> Robot:
+    """A robot whose track, dependence on the rate and wheels nobody knows."""
+    rng = np.random.default_rng(seed)
+    apart = float(rng.uniform(-0.005, 0.005))
+    return Robot(
+        chi=float(rng.uniform(1.0, 2.0)), rate=float(rng.uniform(0.0, 0.08)), left=1 - apart,
+        right=1 + apart, place_hz=10.0, rng=rng,
+    )  # fmt: skip
+
+
+@dataclass
+class Player:
+    """The robot, and the person beside it."""
+
+    robot: Robot
+    gyro: bool = False
+    places: bool = False
+    yaw: float = 0.0
+    """rad, since the person set the robot; and the place of its middle."""
+    place: complex = 0j
+    driven_s: float = 0.0
+    outermost: complex = 0j
+    drives: list[Drive] = field(default_factory=list)
+
+    def ride(self, leg: Leg) -> Run:
+        if any(words in leg.words for words in ("Push", "Mark", "Set")):
+            rng = self.robot.rng
+            self.yaw = math.atan2(float(rng.normal(0, READ_M * math.sqrt(2))), LENGTH)
+            self.place = 0j
+        plan: Plan = [(move.seconds, move.linear, move.angular) for move in leg.moves]
+        if leg.by_key:
+            seconds, linear, angular = plan[-1]
+            plan[-1] = (min(seconds, self._round_s(angular)), linear, angular)
+        self.driven_s += sum(part[0] for part in plan)
+        made = drive(replace(self.robot, slip=self.robot.slip), [*plan, (1.0, 0, 0)])
+        self.drives.append(made)
+        self.place += complex(made.where[-1]) * cmath.exp(1j * self.yaw)
+        self.yaw += float(made.yaw[-1])
+        return self._run(made)
+
+    def _run(self, made: Drive) -> Run:
+        """What was told, without the way through a file."""
+        streams: list[tuple[Floats, dict[str, Floats]]] = [
+            (made.t, {"left": made.left, "right": made.right})
+        ]
+        if self.gyro:
+            streams.append((made.gyro_t, {"yaw_rate": made.gyro}))
+        if self.places:
+            streams.append((made.place_t, {"x": made.place.real, "y": made.place.imag}))
+        t = np.concatenate([times for times, _ in streams])
+        order = np.argsort(t)
+        columns = {"t": t[order]}
+        at = 0
+        for times, values in streams:
+            for name, column in values.items():
+                whole = np.full(len(t), np.nan)
+                whole[at : at + len(times)] = column
+                columns[name] = whole[order]
+            at += len(times)
+        return runs(Table(columns, np.zeros(len(t), dtype=np.int64), ("",), ())).runs[0]
+
+    def _round_s(self, angular: float) -> float:
+        rate = abs(angular)
+        for _ in range(10):
+            rate = abs(angular) / (self.robot.chi * (1 + self.robot.rate * rate))
+        return (2 * math.pi + float(self.robot.rng.normal(0, REACTION_RAD))) / rate
+
+    def answer(self, ask: Ask) -> float:
+        number = self._seen(ask.words)
+        if ask.unit == "mm":
+            number = round(1000 * number)
+        assert ask.least <= number <= ask.most, ask
+        return float(number)
+
+    def _seen(self, words: str) -> float:
+        noise = float(self.robot.rng.normal(0, READ_M))
+        off = math.remainder(self.yaw, math.pi)
+        half = math.sin(off) / 2
+        for told, value in (
+            ("front left and the rear left", LENGTH), ("apart", WIDTH), ("front corners?", WIDTH),
+            ("wide", WIDTH),
+        ):  # fmt: skip
+            if told in words:
+                return value
+        for told, value in (
+            ("Front left wheel", 0.3 - LENGTH * half), ("Rear left", 0.3 + LENGTH * half),
+            ("rear left corner", 0.3 - WIDTH * half), ("rear right corner", 0.3 + WIDTH * half),
+            ("front left corner", 0.3 + WIDTH * half), ("front right corner", 0.3 - WIDTH * half),
+            ("its left side", self.place.real - WIDTH * half),
+            ("its right side", self.place.real + WIDTH * half),
+            ("left of its marks", self.place.imag),
+            ("from the wall now", self.place.real), ("How far is", abs(self.place)),
+        ):  # fmt: skip
+            if told in words:
+                return value + noise
+        assert "degrees" in words, words
+        return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
+
+
+def play(way: Way, player: Player) -> Calibration:
+    """To its end."""
+    step = next(way)
+    try:
+        while True:
+            step = way.send(player.ride(step) if isinstance(step, Leg) else player.answer(step))
+    except StopIteration as end:
+        found: Calibration = end.value
+        return found
+
+
+def usual_setup() -> Setup:
+    return setup(Config())

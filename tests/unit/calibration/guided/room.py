@@ -1,0 +1,77 @@
+"""Where a robot truly goes in the room, step by step: nothing here is of the code under test."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Iterator, Sequence
+
+from acsard.calibration.guided import tape, tour, umbmark, wall
+from acsard.calibration.guided.setup import Setup
+from acsard.calibration.guided.steps import Leg
+
+SIDE = 3.0
+STEP_S = 0.05
+
+ONCE_ROUND = 2 * math.pi + 0.2
+"""rad at which a person ends a first turn, at the worst."""
+
+Start = tuple[complex, float]
+"""Where its middle stands, m from the near right corner of the room, and how it looks."""
+
+Drive = tuple[Start, Sequence[Leg]]
+"""Legs between which nobody moves it by hand."""
+
+
+def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
+    """All that a way drives when the track is taken for this one; x ahead, y to the left."""
+    edge = complex(setup.reach + 0.1, SIDE / 2), 0.0
+    if way == "gyro":
+        yield edge, (tour.straight(setup), tour.spins(setup))
+    elif way == "positions":
+        yield edge, (tour.straight(setup), tour.petals(setup))
+    elif way == "tape":
+        spins = [tape.spin(setup, number, track) for number in (0, 1)]
+        yield edge, (tape.straight(setup), tape.back(setup), tape.first_turn(setup), *spins)
+    elif way == "umbmark":
+        yield edge, (umbmark.straight(setup), umbmark.first_turn(setup))
+        aside = (SIDE - umbmark.length(setup)) / 2
+        for side in (1, -1):
+            place = complex(aside, aside if side > 0 else SIDE - aside)
+            yield (place, 0.0), [umbmark.square(setup, side, track)]
+    else:
+        back = complex(setup.reach, SIDE / 2), 0.0
+        yield back, (wall.out(setup), wall.first_turn(setup), wall.home(setup))
+        for side in (1, -1):
+            yield back, [wall.there_and_back(setup, side, track)]
+        yield back, [wall.spun(setup, track)]
+
+
+def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[complex]:
+    """Its middle all the way; `track`: true effective over geometric one; `bend`: by which share
+    the right wheels are larger than the left ones."""
+    (place, yaw), legs = drive
+    geometric = setup.drive.wheel_separation
+    believed = setup.drive.wheel_separation_multiplier * geometric
+    for leg in legs:
+        for move in leg.moves:
+            left = move.linear - move.angular * believed / 2
+            right = (move.linear + move.angular * believed / 2) * (1 + bend)
+            begun = yaw
+            for _ in range(round(move.seconds / STEP_S)):
+                if leg.by_key and abs(yaw - begun) > ONCE_ROUND:
+                    break
+                yaw += (right - left) / (track * geometric) * STEP_S
+                place += (left + right) / 2 * STEP_S * cmath.exp(1j * yaw)
+                yield place
+
+
+def beyond(way: str, setup: Setup, track: float, taken: float, bend: float) -> float:
+    """m by which some point of the robot leaves the room at the worst, less than 0 for none; a
+    wall at the near edge is touched by pushing."""
+    most = -SIDE
+    for drive in drives(way, setup, taken):
+        for place in places(drive, setup, track, bend):
+            for where in (place.real, SIDE - place.real, place.imag, SIDE - place.imag):
+                most = max(most, setup.reach - where)
+    return most

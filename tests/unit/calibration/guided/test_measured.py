@@ -1,0 +1,42 @@
+"""Readings as a calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.guided.measured import calibrated
+from acsard.calibration.guided.readings import Reading
+from acsard.calibration.report import keys, report, text
+from acsard.config.parsing import parse
+from acsard.config.settings import DriveConfig
+from acsard.config.writing import excerpt
+from tests.unit.calibration.guided.test_readings import readings
+
+DRIVE = DriveConfig()
+
+
+def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
+    made = calibrated("a tape", readings(), DRIVE)
+    assert made.gain.turn.now == pytest.approx(180, rel=0.05)
+    assert made.gain.turn.then is not None
+    assert made.gain.turn.then < 10
+    assert made.drives.runs == 3
+    assert made.drives.turns == pytest.approx(15 * 1.2 / 1.5 / 2 / np.pi, rel=0.15)
+
+
+def test_people_read_it_and_the_configuration_takes_it() -> None:
+    made = calibrated("a tape", readings(), DRIVE)
+    told = text(report("the drive", made, DRIVE, ""), made, "acsard.toml")
+    assert "compared with a tape" in told
+    assert "a turn of 360 deg ends" in told
+    config = parse("\n".join(excerpt(keys(made))).encode())
+    assert config.drive.wheel_separation_multiplier == pytest.approx(1.5, rel=0.02)
+    assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2
+
+
+def test_readings_that_tell_too_little_are_refused() -> None:
+    vague = [Reading(one.rides, one.what, one.value, 100 * one.deviation) for one in readings()]
+    with pytest.raises(RefusedError, match="of no use"):
+        calibrated("a tape", vague, DRIVE)
