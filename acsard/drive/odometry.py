@@ -88,6 +88,9 @@ class Odometry:
             self._add_gap(unknown)
         twist = self._kinematics.twist(speeds)
         self._move(_sum(turned, lost_turned))
+        if feedback.bridged > 0.0:
+            self._move(_between(self.speeds, speeds, feedback.bridged))
+            dt -= feedback.bridged
         if dt > 0.0:
             self._advance(twist.linear * dt, twist.angular * dt)
             self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
@@ -100,6 +103,7 @@ class Odometry:
             self._positions,
             speeds,
             feedback.asked_ns,
+            feedback.heard_ns,
         )
 
     def _move(self, turned: Motors) -> None:
@@ -158,6 +162,11 @@ def _sum(a: Motors, b: Motors) -> Motors:
 
 def _times(a: Motors, dt: float) -> Motors:
     return a[0] * dt, a[1] * dt, a[2] * dt, a[3] * dt
+
+
+def _between(before: WheelSpeeds, after: WheelSpeeds, dt: float) -> Motors:
+    """Wheel angles over a time that no line reported: linear from one report to the next."""
+    return _times(_sum(before.as_tuple(), after.as_tuple()), dt / 2)
 
 
 def _over(p: PoseCovariance) -> bool:

@@ -1,0 +1,114 @@
+"""Which line of ours a reply answers, where the reply does not say: the lines that left in order.
+
+An MCU that answers each line makes its report then, so the lines that left are its clock: a reply
+is as far from the one before as the lines are apart that they answer, whenever they are read, and
+where no line left nothing is missing. Replies come in the order of the lines. One that comes later
+than usual by more than half of what its line is apart from the next belongs to that next one, and
+its own is lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from msgspec import Struct
+
+MEMORY = 64
+"""Lines whose answers may still come."""
+
+GAIN = 0.05
+"""How quickly the usual delay and its spread follow."""
+
+
+class Answered(Struct, frozen=True):
+    """A reply's line: when that left, the last one before it, and the one answered last, ns."""
+
+    line_ns: int
+    before_ns: int
+    last_ns: int | None
+
+
+class Prompts:
+    """Remembers the lines that left; `read` and then `answer` for each of its lines."""
+
+    def __init__(self, soonest_ns: int) -> None:
+        """`soonest_ns` is what a line and its answer take on the wire alone."""
+        self._soonest = soonest_ns
+        self._left: deque[int] = deque(maxlen=MEMORY)
+        self.forget()
+
+    def forget(self) -> None:
+        """What was sent until now is answered, or nobody will."""
+        self._left.clear()
+        self._delay: float | None = None
+        self._spread = 0.0
+        self._last: int | None = None
+        """When the line left that was answered last."""
+        self._passed = 0
+        """The last line that is answered or given up."""
+        self._lost = self._again = False
+        """The read before gave a line up; this read shows that it should not have."""
+
+    def left(self, made_ns: int) -> None:
+        """A line has left that was made then."""
+        self._left.append(made_ns)
+
+    def read(self, at_ns: int, alone: bool) -> None:
+        """A read whose last line was complete then.
+
+        `alone` says that it has one line: that tells which line of ours that one answers.
+        """
+        if self._delay is None:
+            self._begin(at_ns)
+        elif alone:
+            self._match(at_ns, self._delay)
+
+    def answer(self, asked_ns: int | None = None) -> Answered | None:
+        """The next reply's line; made `asked_ns` if the reply says so. None if no line waits."""
+        left, before, last = self._left, self._passed, self._last
+        if asked_ns is not None:
+            while left and left[0] <= asked_ns:
+                before, self._passed = self._passed, left.popleft()
+            line, before = asked_ns, min(before, asked_ns)
+        elif self._again:
+            self._again = self._lost = False
+            line = before
+        elif left:
+            line = left.popleft()
+        else:
+            self._last = None
+            return None
+        self._last = self._passed = line
+        return Answered(line, before, last)
+
+    def skip(self) -> None:
+        """The next reply came damaged."""
+        if self._left:
+            self._passed = self._left.popleft()
+
+    def time_ns(self, line_ns: int) -> int:
+        """When the answer to that line should have been complete."""
+        return line_ns + int(self._delay or self._soonest)
+
+    def _begin(self, at_ns: int) -> None:
+        """Of a first reply only what the wire takes is known: it answers the newest it can."""
+        left = self._left
+        while len(left) > 1 and left[1] + self._soonest <= at_ns:
+            self._passed = left.popleft()
+        if left:
+            self._delay = float(at_ns - left[0])
+
+    def _match(self, at_ns: int, delay: float) -> None:
+        """Give up the lines whose answer would be too late, or find that the last was not."""
+        left, lost = self._left, False
+        while len(left) > 1:
+            most = max((left[1] - left[0]) / 2, 4 * self._spread)
+            if at_ns - left[0] - delay <= most or at_ns - left[1] < self._soonest:
+                break
+            self._passed, lost = left.popleft(), True
+        early = max((left[0] - self._passed) / 2, 4 * self._spread) if left else 0.0
+        error = at_ns - left[0] - delay if left else -early
+        self._again, self._lost = self._lost and error <= -early, lost
+        if left and abs(error) < max(delay, 4 * self._spread):  # else a stall, no delay of theirs
+            self._delay = delay + GAIN * error
+            self._spread += GAIN * (abs(error) - self._spread)
