@@ -98,8 +98,8 @@ class Timeline:
         self._share = (end_ns - before) / lines / NS_PER_S
         self._prompts.read(end_ns, lines == 1)
         self._lost = self._slots.read(end_ns, lines, size < FULL_READ)
-        usual = self._slots.usual or self._period_ns
-        self._habit.read(lines, (end_ns - before) / usual)
+        self._period = (self._slots.usual or self._period_ns) / NS_PER_S
+        self._habit.read(lines, self._share * lines / self._period)
 
     def spoilt(self) -> None:
         """The read's next line is none; where the MCU made it, it was one."""
@@ -147,14 +147,13 @@ class Timeline:
         slot = self._slot() if self._slots.period else None
         answered = self._prompts.answer(asked_ns)
         ours = asked_ns is not None or self._habit.speaks is False
-        if ours and answered and answered.last_ns is not None:
-            line, last = answered.line_ns, answered.last_ns
-            bridged = max(0, answered.before_ns - last)
-            return (line - last) / NS_PER_S, bridged / NS_PER_S, self._prompts.time_ns(line)
+        if ours and answered and answered.dt is not None:
+            return answered.dt, answered.bridged, answered.due_ns
         if slot is not None:
             dt, bridged = slot
             return unplaced + dt, unplaced + bridged, self._slots.time_ns(self._rest)
-        return unplaced + self._share, unplaced, None
+        dt = unplaced + self._share
+        return dt, max(unplaced, dt - self._period), None
 
     def _slot(self) -> tuple[float, float]:
         """The next line's slot and its share of those that are missing; s, and s of these alone."""

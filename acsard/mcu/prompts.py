@@ -13,19 +13,30 @@ from collections import deque
 
 from msgspec import Struct
 
+from acsard.values import NS_PER_S
+
 MEMORY = 64
 """Lines whose answers may still come."""
 
 GAIN = 0.05
 """How quickly the usual delay and its spread follow."""
 
+JITTER_NS = 350_000
+"""What USB and the scheduler make of a constant delay: its mean deviation."""
+
+BATCH_NS = 2_000_000
+"""A mean deviation that no MCU makes: an adapter holds the lines back."""
+
 
 class Answered(Struct, frozen=True):
-    """A reply's line: when that left, the last one before it, and the one answered last, ns."""
+    """How a reply's line is apart from that of the reply before it; None for a first one.
 
-    line_ns: int
-    before_ns: int
-    last_ns: int | None
+    In s; `bridged` of it are without a reply. `due_ns` is when the reply should be complete.
+    """
+
+    dt: float | None
+    bridged: float
+    due_ns: int
 
 
 class Prompts:
@@ -43,9 +54,10 @@ class Prompts:
         self._delay: float | None = None
         self._spread = 0.0
         self._last: int | None = None
-        """When the line left that was answered last."""
-        self._passed = 0
-        """The last line that is answered or given up."""
+        """When the line left that was answered last, and what its answer took beyond the usual."""
+        self._shift = 0
+        self._passed = self._answered = 0
+        """The last line that is answered or given up, and the last that is answered."""
         self._lost = self._again = False
         """The read before gave a line up; this read shows that it should not have."""
 
@@ -58,6 +70,7 @@ class Prompts:
 
         `alone` says that it has one line: that tells which line of ours that one answers.
         """
+        self._shift = 0
         if self._delay is None:
             self._begin(at_ns)
         elif alone:
@@ -69,7 +82,7 @@ class Prompts:
         if asked_ns is not None:
             while left and left[0] <= asked_ns:
                 before, self._passed = self._passed, left.popleft()
-            line, before = asked_ns, min(before, asked_ns)
+            line = asked_ns
         elif self._again:
             self._again = self._lost = False
             line = before
@@ -78,17 +91,20 @@ class Prompts:
         else:
             self._last = None
             return None
-        self._last = self._passed = line
-        return Answered(line, before, last)
+        lost, self._passed, self._answered = before > self._answered, line, line
+        at, self._shift = line + self._shift, 0
+        self._last = at if last is None else max(last, at)
+        due_ns = at + int(self._delay or self._soonest)
+        if last is None:
+            return Answered(None, 0.0, due_ns)
+        dt = self._last - last
+        bridged = min(max(0, before - last), dt) if lost else 0
+        return Answered(dt / NS_PER_S, bridged / NS_PER_S, due_ns)
 
     def skip(self) -> None:
         """The next reply came damaged."""
         if self._left:
             self._passed = self._left.popleft()
-
-    def time_ns(self, line_ns: int) -> int:
-        """When the answer to that line should have been complete."""
-        return line_ns + int(self._delay or self._soonest)
 
     def _begin(self, at_ns: int) -> None:
         """Of a first reply only what the wire takes is known: it answers the newest it can."""
@@ -112,3 +128,11 @@ class Prompts:
         if left and abs(error) < max(delay, 4 * self._spread):  # else a stall, no delay of theirs
             self._delay = delay + GAIN * error
             self._spread += GAIN * (abs(error) - self._spread)
+            self._shift = self._taken(error)
+
+    def _taken(self, late: float) -> int:
+        """How much of it the MCU took over its answer, if that can be told from a read's jitter."""
+        spread = self._spread
+        if not JITTER_NS < spread < BATCH_NS or abs(late) > 4 * spread:
+            return 0
+        return int(late * (1 - (JITTER_NS / spread) ** 2))

@@ -21,6 +21,7 @@ Lines that keep no period are refused, and a clock that they contradict is given
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from statistics import fmean, median
 
 from acsard.values import NS_PER_S
@@ -40,8 +41,11 @@ DRIFT = 0.01
 EXACT = 0.001
 """As DRIFT, for periods that nobody has configured: a quartz, and what the fit is off."""
 
-BATCHED = 0.3
-"""Usual lateness in slots from which on lines come in batches."""
+LATE_ALONE, LATE_BATCHED = 0.6, 1.3
+"""How late in slots any line may be of those a clock is found from: read one by one, or not."""
+
+JUMP = 1.4
+"""Slots since the last line, from which on a lone one can have lost another before it."""
 
 SURE = 0.15
 """Slots beyond the latest that a line can be, from which on one is missing for certain."""
@@ -69,7 +73,6 @@ class Slots:
         self.period: float | None = None
         """T in s as the MCU means it: it divides its counts by that, whatever its clock does."""
         self._reads: list[Read] = []
-        self._taken_back = 0
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
         """The slots that nothing came of before this read's last line, -1 for one too many.
@@ -82,14 +85,14 @@ class Slots:
             return 0
         self._slot += lines
         ahead = (at_ns - self._first) / self.usual - self._slot
-        lost = self._lost(ahead, since / self.usual, lines, drained)
-        if lost < 0 and self._given <= 0:
-            self.forget()  # no line comes before its time: it is not this clock's
+        lost = self._missing(ahead, since / self.usual, lines, drained)
+        if lost < 0 and (self._given <= 0 or ahead > 0):
+            self.forget()  # no line comes before its time, or ever later: it is not this clock's
             return 0
         self._slot += lost
         self._given += lost
-        self._window[1] += lines + lost
-        self._window[2] += lost > 0
+        self._passed += lines + lost
+        self._lossy += lost > 0
         if lost <= 0:
             ahead -= lost
             self._least = min(self._least, ahead)
@@ -97,8 +100,8 @@ class Slots:
                 self._lag += 0.03 * (min(max(ahead, 0.0), 1.0) - self._lag)
         if since < 1.5 * self._batch * self.usual:
             self._batch += 0.03 * (since / self.usual - self._batch)
-        self._window[0] += 1
-        if self._window[0] >= WINDOW_READS and at_ns - self._window_ns >= WINDOW_NS:
+        self._count += 1
+        if self._count >= WINDOW_READS and at_ns - self._window_ns >= WINDOW_NS:
             self._follow(at_ns)
         return lost
 
@@ -106,18 +109,24 @@ class Slots:
         """When the line was complete that lies so many lines before the read's last one."""
         return int(self._first + (self._slot - behind) * self.usual)
 
-    def _lost(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """How many slots are missing, as far as this read can tell; `since` the last, in slots."""
+    def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
+        """How many slots are missing, as far as this read can tell, `since` slots after the last.
+
+        -1 where the clock contradicts it.
+        """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
             return -1
         if not drained:
             return 0
-        if self._lag > BATCHED:
+        alone, self._alone = self._alone, lines == 1
+        if self._batched:
             batch = self._batch
             prompt = since < 1.1 * batch and lines - 1 < since
         else:
             batch, prompt = 0.0, lines == 1
+            if prompt and alone and since < JUMP:
+                return -1 if ahead > 1 else 0  # it only grew later, line by line
         seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - batch
         return max(0, math.floor(seen))
 
@@ -129,27 +138,32 @@ class Slots:
         if len(reads) <= WINDOW_READS or at_ns - reads[0][0] < WINDOW_NS:
             return
         self._reads = reads[-1:]
-        gaps = [b[0] - a[0] for a, b in zip(reads, reads[1:], strict=False)]
-        counts = _slots(reads, gaps)
-        if counts is None:
+        gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
+        slots, most = _slots(reads, gaps)
+        # Of jittery lines a configured period says more than half a second of them.
+        guesses = [known * NS_PER_S for known in self._known]
+        for guess in (*guesses, _slope(reads, slots)):
+            first, late = _latest(reads, slots, guess)
+            if max(late) <= most:
+                break
+        else:
             return
-        usual, first, late = _line(reads, counts)
-        if max(late) > (1.3 if fmean(late) > BATCHED else 0.45):
-            return
-        self.usual, self._first, self._slot = usual, first, counts[-1]
-        self._lag, self._batch, self._gain = fmean(late), median(gaps) / usual, 1.0
+        self.usual, self._first, self._slot = guess, first, slots[-1]
+        self._lag, self._batch, self._gain = fmean(late), median(gaps) / guess, 1.0
+        self._batched = most > 1
         self.period = self._nominal()
-        self._given = 0
+        self._given, self._alone = 0, False
         self._begin(at_ns)
 
     def _begin(self, at_ns: int) -> None:
-        self._window_ns, self._window, self._least = at_ns, [0, 0, 0], math.inf
+        self._window_ns, self._least = at_ns, math.inf
+        self._count = self._passed = self._lossy = 0
+        """Of the window's reads: how many, their slots, and those that lines were missing before."""
 
     def _follow(self, at_ns: int) -> None:
         """Equations (2) and (3), with what the window showed."""
-        reads, slots, lost = self._window
-        least = self._least
-        if lost > MOST_LOST * reads or least < -EARLY or least == math.inf:
+        least, slots = self._least, self._passed
+        if self._lossy > MOST_LOST * self._count or least < -EARLY or least == math.inf:
             self.forget()
             return
         self._gain = max(GAIN, self._gain / (1 + self._gain))
@@ -158,7 +172,7 @@ class Slots:
         self._first -= (usual - self.usual) * self._slot  # the line now stays where it is
         self.usual = usual
         self.period = self._nominal()
-        self._given = 0 if not lost else self._given
+        self._given = self._given if self._lossy else 0
         self._begin(at_ns)
 
     def _nominal(self) -> float:
@@ -171,28 +185,29 @@ class Slots:
         return whole if abs(seconds / whole - 1) < EXACT else seconds
 
 
-def _slots(reads: list[Read], gaps: list[int]) -> list[int] | None:
-    """The slot of each read's last line; None where that cannot be told."""
+def _slots(reads: list[Read], gaps: list[int]) -> tuple[list[int], float]:
+    """The slot of each read's last line, and how late in slots one may be."""
     alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
-    one_by_one = len(alone) >= 0.7 * len(gaps)
-    guess = median(alone) if one_by_one else 0.0
-    if one_by_one and guess <= 0:
-        return None
+    guess = median(alone) if len(alone) >= 0.7 * len(gaps) else 0.0
     slots = [0]
     for gap, (_, lines) in zip(gaps, reads[1:], strict=True):
-        missing = round(gap / guess) - lines if one_by_one else 0
+        missing = round(gap / guess) - lines if guess else 0
         slots.append(slots[-1] + lines + max(0, missing))
-    return slots
+    return slots, LATE_ALONE if guess else LATE_BATCHED
 
 
-def _line(reads: list[Read], slots: list[int]) -> tuple[float, float, list[float]]:
-    """Period and time of slot 0, ns, by least squares, with no line early; how late each was."""
+def _slope(reads: list[Read], slots: list[int]) -> float:
+    """The period by least squares, ns."""
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
     spread = sum((slot - middle) ** 2 for slot in slots)
-    rows = list(zip(slots, times, strict=True))
-    period = sum((slot - middle) * (time - centre) for slot, time in rows) / spread
-    offsets = [time - slot * period for slot, time in rows]
-    least = min(offsets)
-    return period, origin + least, [(offset - least) / period for offset in offsets]
+    rows = zip(slots, times, strict=True)
+    return sum((slot - middle) * (time - centre) for slot, time in rows) / spread
+
+
+def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
+    """The time of slot 0, ns, with no line early; and by how many slots each is late."""
+    offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
+    first = min(offsets)
+    return first, [(offset - first) / period for offset in offsets]

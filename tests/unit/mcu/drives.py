@@ -27,6 +27,9 @@ GRID = 0.001
 RIPPLE = 0.03
 """rad/s by which each side's speed varies from report to report."""
 
+AT_REST = 1500
+"""Points of a path before which nothing moves: a robot stands while its link comes up."""
+
 WALL_NS = 1_800_000_000 * NS_PER_S
 
 Adapter = Literal["acm", "ftdi"]
@@ -44,6 +47,7 @@ class Path:
         # No wheel turns so evenly that two decimals always round it the same way.
         left += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
         right += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
+        left[:AT_REST] = right[:AT_REST] = 0.0
         self.left = np.concatenate([[0.0], np.cumsum(left) * GRID])
         self.right = np.concatenate([[0.0], np.cumsum(right) * GRID])
 
@@ -273,7 +277,7 @@ def _prompted(host: Host) -> None:
             host.read(at, data)
         if not host.tick(tick):
             continue
-        at = max(tick + 0.0001 + wire + float(rng.uniform(0.001, 0.003)), ready)
+        at = max(tick + 0.0001 + wire + float(rng.uniform(0.001, 0.005)), ready)
         ready = at + 0.0031
         line = host.report(at, None)
         if not host.lost(at):
