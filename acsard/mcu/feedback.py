@@ -153,7 +153,7 @@ class Timeline:
             dt, bridged = slot
             return unplaced + dt, unplaced + bridged, self._slots.time_ns(self._rest)
         dt = unplaced + self._share
-        return dt, max(unplaced, dt - self._period), None
+        return dt, dt - self._period if dt > 1.5 * self._period else 0.0, None
 
     def _slot(self) -> tuple[float, float]:
         """The next line's slot and its share of those that are missing; s, and s of these alone."""

@@ -43,7 +43,11 @@ class Habit:
         self._came += lines
         self._periods += periods
         self._asked += left
-        came, own, asked = self._came, abs(self._came - self._periods), abs(self._came - self._asked)
+        came, own, asked = (
+            self._came,
+            abs(self._came - self._periods),
+            abs(self._came - self._asked),
+        )
         if abs(self._periods - self._asked) < TELLING:
             return
         if min(own, asked) <= max(1.5, NEAR * came):

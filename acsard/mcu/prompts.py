@@ -55,11 +55,11 @@ class Prompts:
         self._spread = 0.0
         self._last: int | None = None
         """When the line left that was answered last, and what its answer took beyond the usual."""
-        self._shift = 0
-        self._passed = self._answered = 0
+        self._passed = self._line = 0
         """The last line that is answered or given up, and the last that is answered."""
-        self._lost = self._again = False
-        """The read before gave a line up; this read shows that it should not have."""
+        self._lost = False
+        """The last lone answer made us give up the line before its own."""
+        self._at, self._alone = 0, False
 
     def left(self, made_ns: int) -> None:
         """A line has left that was made then."""
@@ -70,29 +70,30 @@ class Prompts:
 
         `alone` says that it has one line: that tells which line of ours that one answers.
         """
-        self._shift = 0
-        if self._delay is None:
-            self._begin(at_ns)
-        elif alone:
-            self._match(at_ns, self._delay)
+        self._at, self._alone = at_ns, alone
 
     def answer(self, asked_ns: int | None = None) -> Answered | None:
         """The next reply's line; made `asked_ns` if the reply says so. None if no line waits."""
-        left, before, last = self._left, self._passed, self._last
+        left = self._left
         if asked_ns is not None:
-            while left and left[0] <= asked_ns:
-                before, self._passed = self._passed, left.popleft()
-            line = asked_ns
-        elif self._again:
-            self._again = self._lost = False
-            line = before
-        elif left:
-            line = left.popleft()
-        else:
+            while left and left[0] < asked_ns:
+                self._passed = left.popleft()
+            if left and left[0] == asked_ns:
+                left.popleft()
+            return self._answered(asked_ns)
+        if self._delay is None:
+            self._begin()
+        elif self._alone and self._given_up_too_early(self._delay):
+            return self._answered(self._passed)
+        if not left:
             self._last = None
             return None
-        lost, self._passed, self._answered = before > self._answered, line, line
-        at, self._shift = line + self._shift, 0
+        return self._answered(left.popleft())
+
+    def _answered(self, line: int) -> Answered:
+        last, before = self._last, self._passed
+        lost, self._passed, self._line = before > self._line, line, line
+        at = line + (self._shift(line) if self._alone else 0)
         self._last = at if last is None else max(last, at)
         due_ns = at + int(self._delay or self._soonest)
         if last is None:
@@ -106,33 +107,41 @@ class Prompts:
         if self._left:
             self._passed = self._left.popleft()
 
-    def _begin(self, at_ns: int) -> None:
+    def _begin(self) -> None:
         """Of a first reply only what the wire takes is known: it answers the newest it can."""
         left = self._left
-        while len(left) > 1 and left[1] + self._soonest <= at_ns:
+        while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
         if left:
-            self._delay = float(at_ns - left[0])
+            self._delay = float(self._at - left[0])
 
-    def _match(self, at_ns: int, delay: float) -> None:
-        """Give up the lines whose answer would be too late, or find that the last was not."""
-        left, lost = self._left, False
+    def _given_up_too_early(self, delay: float) -> bool:
+        """The line that was given up last was not lost; else gives up those that are now."""
+        left, at, wide = self._left, self._at, 4 * self._spread
+        lost, self._lost = self._lost, False
         while len(left) > 1:
-            most = max((left[1] - left[0]) / 2, 4 * self._spread)
-            if at_ns - left[0] - delay <= most or at_ns - left[1] < self._soonest:
+            most = max((left[1] - left[0]) / 2, wide)
+            if at - left[0] - delay <= most or at - left[1] < self._soonest:
                 break
-            self._passed, lost = left.popleft(), True
-        early = max((left[0] - self._passed) / 2, 4 * self._spread) if left else 0.0
-        error = at_ns - left[0] - delay if left else -early
-        self._again, self._lost = self._lost and error <= -early, lost
-        if left and abs(error) < max(delay, 4 * self._spread):  # else a stall, no delay of theirs
-            self._delay = delay + GAIN * error
-            self._spread += GAIN * (abs(error) - self._spread)
-            self._shift = self._taken(error)
+            self._passed, self._lost = left.popleft(), True
+        if not lost or not left:
+            return lost
+        return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
-    def _taken(self, late: float) -> int:
-        """How much of it the MCU took over its answer, if that can be told from a read's jitter."""
-        spread = self._spread
-        if not JITTER_NS < spread < BATCH_NS or abs(late) > 4 * spread:
+    def _shift(self, line: int) -> int:
+        """How much beyond the usual the MCU took over a lone answer, ns; follows the usual too.
+
+        Of a delay that varies no more than a read's time does by itself nothing is the MCU's, and
+        of one that an adapter makes neither.
+        """
+        delay, spread = self._delay, self._spread
+        if delay is None:
             return 0
-        return int(late * (1 - (JITTER_NS / spread) ** 2))
+        error = self._at - line - delay
+        if abs(error) >= max(delay, 4 * spread):
+            return 0  # a stall
+        self._delay = delay + GAIN * error
+        self._spread += GAIN * (abs(error) - spread)
+        if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
+            return 0
+        return int(error * (1 - (JITTER_NS / spread) ** 2))

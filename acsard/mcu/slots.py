@@ -54,7 +54,7 @@ EARLY = 0.25
 """Slots by which no line of a window may be ahead of a clock that is right."""
 
 MOST_LOST = 0.45
-"""Share of a window's reads that lines are missing before; more, and the period is another one."""
+"""Share of two windows' reads that lines are missing before; more, and it is another period."""
 
 
 class Slots:
@@ -66,6 +66,16 @@ class Slots:
         self.usual = 0.0
         """T in ns as last found, 0 before."""
         self._before = 0
+        self._first, self._slot = 0.0, 0
+        """c in ns, and k of the last line."""
+        self._given = 0
+        """Slots counted of late that no line came for: one of them may be taken back."""
+        self._lag = self._batch = self._gain = self._share = 0.0
+        """Usual x of a read and its distance from the last, in slots; g; the lossy reads' share."""
+        self._batched: bool = False
+        self._alone: bool = False
+        """Lines come several in a read; the last one came alone."""
+        self._begin(0)
         self.forget()
 
     def forget(self) -> None:
@@ -152,18 +162,22 @@ class Slots:
         self._lag, self._batch, self._gain = fmean(late), median(gaps) / guess, 1.0
         self._batched = most > 1
         self.period = self._nominal()
-        self._given, self._alone = 0, False
+        self._given, self._share, self._alone = 0, 0.0, False
         self._begin(at_ns)
 
     def _begin(self, at_ns: int) -> None:
-        self._window_ns, self._least = at_ns, math.inf
-        self._count = self._passed = self._lossy = 0
-        """Of the window's reads: how many, their slots, and those that lines were missing before."""
+        """A new window: its least x, its reads, their slots, and how many of them were lossy."""
+        self._window_ns: int = at_ns
+        self._least: float = math.inf
+        self._count: int = 0
+        self._passed: int = 0
+        self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
         """Equations (2) and (3), with what the window showed."""
         least, slots = self._least, self._passed
-        if self._lossy > MOST_LOST * self._count or least < -EARLY or least == math.inf:
+        lossy, self._share = self._share, self._lossy / self._count
+        if (lossy + self._share) / 2 > MOST_LOST or least < -EARLY or least == math.inf:
             self.forget()
             return
         self._gain = max(GAIN, self._gain / (1 + self._gain))

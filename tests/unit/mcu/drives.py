@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections import deque
 from collections.abc import Iterator
 from typing import Literal
 
@@ -20,6 +21,21 @@ from acsard.drive.odometry import Odometry
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
+
+RATE = 100.0
+PERIOD, DRIFT = 0.01, 2e-4
+"""s, and how far an MCU's clock may be off."""
+
+BYTE = 10 / 115200
+"""s of a byte on the wire."""
+
+LATENCY, SCHEDULER = 0.016, 0.0003
+"""s that an FTDI adapter holds bytes back, and a process waits for its turn in the mean."""
+
+PIECE = 1024
+"""Bytes that one read takes."""
+
+ROLLING = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 GRID = 0.001
 """s between the points at which a path is known."""
@@ -80,18 +96,16 @@ def _ramped(
 
 
 class Case(Struct, frozen=True):
-    """What is between the MCU and us."""
+    """What is between the MCU and us, s and shares."""
 
-    adapter: Adapter = "acsm"  # type: ignore[assignment]
+    adapter: Adapter = "acm"
     prompted: bool = False
+    """It answers our lines, of the time since the last one; else it reports by its own clock."""
     stall: float = 0.0
     stall_every: float = 5.0
     lost: float = 0.0
-    burst: tuple[float, float] = (0.0, 0.0)
-    burst_every: float = 30.0
-    period: float = 0.01
-    drift: float = 100e-6
-    baud_rate: int = 115200
+    burst_every: float = 0.0
+    """A burst of lost lines, 0.1 to 0.5 s; 0 is none."""
 
 
 class Line(Struct):
@@ -104,190 +118,194 @@ class Line(Struct):
 
 
 class Host:
-    """The session under test, its odometry, and the floor's."""
+    """The session under test, and what others would make of the same lines."""
 
     def __init__(self, case: Case, seed: int, seconds: float) -> None:
-        self.case, self.rng, self.seconds = case, np.random.default_rng(seed), seconds
-        self.path = Path(self.rng, seconds)
-        mcu = McuConfig(baud_rate=115200)
-        self.session = McuSession(mcu, 100.0)
-        self.kinematics = Kinematics(DriveConfig())
-        self.odometry = Odometry(OdometryConfig(), self.kinematics)
-        self.floor = Odometry(OdometryConfig(), self.kinematics)
-        self.arrival = Odometry(OdometryConfig(), self.kinematics)
-        self.truth = Pose()
+        self.case, self.seconds = case, seconds
+        self.rng = rng = np.random.default_rng(seed)
+        self.path = Path(rng, seconds)
+        self.session = McuSession(McuConfig(), RATE)
+        self.found, self.floor, self.by_arrival = _odometry(), _odometry(), _odometry()
+        """The session's; with each line's true time; with the time between their arrivals, each
+        line's speed since the last."""
         self.lines: list[Line] = []
         self.heard: list[Feedback] = []
-        self._arrived: int | None = None
-        self._arrived_speeds = WheelSpeeds()
+        self.now = 0.0
+        """When the last step was."""
+        self._heard_ns = 0
         self._reported = 0.0
-        rng = self.rng
-        self.stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
-        self.bursts = (
-            [(b, b + rng.uniform(*case.burst)) for b, _ in _times(rng, seconds, case.burst_every, 0)]
-            if case.burst[1]
-            else []
-        )
-        self._stall_starts = [s for s, _ in self.stalls]
-        self._phase = rng.uniform(0, 0.016)
+        self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
+        self._starts = [start for start, _ in self._stalls]
+        every = case.burst_every
+        starts = [start for start, _ in _times(rng, seconds, every, 0.0)] if every else []
+        self._bursts = [(start, start + rng.uniform(0.1, 0.5)) for start in starts]
+        self._phase = rng.uniform(0, LATENCY)
 
     # the microcontroller
 
     def report(self, at: float, nominal: float | None) -> Line:
         """The line that it makes at `at` of what the wheels did since the last one."""
-        left, right = self.path.angles(at)
-        before_left, before_right = self.path.angles(self._reported)
+        now, then = self.path.angles(at), self.path.angles(self._reported)
         dt = at - self._reported if nominal is None else nominal
-        l, r = (round((a - b) / dt, 2) for a, b in ((left, before_left), (right, before_right)))
-        line = Line(at, self._reported, WheelSpeeds(r, l, l, r), _encode(r, l, l, r))
+        left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
+        speeds = WheelSpeeds(right, left, left, right)
+        line = Line(at, self._reported, speeds, _encode(speeds))
         self._reported = at
         self.lines.append(line)
-        self.floor.fold(Feedback(Instant(0, 0), line.speeds, dt))
+        self.floor.fold(Feedback(Instant(0, 0), speeds, dt))
         return line
-
-    def lost(self, at: float) -> bool:
-        return self.rng.random() < self.case.lost or any(b <= at < e for b, e in self.bursts)
 
     # the way to the host
 
+    def lost(self, line: Line) -> bool:
+        """Nothing of it arrives."""
+        gone = any(begin <= line.at < end for begin, end in self._bursts)
+        return gone or self.rng.random() < self.case.lost
+
     def delivered(self, line: Line) -> float:
         """When its bytes are in the kernel."""
-        at = line.at + len(line.data) * 10 / 115200
+        at = line.at + len(line.data) * BYTE
         if self.case.adapter == "ftdi":
-            return math.ceil((at - self._phase) / 0.016) * 0.016 + self._phase
-        return at + float(self.rng.uniform(0, 0.001))
-
-    def awake(self, at: float) -> float:
-        """When a process that wants to run at `at` does."""
-        at += float(self.rng.exponential(0.0003))
-        i = bisect.bisect_right(self._stall_starts, at) - 1
-        if i >= 0 and at < self.stalls[i][1]:
-            at = self.stalls[i][1] + float(self.rng.exponential(0.0003))
-        return at
+            return float(np.ceil((at - self._phase) / LATENCY) * LATENCY + self._phase)
+        return at + self.rng.uniform(0, 0.001)
 
     # the host
 
-    def read(self, at: float, data: bytes) -> None:
-        for start in range(0, len(data), 1024):
-            now = self.instant(at + start / 1024 * 0.0002)
-            self.update(now, (Received(now, data[start : start + 1024]),))
+    def awake(self, at: float) -> float:
+        """When a process that wants to run at `at` does."""
+        at += self.rng.exponential(SCHEDULER)
+        i = bisect.bisect_right(self._starts, at) - 1
+        if i >= 0 and at < self._stalls[i][1]:
+            at = self._stalls[i][1] + self.rng.exponential(SCHEDULER)
+        return at
 
-    def instant(self, at: float) -> Instant:
-        ns = 10**12 + int(at * NS_PER_S)
-        return Instant(ns, ns + WALL_NS)
-
-    def update(self, now: Instant, received: tuple[Received, ...]) -> None:
-        for feedback in self.session.update(now, True, 1, received):
-            self.heard.append(feedback)
-            self.odometry.fold(feedback)
-            heard_ns, self._arrived = getattr(feedback, "heard_ns", 0), self._arrived
-            dt = (heard_ns - (self._arrived or heard_ns)) / NS_PER_S
-            self._arrived = heard_ns
-            if dt:
-                self.arrival.fold(_by_arrival(feedback, dt))
+    def ticks(self) -> Iterator[float]:
+        """When the control periods' steps come; those that are missed are left out."""
+        at = 0.0
+        while True:
+            at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
+            yield at
 
     def tick(self, at: float) -> bool:
-        now = self.instant(at)
-        self.update(now, ())
-        return self.session.line(now.mono_ns, WheelSpeeds(1.0, 1.0, 1.0, 1.0)) is not None
+        """A period's step; whether a line leaves with it."""
+        self.now = at
+        now = _instant(at)
+        self._update(now, ())
+        return self.session.line(now.mono_ns, ROLLING) is not None
+
+    def read(self, at: float, data: bytes) -> None:
+        """What lies in the kernel is read, a piece at a time."""
+        for start in range(0, len(data), PIECE):
+            now = _instant(at + start / PIECE * 0.0002)
+            self._update(now, (Received(now, data[start : start + PIECE]),))
+
+    def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
+        for feedback in self.session.update(now, True, 1, received):
+            self.heard.append(feedback)
+            self.found.fold(feedback)
+            since = (feedback.heard_ns - (self._heard_ns or feedback.heard_ns)) / NS_PER_S
+            self._heard_ns = feedback.heard_ns
+            self.by_arrival.fold(Feedback(feedback.at, feedback.speeds, since))
+
+    # the end
+
+    def errors(self) -> np.ndarray:
+        """m and deg from the truth: of the session, of the floor, of arrival times."""
+        truth = self._truth()
+        rows = []
+        for odometry in (self.found, self.floor, self.by_arrival):
+            pose = odometry.pose
+            turn = math.degrees(math.remainder(pose.yaw - truth.yaw, math.tau))
+            rows.append((math.hypot(pose.x - truth.x, pose.y - truth.y), abs(turn)))
+        return np.array(rows)
+
+    def _truth(self) -> Pose:
+        truth, before = _odometry(), (0.0, 0.0)
+        end = self.lines[-1].at
+        for at in (*np.arange(0.005, end, 0.005).tolist(), end):
+            now = self.path.angles(at)
+            left, right = now[0] - before[0], now[1] - before[1]
+            truth.fold(Feedback(Instant(0, 0), WheelSpeeds(right, left, left, right), 1.0))
+            before = now
+        return truth.pose
 
 
-def _by_arrival(feedback: Feedback, dt: float) -> Feedback:
-    return Feedback(feedback.at, feedback.speeds, dt, bridged=dt)
+def _odometry() -> Odometry:
+    return Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+
+
+def _instant(at: float) -> Instant:
+    ns = 10**12 + int(at * NS_PER_S)
+    return Instant(ns, ns + WALL_NS)
 
 
 def _times(
     rng: np.random.Generator, seconds: float, every: float, length: float
 ) -> list[tuple[float, float]]:
-    starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2, 1)
-    return [(s, s + length) for s in (starts + rng.uniform(0, every * 0.1, len(starts))).tolist()]
+    """Begins and ends of what happens every so often, at no fixed phase."""
+    starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2)
+    starts += rng.uniform(0, every * 0.1, len(starts))
+    return [(start, start + length) for start in starts.tolist()]
 
 
-def _encode(*speeds: float) -> bytes:
+def _encode(speeds: WheelSpeeds) -> bytes:
     tokens = [
-        f"{letter}{'n' if s < 0 else 'p'}{abs(s):05.2f}"
-        for letter, s in zip("abcd", speeds, strict=True)
+        f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+        for letter, speed in zip("abcd", speeds.as_tuple(), strict=True)
     ]
     return ", ".join(tokens).encode() + b"\r\n"
 
 
 def drive(case: Case, seed: int, seconds: float) -> Host:
-    """All of a drive: `odometry` and `floor` end where they believe to be."""
+    """All of a drive, read to its end."""
     host = Host(case, seed, seconds)
-    (_prompted if case.prompted else _free)(host)
-    end = host.lines[-1].at
-    angles = host.path.angles
-    truth = Odometry(OdometryConfig(), host.kinematics)
-    before = (0.0, 0.0)
-    for i in range(1, int(end / 0.005) + 1):
-        now = angles(min(i * 0.005, end))
-        left, right = now[0] - before[0], now[1] - before[1]
-        before = now
-        truth.fold(Feedback(Instant(0, 0), WheelSpeeds(right, left, left, right), 1.0))
-    host.truth = truth.pose
+    if case.prompted:
+        _prompted(host)
+    else:
+        _reporting(host)
     return host
 
 
-def _ticks(host: Host) -> Iterator[float]:
-    at, due = 0.0, 0.0
-    while due < host.seconds:
-        due = max(due + 0.01, math.floor(at / 0.01) * 0.01 + 0.01 * (at > due + 0.01))
-        at = max(host.awake(due), at + 1e-6)
-        yield at
-
-
-def _free(host: Host) -> None:
-    case = host.case
-    period = case.period * (1 + case.drift)
-    arrivals: list[tuple[float, bytes]] = []
+def _reporting(host: Host) -> None:
+    """The MCU makes a line every period of its own clock, and divides by the nominal one."""
+    arrivals: deque[tuple[float, bytes]] = deque()
+    period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))
     for k in range(1, int(host.seconds / period)):
-        line = host.report(k * period, case.period)
-        if not host.lost(line.at):
+        line = host.report(k * period, PERIOD)
+        if not host.lost(line):
             arrivals.append((host.delivered(line), line.data))
-    _play(host, arrivals, None)
-
-
-def _play(host: Host, arrivals: list[tuple[float, bytes]], _: None) -> None:
-    ticks, i = _ticks(host), 0
-    tick = next(ticks)
-    while i < len(arrivals):
-        at = host.awake(arrivals[i][0])
-        while tick is not None and tick < at:
-            host.tick(tick)
-            tick = next(ticks, None)  # type: ignore[assignment]
-        data = b""
-        while i < len(arrivals) and arrivals[i][0] <= at:
-            data += arrivals[i][1]
-            i += 1
-        host.read(at, data)
+    for tick in host.ticks():
+        _read_until(host, arrivals, tick)
+        if not arrivals:
+            return
+        host.tick(tick)
 
 
 def _prompted(host: Host) -> None:
-    rng, replies = host.rng, []
-    ready = 0.0
-    wire = 33 * 10 / 115200
-    for tick in _ticks(host):
-        while replies:
-            at = host.awake(replies[0][0])
-            if at >= tick:
-                break
-            data = b""
-            while replies and replies[0][0] <= at:
-                data += replies.pop(0)[1]
-            host.read(at, data)
+    """The MCU answers each line, 1 to 5 ms after it has come, and divides by the true time."""
+    arrivals: deque[tuple[float, bytes]] = deque()
+    free = last = 0.0
+    for tick in host.ticks():
+        _read_until(host, arrivals, tick)
+        if tick > host.seconds:
+            return
         if not host.tick(tick):
             continue
-        at = max(tick + 0.0001 + wire + float(rng.uniform(0.001, 0.005)), ready)
-        ready = at + 0.0031
-        line = host.report(at, None)
-        if not host.lost(at):
-            replies.append((max(host.delivered(line), replies[-1][0] if replies else 0), line.data))
-    for at, data in replies:
-        host.read(host.awake(at), data)
+        made = max(tick + 0.0001 + 33 * BYTE + host.rng.uniform(0.001, 0.005), free)
+        line = host.report(made, None)
+        free = made + len(line.data) * BYTE
+        if not host.lost(line):
+            last = max(host.delivered(line), last)
+            arrivals.append((last, line.data))
 
 
-def error(host: Host, odometry: Odometry) -> tuple[float, float]:
-    """m and deg from where it is in truth."""
-    pose, truth = odometry.pose, host.truth
-    turn = math.remainder(pose.yaw - truth.yaw, math.tau)
-    return math.hypot(pose.x - truth.x, pose.y - truth.y), abs(math.degrees(turn))
+def _read_until(host: Host, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
+    """What the host gets to read before its next step."""
+    while arrivals and arrivals[0][0] < tick:
+        at = max(host.awake(arrivals[0][0]), host.now)
+        if at >= tick:
+            return
+        data = b""
+        while arrivals and arrivals[0][0] <= at:
+            data += arrivals.popleft()[1]
+        host.read(at, data)

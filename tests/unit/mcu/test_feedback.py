@@ -14,6 +14,8 @@ from acsard.values import Instant, WheelSpeeds
 
 MS = 1_000_000
 SPEEDS = WheelSpeeds(1.0, 2.0, 3.0, 4.0)
+LENGTH = 36
+WIRE_NS = 3_125_000
 COUNTS = 3600
 DEGREE = math.tau / 360
 """Ten counts."""
@@ -25,7 +27,7 @@ class Bench:
     def __init__(self, wheels: WheelMap | None = None, counts: int = COUNTS) -> None:
         wheels = wheels or WheelMap()
         mcu = McuConfig(wheels=wheels, encoder_counts=counts, link_check="auto")
-        self.timeline = Timeline(mcu, Codec(wheels), 80.0, 100 * MS)
+        self.timeline = Timeline(mcu, Codec(wheels), 80.0, 100 * MS, 100.0)
         self.now_ns, self.mcu_ms = 9000 * MS, 500
 
     def line(
@@ -44,17 +46,21 @@ class Bench:
             a, b, c, d = (count % 65536 for count in counts)
             reading = Reading(self.mcu_ms % 65536, (a, b, c, d))
         at = Instant(self.now_ns, self.now_ns + 7)
-        return self.timeline.place(SPEEDS, reading, at, following, gap)
+        self.timeline.read(at, LENGTH, 1, following)
+        return self.timeline.place(SPEEDS, reading, following, LENGTH, gap)
 
 
 def test_the_first_line_has_a_time_and_nothing_before_it() -> None:
     bench = Bench()
-    assert bench.line() == Feedback(Instant(bench.now_ns, bench.now_ns + 7), SPEEDS, 0.0)
+    found = bench.line()
+    made_ns = bench.now_ns - WIRE_NS
+    assert found.at == Instant(made_ns, made_ns + 7)
+    assert (found.speeds, found.dt, found.gap, found.heard_ns) == (SPEEDS, 0.0, 0.0, bench.now_ns)
 
 
 def test_bytes_behind_a_line_make_it_older() -> None:
     bench = Bench()
-    assert bench.line(following=12).at.mono_ns == bench.now_ns - 1_041_666
+    assert bench.line(following=12).at.mono_ns == bench.now_ns - 1_041_666 - WIRE_NS
 
 
 def test_without_counts_dt_is_the_hosts() -> None:
