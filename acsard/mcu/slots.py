@@ -75,6 +75,7 @@ class Slots:
         self._batched: bool = False
         self._alone: bool = False
         """Lines come several in a read; the last one came alone."""
+        self._least: float
         self._begin(0)
         self.forget()
 
@@ -168,7 +169,7 @@ class Slots:
     def _begin(self, at_ns: int) -> None:
         """A new window: its least x, its reads, their slots, and how many of them were lossy."""
         self._window_ns: int = at_ns
-        self._least: float = math.inf
+        self._least = math.inf
         self._count: int = 0
         self._passed: int = 0
         self._lossy: int = 0

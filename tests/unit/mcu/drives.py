@@ -44,7 +44,8 @@ RIPPLE = 0.03
 """rad/s by which each side's speed varies from report to report."""
 
 AT_REST = 1500
-"""Points of a path before which nothing moves: a robot stands while its link comes up."""
+"""Points of a path before which nothing moves: a robot stands while its link comes up. At the end
+it stands too: what is on its way then says nothing."""
 
 WALL_NS = 1_800_000_000 * NS_PER_S
 
@@ -63,7 +64,8 @@ class Path:
         # No wheel turns so evenly that two decimals always round it the same way.
         left += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
         right += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
-        left[:AT_REST] = right[:AT_REST] = 0.0
+        for wheels in (left, right):
+            wheels[:AT_REST] = wheels[int((seconds - 1.0) / GRID) :] = 0.0
         self.left = np.concatenate([[0.0], np.cumsum(left) * GRID])
         self.right = np.concatenate([[0.0], np.cumsum(right) * GRID])
 
