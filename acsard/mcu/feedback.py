@@ -96,15 +96,20 @@ class Timeline:
         end_ns = self._end_ns = max(before, at.mono_ns - wire_ns(following, self._baud_rate))
         self._at, self._lines, self._rest = at, lines, lines
         self._share = (end_ns - before) / lines / NS_PER_S
+        habit, slots = self._habit, self._slots
+        if habit.speaks is not False:
+            self._lost = slots.read(end_ns, lines, size < FULL_READ)
+        self._period = (slots.usual or self._period_ns) / NS_PER_S
+        habit.read(lines, self._share * lines / self._period)
+        if habit.speaks is False:
+            slots.forget()
         self._prompts.read(end_ns, lines == 1)
-        self._lost = self._slots.read(end_ns, lines, size < FULL_READ)
-        self._period = (self._slots.usual or self._period_ns) / NS_PER_S
-        self._habit.read(lines, self._share * lines / self._period)
 
     def spoilt(self) -> None:
         """The read's next line is none; where the MCU made it, it was one."""
         self._rest -= 1
-        self._prompts.skip()
+        if not self._habit.speaks:
+            self._prompts.skip()
         self._unplaced += self._slot()[0] if self._slots.period else self._share
 
     def place(
@@ -144,13 +149,14 @@ class Timeline:
         """How long after the last good line this one was made, how much of it no line reported, s,
         and when it was due to be complete here, ns: None if only its read tells."""
         unplaced, self._unplaced = self._unplaced, 0.0
-        slot = self._slot() if self._slots.period else None
-        answered = self._prompts.answer(asked_ns)
-        ours = asked_ns is not None or self._habit.speaks is False
-        if ours and answered and answered.dt is not None:
-            return answered.dt, answered.bridged, answered.due_ns
-        if slot is not None:
-            dt, bridged = slot
+        speaks = self._habit.speaks
+        if asked_ns is not None or not speaks:
+            answered = self._prompts.answer(asked_ns)
+            ours = asked_ns is not None or speaks is False
+            if ours and answered is not None and answered.dt is not None:
+                return answered.dt, answered.bridged, answered.due_ns
+        if self._slots.period is not None:
+            dt, bridged = self._slot()
             return unplaced + dt, unplaced + bridged, self._slots.time_ns(self._rest)
         dt = unplaced + self._share
         return dt, dt - self._period if dt > 1.5 * self._period else 0.0, None
@@ -169,11 +175,11 @@ class Timeline:
         late = 0 if due_ns is None else max(0, came_ns - due_ns)
         mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
-        at = Instant(mono_ns, read.wall_ns - (read.mono_ns - mono_ns))
+        wall_ns = read.wall_ns - read.mono_ns + mono_ns
         if last is not None and mono_ns < last.mono_ns:
-            at = Instant(last.mono_ns, max(at.wall_ns, last.wall_ns))
-        self._last = at
-        return at
+            mono_ns, wall_ns = last.mono_ns, max(wall_ns, last.wall_ns)
+        self._last = Instant(mono_ns, wall_ns)
+        return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
         """How far the motors turned since the line before, if its counts tell."""

@@ -103,6 +103,8 @@ class Case(Struct, frozen=True):
     adapter: Adapter = "acm"
     prompted: bool = False
     """It answers our lines, of the time since the last one; else it reports by its own clock."""
+    thinking: float = 0.0002
+    """By how much it may take longer over one answer than over another."""
     stall: float = 0.0
     stall_every: float = 5.0
     lost: float = 0.0
@@ -284,7 +286,7 @@ def _reporting(host: Host) -> None:
 
 
 def _prompted(host: Host) -> None:
-    """The MCU answers each line, 1 to 5 ms after it has come, and divides by the true time."""
+    """The MCU answers each line, 1 ms after it has come or later, and divides by the true time."""
     arrivals: deque[tuple[float, bytes]] = deque()
     free = last = 0.0
     for tick in host.ticks():
@@ -293,7 +295,9 @@ def _prompted(host: Host) -> None:
             return
         if not host.tick(tick):
             continue
-        made = max(tick + 0.0001 + 33 * BYTE + host.rng.uniform(0.001, 0.005), free)
+        made = max(
+            tick + 0.0001 + 33 * BYTE + 0.001 + host.rng.uniform(0, host.case.thinking), free
+        )
         line = host.report(made, None)
         free = made + len(line.data) * BYTE
         if not host.lost(line):

@@ -154,6 +154,7 @@ def test_counts_nobody_configured_are_left_alone() -> None:
 def reporting(bench: Bench, lines: int = 80) -> Bench:
     """After so many lines one by one, every 10 ms."""
     for _ in range(lines):
+        bench.timeline.left(bench.now_ns)
         bench.line()
     return bench
 
@@ -194,6 +195,8 @@ def test_stamps_of_lines_that_lay_in_the_kernel_are_a_period_apart() -> None:
 
 def test_missing_lines_are_bridged_and_no_gap() -> None:
     bench = reporting(Bench(counts=0))
+    for ms in range(0, 310, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
     found = bench.line(ms=310, gap=True)
     assert (found.dt, found.gap) == (pytest.approx(0.31), 0.0)
     assert found.bridged == pytest.approx(0.3)
