@@ -198,7 +198,8 @@ def test_missing_lines_are_bridged_and_no_gap() -> None:
     for ms in range(0, 310, 10):
         bench.timeline.left(bench.now_ns + ms * MS)
     found = bench.line(ms=310, gap=True)
-    assert (found.dt, found.gap) == (pytest.approx(0.31), 0.0)
+    assert found.dt == pytest.approx(0.31)
+    assert found.gap == 0.0
     assert found.bridged == pytest.approx(0.3)
 
 
@@ -259,7 +260,8 @@ def test_an_answer_is_as_far_from_the_last_as_their_lines() -> None:
     bench = prompted(Bench(counts=0), 80)
     bench.timeline.left(bench.now_ns + 202 * MS)
     found = bench.line(ms=210, gap=True)
-    assert (found.dt, found.gap, found.bridged) == (pytest.approx(0.21, abs=1e-3), 0.0, 0.0)
+    assert found.dt == pytest.approx(0.21, abs=1e-3)
+    assert (found.gap, found.bridged) == (0.0, 0.0)
 
 
 def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
