@@ -27,6 +27,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     robot.py       P  the order; guard.py: the last look at every outgoing line
     sim/           P  the vehicle, the fake microcontroller, its faults
     checkup/       P  what `acsard mcu check` does: one module a question to the board
+    calibration/   P  what `acsard calibrate` does: table and runs (a log), heading and places (what
+                      it shows), fit, solve (the order), report
     host/          S  the machine: clock, timers, threads, files, systemd, journal, logs, errors
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates

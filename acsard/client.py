@@ -12,12 +12,14 @@ with zeros, so the daemon's staleness and neutral-first rules are met without th
 
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
-    UnreachableError  ConnectionError  nobody listens at the endpoint
-    NoAnswerError     TimeoutError     no robot of this id there, no such key, or you may not ask it
-    ReplyError        RuntimeError     the daemon answers that it cannot; a service that refuses
-                                       says so in its reply instead
-    UsageError        ValueError       an endpoint, a key or a number that cannot be
-    DecodeError                        what was sent is not one of our messages
+    UnreachableError   ConnectionError  nobody listens at the endpoint
+    NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
+    ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
+                                        says so in its reply instead
+    NotPermittedError  PermissionError  certificates that you may not read
+    CertificateError   ValueError       certificates that are not there, or cannot be used
+    UsageError         ValueError       an endpoint, a key or a number that cannot be
+    DecodeError                         what was sent is not one of our messages
 """
 
 from __future__ import annotations
@@ -35,9 +37,16 @@ import msgspec
 import zenoh
 
 from acsard.bus.session import client_session
-from acsard.bus.subscription import Subscription, queue_on
+from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.host import clock
-from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
+from acsard.host.errors import (
+    CertificateError,
+    NoAnswerError,
+    NotPermittedError,
+    ReplyError,
+    UnreachableError,
+    UsageError,
+)
 from acsard.host.own_name import own_name
 from acsard.host.threads import in_thread
 from acsard.messages import schema
@@ -49,9 +58,11 @@ from acsard.values import AcsardError, Pose
 __all__ = (
     "AcsardError",
     "AsyncClient",
+    "CertificateError",
     "Client",
     "DecodeError",
     "NoAnswerError",
+    "NotPermittedError",
     "Pose",
     "ReplyError",
     "Subscription",
@@ -134,7 +145,7 @@ class Client:
         """The typed messages of a published key as they come; ends after `timeout` s of silence."""
         decoder = _decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
-            yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+            yield decoder.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
         """The raw samples of any key below the robot's id, whatever key they were put on."""
@@ -191,7 +202,7 @@ class Client:
             raise _no_key(name) from None
         for reply in replies:
             if reply.ok is not None:
-                found.append((str(reply.ok.encoding), reply.ok.payload.to_bytes()))
+                found.append(encoded(reply.ok))
             elif reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
@@ -243,7 +254,7 @@ class AsyncClient:
                 if sample is None:
                     await asyncio.sleep(0.001)
                     continue
-                yield decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                yield decoder.decode(*encoded(sample))
         finally:
             subscriber.undeclare()
 
@@ -305,7 +316,7 @@ def _opening(client: Client) -> Iterator[float]:
             if sample is None:
                 continue
             try:
-                state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                state = decoder.decode(*encoded(sample))
             except DecodeError:  # of a daemon of another version
                 continue
             counts = state.mode in NEVER or _counts(state, client.source)

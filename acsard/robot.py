@@ -1,8 +1,9 @@
-"""`Robot.step(Inputs) -> Outputs`: the only mutable state, the only place that knows the order.
+"""`Robot.step(Inputs) -> Outputs`: has all parts of a robot, and alone knows their order.
 
 Fold the feedback into odometry, choose one command, gate by mode, limit, invert the kinematics,
-report. Pure: time, bytes and commands come in, decisions go out. The shell around it carries
-bytes, and `guard.py` checks what leaves.
+report. Pure: time, bytes and commands come in, decisions go out. What a robot remembers from step
+to step is here and in its parts, and changes in a step only (the shell adds to `counters`). The
+shell around it carries bytes, and `guard.py` checks what leaves.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import Counter
 
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
+from acsard.drive.gyro import Gyro, Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
@@ -20,6 +22,7 @@ from acsard.drive.sanity import Sanity
 from acsard.drive.tally import Tally
 from acsard.drive.told import Told, missed, refused
 from acsard.drive.words import REFUSED, chosen
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
@@ -28,21 +31,23 @@ from acsard.values import (
     Answer,
     Estimate,
     Event,
+    GyroStatus,
     Inputs,
     Outputs,
     Pose,
     Refusal,
     Request,
     Snapshot,
+    WheelSpeeds,
 )
 
 MAX_DT = 0.05
 """s; the longest step towards a command, or 1.5 periods if that is longer: after a stall the robot
 must not leap."""
 
-UNHEARD_S = 0.25
-"""s without a line that left: by its contract the MCU stops by itself soon after, so start over
-from rest instead of resuming a speed it no longer has."""
+UNHEARD_S = WATCHDOG_S - 0.05
+"""s without a line that left: the MCU stops by itself soon after, or, by a clock a little fast, has
+done so. So start over from rest instead of resuming a speed it no longer has."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
 """What brakes by the stop limits."""
@@ -57,7 +62,8 @@ class Robot:
     def __init__(self, config: Config) -> None:
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
-        self._odometry = Odometry(config.odometry, self._kinematics)
+        self._odometry = Odometry(config.odometry, self._kinematics, config.mcu.encoder_counts)
+        self._gyro = Gyro() if config.odometry.gyro else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
@@ -97,7 +103,8 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
-            check=session.check.in_force,
+            gyro=GyroStatus() if self._gyro is None else self._gyro.status,
+            check=session.negotiation.in_force,
         )
 
     @property
@@ -187,6 +194,8 @@ class Robot:
             self._linked_once = True
             self._life.link(up=True)
         now_ns = inputs.now.mono_ns
+        if self._gyro is not None:
+            self._gyro.hear(inputs.gyro)
         return tuple(
             [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
@@ -207,7 +216,19 @@ class Robot:
         if self._sanity.turned:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
-        return self._odometry.fold(line)
+        return self._odometry.fold(line, self._turn(line, events))
+
+    def _turn(self, line: Feedback, events: list[Event]) -> Turn | None:
+        """What the gyro says of the turn since the line before; None where it says nothing."""
+        gyro = self._gyro
+        if gyro is None:
+            return None
+        wheels = self._kinematics.twist(line.speeds).angular * line.dt
+        if line.turned is not None:
+            wheels = self._kinematics.twist(WheelSpeeds(*line.turned)).angular
+        turn = gyro.turn(line.at.mono_ns, line.dt, wheels, line.speeds == STILL)
+        events += gyro.events
+        return turn
 
     # requests
 

@@ -73,6 +73,14 @@ class PoseCovariance(Struct, frozen=True):
     yawyaw: float
 
 
+class TwistVariances(Struct, frozen=True):
+    """Variances of one report in base_link: along x and y in m2/s2, of the turning in rad2/s2."""
+
+    linear: float
+    lateral: float
+    angular: float
+
+
 class Received(Struct, frozen=True):
     """Bytes as one read of the serial port gave them, and when."""
 
@@ -145,7 +153,7 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "wheels_turned", "bus_stuck", "missed_periods",
+    "lines_rejected", "wheels_turned", "gyro", "imu_refused", "bus_stuck", "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
@@ -178,6 +186,7 @@ class Estimate(Struct, frozen=True):
     pose: Pose
     twist: Twist
     covariance: PoseCovariance
+    twist_variances: TwistVariances
     positions: tuple[float, float, float, float]
     """Wheel angles in rad since start, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
@@ -208,6 +217,36 @@ class SourceStatus(Struct, frozen=True):
     waits_for: Wait
 
 
+class GyroSample(Struct, frozen=True):
+    """What a gyro said: `rate` rad/s about base_link's z, left is +, and its `variance`, rad2/s2.
+
+    A variance of 0 is one that the gyro does not tell.
+    """
+
+    at_ns: int
+    """When it arrived, monotonic."""
+    stamp_ns: int | None
+    """When it was measured by the sender's clock; None where that is not told."""
+    rate: float
+    variance: float = 0.0
+
+
+GyroDoes = Literal["off", "waiting for rest", "used", "silent", "disagrees", "not believed"]
+"""Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
+
+
+class GyroStatus(Struct, frozen=True):
+    """What the gyro does for odometry, and what is known of it; None is not known yet."""
+
+    does: GyroDoes = "off"
+    bias: float | None = None
+    """rad/s"""
+    delay: float = 0.0
+    """s by which it tells later than the wheels."""
+    track: float | None = None
+    """The effective track it implies, as a share of the configured one."""
+
+
 class Inputs(Struct, frozen=True):
     """Everything one step may know.
 
@@ -225,6 +264,7 @@ class Inputs(Struct, frozen=True):
     received: tuple[Received, ...] = ()
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()
+    gyro: tuple[GyroSample, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     """The bus messages refused before they became a `Command`."""
     guard_trip: str = ""
@@ -297,5 +337,6 @@ class Snapshot(Struct, frozen=True):
     """The last command that was refused and why, "" when none was."""
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `runtime/figures.py`."""
+    gyro: GyroStatus = GyroStatus()
     check: str = "plain"
     """Which check the serial lines have, in words."""

@@ -15,7 +15,7 @@ settings.register_profile("default", deadline=None, max_examples=30, derandomize
 settings.register_profile("thorough", deadline=None, max_examples=300, derandomize=True)
 """`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
 settings.register_profile("explore", deadline=None, max_examples=3000)
-"""`pytest --hypothesis-profile explore tests/unit`: about ten minutes, other examples each time."""
+"""`pytest --hypothesis-profile explore tests/unit`: 8 minutes, other examples each time."""
 settings.load_profile("default")
 
 # nohup and a script's `&` start a program with these ignored, and what a test starts inherits that.

@@ -1,8 +1,8 @@
 """`python -m tests.lock`: writes `deploy/systemd/requirements.lock` anew, with today's versions.
 
-It asks pip what an install of acsard with the extra `lan` takes from the package index, for each
-Python we support on x86_64 and aarch64, and pins it with the hashes of those wheels. All get the
-same versions. `--check` tells what would change and writes nothing.
+It asks pip what an install of acsard with the extra `lan` takes from the package index, also to
+build it, for each Python we support on x86_64 and aarch64, and pins it with the hashes of those
+wheels. All get the same versions. `--check` tells what would change and writes nothing.
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ GLIBC = 36
 """Debian 12 has 2.36: wheels for it and for all before."""
 
 HEAD = """\
-# What the service runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
+# What the service is built with and runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
 #
 #     pip install -r requirements.lock
 #
-# Written by `python -m tests.lock`; all tests of .ci/run run on it.
+# Written by `python -m tests.lock`. .ci/run runs all tests on it, and the unit tests once more on
+# the lowest versions that pyproject.toml allows.
 """
 
 
 def wanted() -> list[str]:
-    """What `pyproject.toml` asks for."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = set(project["dependencies"])
+    """What `pyproject.toml` asks for, to build it and to run it."""
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = pyproject["project"]
+    asked = {*pyproject["build-system"]["requires"], *project["dependencies"]}
     return sorted(asked.union(*(project["optional-dependencies"][name] for name in EXTRAS)))
 
 

@@ -17,9 +17,11 @@ BOUND = re.compile(r"^([A-Za-z0-9-]+)>=([0-9.]+)")
 
 def lowest() -> dict[str, str]:
     """The lowest version of each distribution."""
-    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    pyproject = tomllib.loads(PYPROJECT.read_text())
+    project, builder = pyproject["project"], pyproject["build-system"]["requires"]
     found: dict[str, str] = {}
-    for one in chain(project["dependencies"], *project["optional-dependencies"].values()):
+    extras = project["optional-dependencies"].values()
+    for one in chain(builder, project["dependencies"], *extras):
         bound = BOUND.match(one)
         assert bound is not None, f"{one} has no lower bound"
         name, version = bound.groups()

@@ -79,9 +79,17 @@ class Run(NamedTuple):
 
 
 class Elsewhere(NamedTuple):
-    """That file runs it, with other addresses and places; the words there that show it."""
+    """That test runs it, with other addresses and places."""
 
     file: str
+    test: str
+    but: str = ""
+    """What is not as on the page beyond that: it is the nearest there is."""
+
+
+class InCi(NamedTuple):
+    """.ci/run has it; the words there."""
+
     words: str
 
 
@@ -95,17 +103,35 @@ class Shown(NamedTuple):
     why: str
 
 
-How = Run | Elsewhere | Collected | Shown
+How = Run | Elsewhere | InCi | Collected | Shown
 
 HERE = "tests/system/test_pages.py"
-CLI, FLEET, MCU = (f"tests/system/test_{name}.py" for name in ("cli", "fleet", "mcu"))
-SERVICE, CONTAINER = "tests/systemd/test_service.py", "tests/systemd/container.py"
-ROS_FILES, BRIDGE = "tests/test_deploy_ros2.py", "tests/system/test_ros_bridge.py"
+FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
+ROUTER = "tests/system/test_router.py"
+SERVICE = "tests/systemd/test_service.py"
+CALIBRATE = "tests/unit/cli/test_calibrate.py"
 
 NO_ROS = Shown("needs ROS 2; the page says that it was not tried")
 TWO_MACHINES = Shown("needs a second machine")
 BY_ROOT = Shown("makes places for a user of the system that only zenohd's package has")
 PYTEST = Collected()
+FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
+VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
+AUTHORITY = Elsewhere(
+    HERE, "test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs"
+)
+LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
+BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
+DRIVE = Elsewhere(
+    "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
+)
+INSTALLED = Elsewhere(SERVICE, "test_installed_it_runs_and_uninstalled_nothing_is_left")
+OPENED = Elsewhere(SERVICE, "test_after_lan_init_the_service_listens_on_the_network")
+LAUNCH = Elsewhere(
+    "tests/test_deploy_ros2.py",
+    "test_the_launch_file_puts_the_namespace_before_every_topic",
+    "the file is run, with what ROS has in it stood in for",
+)
 
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
 _LAUNCH_FILE = "deploy/ros2/acsar.launch.py"
@@ -114,14 +140,12 @@ _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'
 
 COMMANDS: dict[str, How] = {
     # README.md
-    "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/acsard run": Elsewhere(
-        HERE, "def test_the_first_command_of_the_readme"
-    ),
-    "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": Elsewhere(
-        ".ci/run", "-e '.[test]'"
+    "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/acsard run": FIRST,
+    "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(
+        "-e '.[test]'"
     ),
     ". .venv/bin/activate": Run(),
-    "acsard drive": Elsewhere(CLI, '"drive", "--config"'),
+    "acsard drive": DRIVE,
     "acsard echo odom -n 1": Run('"child_frame_id":"base_link"'),
     "acsard echo state -n 1": Run('"mode":"[a-z]+","reason":'),
     "acsard hz odom -n 1": Run(" Hz "),
@@ -129,34 +153,53 @@ COMMANDS: dict[str, How] = {
     "acsard call stop": Run("^stopped and latched; srv/clear releases it$"),
     "acsard call clear": Run("^cleared; each source must be neutral once before it drives$"),
     "acsard ports": Run(codes=(0, 1)),
-    "acsard mcu check --port DEVICE": Elsewhere(MCU, '"mcu", "check", "--port", port'),
-    "acsard run --port DEVICE": Elsewhere("tests/system/test_start.py", '"run", "--port", device'),
+    "acsard mcu check --port DEVICE": Elsewhere(
+        "tests/system/test_mcu.py", "test_a_person_at_a_real_port_is_asked_after_each_motor"
+    ),
+    "acsard run --port DEVICE": Elsewhere(
+        "tests/system/test_start.py", "test_permission_granted_within_2_s_of_the_start_is_enough"
+    ),
     "acsard doctor": Run("daemon", codes=(0, 1)),
     # acsard/README.md
     ".venv/bin/python -m pydoc acsard": Run("Where to look"),
-    ".venv/bin/ruff check .": Elsewhere(".ci/run", ".venv/bin/ruff check ."),
-    ".venv/bin/ruff format --check .": Elsewhere(".ci/run", ".venv/bin/ruff format --check ."),
-    ".venv/bin/mypy": Elsewhere(".ci/run", ".venv/bin/mypy"),
-    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "lint-imports"),
+    ".venv/bin/ruff check .": InCi(".venv/bin/ruff check ."),
+    ".venv/bin/ruff format --check .": InCi(".venv/bin/ruff format --check ."),
+    ".venv/bin/mypy": InCi(".venv/bin/mypy"),
+    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "test_the_law_of_imports_is_kept"),
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
+    ".venv/bin/pre-commit install": Elsewhere(
+        "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
+    ),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
     ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
-    "acsard bench": Elsewhere("tests/system/test_bench.py", 'acsard("bench"'),
-    # deploy/firmware
-    "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": Elsewhere(".ci/run", "gcc-avr"),
-    "make": Elsewhere("tests/firmware/board.py", '"make"'),
-    "make flash PORT=/dev/ttyACM0": Elsewhere(HERE, '"make", "-n", "flash"'),
-    "sudo systemctl stop acsard": Elsewhere(CONTAINER, '"systemctl", "stop", DOOR, UNIT'),
-    "acsard mcu check --port sim --yes": Run("PASS +watchdog"),
-    "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": Elsewhere(
-        HERE, "def test_the_broken_board"
+    "acsard bench": Elsewhere(
+        "tests/system/test_bench.py",
+        "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",
     ),
-    "acsard mcu check --port ./mcu --yes": Elsewhere(HERE, "def test_the_broken_board"),
-    "sudo apt install gcc libsimavr-dev libelf-dev": Elsewhere(".ci/run", "libsimavr-dev"),
+    # deploy/firmware
+    "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
+    "make": Elsewhere("tests/firmware/test_board.py", "test_it_boots_stopped_and_says_who_it_is"),
+    "make flash PORT=/dev/ttyACM0": Elsewhere(
+        HERE,
+        "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
+        "make only says what it would do",
+    ),
+    "sudo systemctl stop acsard": Elsewhere(
+        UNIT, "test_stop_ramps_down_ends_with_stop_and_exits_0"
+    ),
+    "acsard mcu check --port sim --yes": Run("PASS +watchdog"),
+    "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": BROKEN,
+    "acsard mcu check --port ./mcu --yes": BROKEN,
+    "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
+    "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
+    "acsard calibrate --log drive.csv --distance straight=4.03 --write": Elsewhere(
+        CALIBRATE, "test_a_distance_measures_the_wheels"
+    ),
+    "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,
     # deploy/ros2
@@ -168,7 +211,11 @@ COMMANDS: dict[str, How] = {
     """export ZENOH_CONFIG_OVERRIDE='mode="client";connect/endpoints=["tcp/127.0.0.1:7447"]'""": (
         Run()
     ),
-    f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE}": Elsewhere(BRIDGE, '"zenoh-bridge-ros2dds"'),
+    f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE}": Elsewhere(
+        "tests/system/test_ros_bridge.py",
+        "test_the_real_bridge_carries_odometry_commands_transforms_and_services",
+        "only where that program is on the PATH",
+    ),
     f"{_RMW_ROUTER} ros2 run rmw_zenoh_cpp rmw_zenohd": NO_ROS,
     "ssh -N -L 7448:127.0.0.1:7448 USER@ROBOT": TWO_MACHINES,
     "ssh -N -R 7447:127.0.0.1:7447 USER@ROBOT": TWO_MACHINES,
@@ -184,40 +231,40 @@ COMMANDS: dict[str, How] = {
     "ros2 param get /acsard drive.wheel_radius": NO_ROS,
     "ros2 run teleop_twist_keyboard teleop_twist_keyboard --ros-args "
     "-r cmd_vel:=cmd_vel_teleop": NO_ROS,
-    f"ros2 launch {_LAUNCH_FILE} use_rviz:=true": Elsewhere(ROS_FILES, "generate_launch"),
-    f"ros2 launch {_LAUNCH_FILE} use_ros2_control:=true": Elsewhere(ROS_FILES, "generate_launch"),
+    f"ros2 launch {_LAUNCH_FILE} use_rviz:=true": LAUNCH,
+    f"ros2 launch {_LAUNCH_FILE} use_ros2_control:=true": LAUNCH,
     "sudo apt install ros-$ROS_DISTRO-ros2-controllers "
     "ros-$ROS_DISTRO-joint-state-topic-hardware-interface": NO_ROS,
     # deploy/systemd
-    "sudo python3 -m venv /opt/acsard/venv": Elsewhere(HERE, "def test_the_service_s_venv"),
-    "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": Elsewhere(
-        HERE, "def test_the_service_s_venv"
-    ),
-    "sudo /opt/acsard/venv/bin/pip install --no-deps .": Elsewhere(
-        HERE, "def test_the_service_s_venv"
-    ),
-    "sudo /opt/acsard/venv/bin/acsard service install": Elsewhere(SERVICE, '"service", "install")'),
-    "sudo systemctl restart acsard": Elsewhere(SERVICE, '"systemctl", "restart", UNIT'),
+    "sudo python3 -m venv /opt/acsard/venv": VENV,
+    "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
+    "sudo /opt/acsard/venv/bin/pip install --no-deps --no-build-isolation .": VENV,
+    "sudo /opt/acsard/venv/bin/acsard service install": INSTALLED,
+    "sudo systemctl restart acsard": OPENED,
     "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
-        "tests/system/test_doctor.py", '"doctor", "--config"'
+        "tests/system/test_doctor.py",
+        "test_for_people_each_finding_is_a_line_and_its_mend_another",
     ),
     'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
-    "/opt/acsard/venv/bin/pip install --no-deps . && /opt/acsard/venv/bin/acsard service install "
-    '--force && systemctl restart acsard"': Elsewhere(SERVICE, '"service", "install", "--force"'),
-    "systemctl status acsard": Elsewhere(SERVICE, 'show("StatusText")'),
-    "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(CONTAINER, '"journalctl"'),
-    "/opt/acsard/venv/bin/acsard service status": Elsewhere(SERVICE, '"service", "status"'),
-    "sudo /opt/acsard/venv/bin/acsard lan init --write /etc/acsard/acsard.toml": Elsewhere(
-        SERVICE, '"lan", "init", "--write"'
+    "/opt/acsard/venv/bin/pip install --no-deps --no-build-isolation . && "
+    "/opt/acsard/venv/bin/acsard service install "
+    '--force && systemctl restart acsard"': Elsewhere(
+        SERVICE,
+        "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
+        "pip is not called again",
     ),
-    'sudo sh -c "systemctl daemon-reload && systemctl restart acsard"': Elsewhere(
-        SERVICE, '"systemctl", "daemon-reload"'
+    "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
+    "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
+        UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"
     ),
-    "acsard echo state --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
-        SERVICE, '"--connect", "tls/127.0.0.1:7449", "--tls"'
+    "/opt/acsard/venv/bin/acsard service status": INSTALLED,
+    "sudo /opt/acsard/venv/bin/acsard lan init --write /etc/acsard/acsard.toml": OPENED,
+    'sudo sh -c "systemctl daemon-reload && systemctl restart acsard"': OPENED,
+    "acsard echo state --connect tls/robot.local:7449 --tls clients/viewer": OPENED._replace(
+        but="it calls `stop` instead"
     ),
     # deploy/zenoh
-    "pip install 'acsard[lan]'": Elsewhere(HERE, "def test_the_service_s_venv"),
+    "python3 -m venv .venv && .venv/bin/pip install '.[lan]'": AUTHORITY,
     "acsard lan init --directory fleet": Run("^Wrote "),
     "acsard lan add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
     "acsard lan add robot1 --directory fleet": Run("robot1"),
@@ -226,17 +273,24 @@ COMMANDS: dict[str, How] = {
     "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": BY_ROOT,
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": BY_ROOT,
     "sudo install -m 0644 router.json5 /etc/zenohd/": BY_ROOT,
-    "zenohd -c /etc/zenohd/router.json5": Elsewhere(FLEET, "ROUTER_FILE"),
-    "acsard check": Run("effective configuration"),
-    f"acsard echo state -n 1 {_ROUTER} laptop-anna": Elsewhere(HERE, "def test_the_laptop"),
-    f"acsard drive {_ROUTER} laptop-anna": Elsewhere(CLI, '"drive", "--config"'),
-    f"acsard call stop {_ROUTER} laptop-anna": Elsewhere(HERE, "def test_the_laptop"),
-    f"acsard echo state -n 1 {_ROUTER} fleet/clients/viewer": Elsewhere(
-        HERE, "def test_the_laptop"
+    "acsard router /etc/zenohd/router.json5": Elsewhere(
+        ROUTER, "test_it_goes_whole", "with the file's addresses and certificates changed"
     ),
-    f"acsard call clear {_ROUTER} fleet/clients/viewer": Elsewhere(HERE, "def test_the_laptop"),
-    f"acsard call clear {_ROUTER} fleet/clients/operator": Elsewhere(HERE, "def test_the_laptop"),
-    f"acsard call stop {_ROUTER} fleet/clients/viewer": Elsewhere(HERE, "def test_the_laptop"),
+    "zenohd -c /etc/zenohd/router.json5": Elsewhere(
+        FLEET,
+        "test_each_may_do_what_the_table_says_and_nothing_else",
+        "by Zenoh's own router mode in the place of the program",
+    ),
+    "acsard check": Run("effective configuration"),
+    f"acsard echo state -n 1 {_ROUTER} laptop-anna": LAPTOP,
+    f"acsard drive {_ROUTER} laptop-anna": DRIVE._replace(
+        but="without the router; `laptop-anna` calls by it"
+    ),
+    f"acsard call stop {_ROUTER} laptop-anna": LAPTOP,
+    f"acsard echo state -n 1 {_ROUTER} fleet/clients/viewer": LAPTOP,
+    f"acsard call clear {_ROUTER} fleet/clients/viewer": LAPTOP,
+    f"acsard call clear {_ROUTER} fleet/clients/operator": LAPTOP,
+    f"acsard call stop {_ROUTER} fleet/clients/viewer": LAPTOP,
 }
 
 

@@ -383,7 +383,12 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
     }
     assert {kind: set(names) for kind, names in allow.items()} == wanted
     assert all(len(names) == len(set(names)) for names in allow.values())
-    assert wanted["publishers"] == {"/cmd_vel", "/cmd_vel_teleop", "/joint_commands"}
+    assert wanted["publishers"] == {
+        "/cmd_vel",
+        "/cmd_vel_teleop",
+        "/joint_commands",
+        "/imu/data",
+    }
     assert len(wanted["subscribers"]) == 6
     assert len(triggers) == 5
 

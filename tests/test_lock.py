@@ -27,4 +27,4 @@ def test_the_lock_has_all_that_the_service_needs_in_versions_that_are_allowed() 
 
 
 def test_every_dependency_has_one_lower_bound() -> None:
-    assert {"eclipse-zenoh", "numpy", "pytest"} <= set(lowest())
+    assert {"eclipse-zenoh", "hatchling", "numpy", "pytest"} <= set(lowest())

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -24,6 +24,7 @@ import zenoh
 
 from acsard.cli import VERBS
 from acsard.config.settings import Config
+from acsard.host.extras import Extra, install
 from tests.pages import (
     COMMANDS,
     LANGUAGES,
@@ -31,6 +32,7 @@ from tests.pages import (
     ROOT,
     Block,
     Elsewhere,
+    InCi,
     blocks,
     promises,
     prose,
@@ -67,11 +69,24 @@ def test_every_command_that_something_runs_is_on_a_page() -> None:
     assert set(COMMANDS) == {command for _, command in ON_PAGES}
 
 
+def named_tests(file: str) -> set[str]:
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    return {name for name in functions if name.startswith("test_")}
+
+
 @pytest.mark.parametrize(
     "how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}), ids=" ".join
 )
-def test_what_is_said_to_run_a_command_has_the_words_for_it(how: Elsewhere) -> None:
-    assert how.words in (ROOT / how.file).read_text(encoding="utf-8")
+def test_what_is_said_to_run_a_command_is_a_test(how: Elsewhere) -> None:
+    assert how.test in named_tests(how.file)
+
+
+def test_ci_has_what_it_is_said_to_run() -> None:
+    told = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    words = {how.words for how in COMMANDS.values() if isinstance(how, InCi)}
+    assert words
+    assert not {one for one in words if one not in told}
 
 
 @pytest.mark.parametrize("block", blocks(), ids=at)
@@ -137,6 +152,22 @@ def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
     assert end.value.code == 0, f"{page}: acsard {' '.join(words)}"
     told = capsys.readouterr().out
     assert not [word for word in words if word.startswith("-") and word not in told]
+
+
+# extras
+
+EXTRA = re.compile(r"pip install (?:-e )?\s*'(\S*)\[(\w+)\]'")
+
+
+def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
+    texts = [text_of(page) for page in PAGES]
+    texts += [file.read_text(encoding="utf-8") for file in (ROOT / "acsard").rglob("*.py")]
+    told = {found for text in texts for found in EXTRA.findall(text)}
+    told |= {found for extra in get_args(Extra) for found in EXTRA.findall(install(extra))}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    known = {(".", extra) for extra in project["optional-dependencies"]}
+    assert {(".", extra) for extra in get_args(Extra)} <= told
+    assert told - {(".", "{extra}")} <= known
 
 
 # calls of pytest
@@ -215,6 +246,33 @@ def test_every_file_that_a_recipe_names_is_there() -> None:
     named = files_in("\n".join(re.findall(r"`([^`\s]+)`", prose("acsard/README.md"))))
     assert len(named) > 40
     assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
+
+
+def recipe(begin: str, end: str) -> set[str]:
+    """The files that a part of the page for who changes the code names."""
+    part = prose("acsard/README.md").partition(begin)[2].partition(end)[0]
+    return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
+
+
+def files_with(pattern: str, *rooms: str) -> set[str]:
+    """The files below these directories in whose text it is, as the recipes write them."""
+    files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
+    texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
+    found = [file for file, text in texts if re.search(pattern.encode(), text)]
+    names = {str(file.relative_to(ROOT)).removeprefix("acsard/") for file in found}
+    return names - {"README.md"}  # the recipes themselves
+
+
+def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
+    listed = files_with("reset_odometry", "acsard", "deploy")
+    assert {"values.py", "deploy/ros2/README.md"} <= listed
+    assert listed <= recipe("## Add a verb", "A verb of the command line")
+
+
+def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:
+    knowing = files_with('"(rmw|bridge)"', "acsard")
+    assert {"ros/transports.py", "bus/bus.py"} <= knowing
+    assert knowing <= recipe("A third transport", "##")
 
 
 def test_every_file_of_the_tour_is_there() -> None:

@@ -20,7 +20,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import msgspec
 import zenoh
@@ -30,6 +30,7 @@ from acsard.bench.far_end import Part
 from acsard.bench.record import Record, Sample, Seen, Sent
 from acsard.bus.outlets import direct
 from acsard.bus.session import client_session
+from acsard.bus.subscription import encoded
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
@@ -253,8 +254,7 @@ class Rig:
         key = full_key(self._config.robot.id, "state")
         for reply in self._session.get(key, timeout=3.0) if self._session else ():
             if reply.ok is not None:
-                sample: Any = reply.ok
-                return Decoder(RobotState).decode(str(sample.encoding), sample.payload.to_bytes())
+                return Decoder(RobotState).decode(*encoded(reply.ok))
         raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
@@ -267,7 +267,7 @@ class Rig:
         time.sleep(0.1)  # what was under way
         self._alive()
         self.leave()
-        seen = None if self._far_end is None else _told(self._far_end)
+        seen = None if self._far_end is None else _last_words(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -280,7 +280,7 @@ class Rig:
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
 
 
-def _told(far_end: subprocess.Popen[bytes]) -> Seen:
+def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
     """End the far end; all it saw."""
     assert far_end.stdin is not None
     assert far_end.stdout is not None

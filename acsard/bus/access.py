@@ -14,8 +14,16 @@ from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, TOPICS, Direction, full_key, service_key, source_keys
-from acsard.ros.transports import Endpoint, endpoints
+from acsard.messages.topics import (
+    IMU,
+    Direction,
+    full_key,
+    offered,
+    published,
+    service_key,
+    source_keys,
+)
+from acsard.ros.transports import Endpoint, endpoints, left_out
 from acsard.values import ROOT, Verb
 
 Role = Literal["viewer", "operator", "maintainer"]
@@ -61,6 +69,7 @@ GRANTS: dict[Role, tuple[str, ...]] = {
         "command",
         "operate",
         "maintain",
+        "sense",
     ),
 }
 """The rules each role has. A router is a maintainer, and tells of a twin that is alive."""
@@ -99,18 +108,18 @@ class _Keys:
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
-        self._robot, self._ros = robot, endpoints(config.ros, "*")
-        ros = self._ros
+        self._robot, self._ros = robot, endpoints(config.ros, "*", left_out(config) & {IMU})
+        ros, topics, told = self._ros, offered(config), published(config)
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.config = full_key(robot, "config")
         self.stop = full_key(robot, "stop")
-        self.published = [full_key(robot, topic.key) for topic in PUBLISHED] + _of(ros, "out")
-        latched = [full_key(robot, topic.key) for topic in PUBLISHED if topic.latched]
+        self.published = [full_key(robot, topic.key) for topic in told] + _of(ros, "out")
+        latched = [full_key(robot, topic.key) for topic in told if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
         """Where Zenoh's advanced publishers keep samples for those who come late."""
-        self.heard = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "in"]
+        self.heard = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.heard += _of(ros, "in")
         """What the daemon subscribes to, whoever sends."""
         sources = [source.name for source in config.commands.sources]
@@ -119,7 +128,10 @@ class _Keys:
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
         """What listed sources send on."""
-        asked = [full_key(robot, t.pattern) for t in TOPICS if t.direction == "query"]
+        self.gyro = [full_key(robot, t.key) for t in topics if t.key == IMU and t not in told]
+        self.gyro += [e.key for e in ros if e.native == IMU]
+        """What a gyro is heard on; the simulator has its own."""
+        asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
         self.questions = [key for key in asked if key != self.config]
         self.exact_questions = [key for key in self.questions if "*" not in key]
         self.exact_questions += [full_key(robot, f"schema/{name}") for name in MESSAGES]
@@ -196,6 +208,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("operate", "ingress", ["query"], services("operator")),
         _rule("maintain", "ingress", ["query"], maintained),
+        # who bends the pose, as by set_pose
+        _rule("sense", "ingress", ["put"], keys.gyro),
         # wildcards: all robots at once, the discovery of ROS, what is kept for who comes late
         _rule("roam", "ingress", watching, [f"{ROOT}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),

@@ -24,7 +24,7 @@ from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
-from acsard.messages.topics import PUBLISHED, TOPICS, full_key
+from acsard.messages.topics import Topic, full_key
 from acsard.ros.tokens import gid
 from acsard.ros.transports import Endpoint, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
@@ -48,9 +48,13 @@ class ZenohBus:
         sources: tuple[str, ...],
         access: dict[str, object],
         waker: Waker,
+        topics: tuple[Topic, ...],
+        published: tuple[Topic, ...],
     ) -> None:
+        """`topics` are the rows of the table that there are, `published` those that go out."""
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
+        self._topics, self._published = topics, published
         self._alive = full_key(robot_id, "alive")
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
@@ -120,14 +124,14 @@ class ZenohBus:
 
     def _declare_native(self, session: zenoh.Session) -> None:
         inbox = self._inbox
-        for topic in TOPICS:
+        for topic in self._topics:
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
                 self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
             elif topic.key != "alive":
                 on_query = direct(partial(inbox.on_query, topic.key))
                 self._kept.append(session.declare_queryable(key, on_query))
-        for topic in PUBLISHED:
+        for topic in self._published:
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
             self._outlets.declare(session, topic.key, key, "msgpack", encoding, topic.latched)
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 import ssl
 from pathlib import Path
 
-from acsard.bus.session import CA, CERTIFICATE, KEY
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
 
+CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
+"""The files of a TLS directory."""
 
-def check(directory: str) -> None:
+
+def require_usable(directory: str) -> None:
     """Raises `CertificateError` or `NotPermittedError`, with the file and the mend."""
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -21,21 +23,22 @@ def check(directory: str) -> None:
             file.read_bytes()
         except PermissionError:
             raise NotPermittedError(
-                f"no permission to read {file}; a service gets its copies by the drop-in "
-                "deploy/systemd/lan.conf",
+                f"no permission to read {file}: sudo, or copies of your own; a service gets its "
+                "copies by the drop-in deploy/systemd/lan.conf",
             ) from None
         except OSError as error:
             raise CertificateError(
-                f"cannot read {file}: {error.strerror}; `acsard lan init` makes it"
+                f"cannot read {file}: {error.strerror}; `acsard lan init` or `lan add` makes it"
             ) from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(f"{directory}/{CA}")
-        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}")
+        # A password: Zenoh takes no key that wants one, and nobody is to be asked for it here.
+        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
             f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
-            "another certificate; `acsard lan init` or `lan add` makes them",
+            "another certificate or has a password; `acsard lan init` or `lan add` makes them",
         ) from None
 
 

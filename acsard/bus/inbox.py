@@ -17,13 +17,16 @@ from acsard.incoming.bus import BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
-from acsard.messages.topics import VERBS, service_key, source_keys
+from acsard.messages.topics import IMU, VERBS, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
 ARRIVALS = 16
 """Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
 in from one who sends all he may. What comes in on other keys than those of listed sources is held
 together: no flood pushes out a command on another key."""
+
+SAMPLES = 64
+"""Samples of a gyro held: what one of 400 Hz says while the loop stands still for 150 ms."""
 
 OTHERS = ""
 """Where samples on all other keys go."""
@@ -55,6 +58,7 @@ class Inbox:
         self._arrivals: dict[str, deque[Arrival]] = {
             key: deque(maxlen=ARRIVALS) for key in (*source_keys(sources), OTHERS)
         }
+        self._arrivals[IMU] = deque(maxlen=SAMPLES)
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
@@ -65,7 +69,7 @@ class Inbox:
 
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
-        arrivals = [one for held in self._arrivals.values() for one in _drained(held, ARRIVALS)]
+        arrivals = [one for held in self._arrivals.values() for one in _drained(held, SAMPLES)]
         arrivals.sort(key=lambda one: one.arrived_ns)
         arrivals = _drained(self._stops, STOPS) + arrivals
         asked = _drained(self._services, queries) + _drained(self._slow, 1)
@@ -113,10 +117,11 @@ class Inbox:
             self._stop(arrival)
             return
         held = self._arrivals.get(key, self._arrivals[OTHERS])
-        if len(held) == ARRIVALS:
+        if len(held) == held.maxlen:
             self._overrun += 1
         held.append(arrival)
-        self._waker.command()
+        if key != IMU:  # which is for the next line that the wheels send
+            self._waker.command()
 
     def _stop(self, arrival: Arrival) -> None:
         self._stops.append(arrival)

@@ -11,19 +11,17 @@ import re
 
 import zenoh
 
+from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.config.settings import TLS, BusConfig
 from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a tick."""
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
 keep a person out for long."""
-
-CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""The files of a TLS directory."""
 
 MESSAGE_BYTES = 65536
 """Largest message taken from a link; commands are held to far less in code."""
@@ -114,17 +112,17 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         raise InUseError(
-            f"cannot listen on {', '.join(where)}: {_first_line(error)}; another daemon or router "
+            f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
             "may have it: stop that, or give this one its own bus.listen",
         ) from error
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """A client of the daemon (or a router) at `endpoint`; raises `UnreachableError`, `UsageError`.
+    """A client of the daemon (or a router) at `endpoint`; a peer behind one would reach no other.
 
     `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
-
-    A client, because peers behind one hub do not reach each other.
+    Raises `UsageError` for what is no endpoint, `NotPermittedError` and `CertificateError` for the
+    certificates, and `UnreachableError` when nobody answers there.
     """
     if "/" not in endpoint:
         raise UsageError(f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
@@ -136,13 +134,14 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
     if tls:
+        require_usable(tls)  # Zenoh says of them what it says of a daemon that is not there
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        about = ", and is your certificate (--tls DIRECTORY) there and of its authority"
+        about = ", and is your certificate (--tls DIRECTORY) of its authority and in date"
         raise UnreachableError(
-            f"no daemon answers at {endpoint} ({_first_line(error)}); is `acsard run` running, "
+            f"no daemon answers at {endpoint} ({first_line(error)}); is `acsard run` running, "
             f"is this its bus.listen, has it room (at most {MAX_SESSIONS} connections)"
             f"{about if endpoint.startswith(TLS) else ''}?",
         ) from error
@@ -182,7 +181,7 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    keys = [full_key(robot_id, key) for key in source_keys([*sources, "*"])]
+    keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
     keys += limited
     return {
         "id": "commands",
@@ -199,7 +198,7 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
     return config
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     """What a Zenoh error says, without the source paths it carries."""
     text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
     return text[0][:200].strip() if text else type(error).__name__

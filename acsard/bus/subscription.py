@@ -50,6 +50,11 @@ class Subscription:
         self._queue.undeclare()
 
 
+def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
+    """Encoding and payload of a sample or answer, as a `Decoder` takes them."""
+    return str(sample.encoding), sample.payload.to_bytes()
+
+
 def queue_on(session: zenoh.Session, key: str, latched: bool) -> Any:
     """Subscribe: `try_recv` and `undeclare`; a latched key begins with what is kept of it."""
     # A ring: a full FIFO would hold up everything else this session receives.

@@ -13,7 +13,6 @@ from acsard.checkup.findings import Finding
 from acsard.config.contradictions import contradictions
 from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import Config
-from acsard.config.validation import write
 
 Changes = dict[str, object]
 """Dotted key -> value, in the order of the file."""
@@ -58,16 +57,3 @@ def applied(given: Changes, config: Config) -> Config | None:
         return from_builtins(plain)
     except ValidationError:
         return None
-
-
-def lines(given: Changes) -> list[str]:
-    """The changes as lines of TOML, by table."""
-    found: list[str] = []
-    table = ""
-    for key, value in sorted(given.items(), key=lambda item: item[0].count(".")):
-        where, _, name = key.rpartition(".")
-        if where != table:
-            found += [""] * bool(found) + [f"[{where}]"]
-            table = where
-        found.append(f"{name} = {write(value)}")
-    return found

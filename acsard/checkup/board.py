@@ -17,6 +17,7 @@ from acsard.checkup.outside import Wire
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, WheelSpeeds
@@ -172,7 +173,7 @@ class Board:
             took_s = self.now_s - began_s
             self.paused |= took_s >= max(limits.WATCHDOG_LEAST_S, 2 * period_s)
             self._unanswered_s += 0.0 if answers else min(took_s, period_s)
-            if self.armed and self._unanswered_s > limits.WATCHDOG_S + 4 * self.gap_s:
+            if self.armed and self._unanswered_s > WATCHDOG_S + 4 * self.gap_s:
                 self.zeros()
                 names = motor_names(self.mcu, [m for m in range(4) if motors[m]]) or "nothing"
                 found = manual.find("link: silent", motors=names, seconds=self._unanswered_s)

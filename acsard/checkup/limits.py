@@ -1,14 +1,13 @@
-"""Every speed and time the steps share: what the MCU contract says, and what follows from it.
+"""Every speed and time the steps share.
 
 What only one step counts or compares is named where it is used. Speeds are rad/s, times s.
 """
 
 from __future__ import annotations
 
-# what the MCU contract says of silence
-WATCHDOG_S = 0.3  # the motors stop so long after the last valid line
-WATCHDOG_LEAST_S = 0.1  # what is taken; a pause of ours as long may have stopped them already
-WATCHDOG_MOST_S = 0.5  # what is taken
+# what is taken for the contract's `WATCHDOG_S`
+WATCHDOG_LEAST_S = 0.1  # a pause of ours as long may have stopped the motors already
+WATCHDOG_MOST_S = 0.5
 
 # speeds
 SPEED = 3.0  # the fastest a motor is asked to turn: half a turn in a second

@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from acsard.checkup import advice
 from acsard.checkup.findings import Finding
+from acsard.config.writing import excerpt
 
 COLOURS = {"PASS": 32, "WARN": 33, "FAIL": 31, "SKIPPED": 90}
 
@@ -31,7 +32,7 @@ def report(
 ) -> Report:
     """Put together; a board that never answered has not passed."""
     passed = advice.answered(findings) and not failed(findings)
-    toml = "\n".join(advice.lines(changes))
+    toml = "\n".join(excerpt(changes))
     return Report(port, passed, findings, changes, toml, written or None, error or None)
 
 

@@ -15,6 +15,7 @@ from typing import NoReturn
 from acsard import __version__
 from acsard.cli import (
     bench,
+    calibrate,
     call,
     check,
     doctor,
@@ -25,6 +26,7 @@ from acsard.cli import (
     lan,
     mcu,
     ports,
+    router,
     run,
     service,
     sim,
@@ -49,8 +51,10 @@ VERBS = (
     doctor,
     ports,
     mcu,
+    calibrate,
     lan,
     door,
+    router,
     service,
 )
 

@@ -32,6 +32,7 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.bus.session import log_from_environment
     from acsard.door.door import Door
+    from acsard.door.watched import Watched
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 
@@ -43,7 +44,8 @@ def main(args: argparse.Namespace) -> int:
     log_from_environment()
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())
     try:
-        code = Door(config, log, manager, sys.stdin.fileno() if args.held else None).run()
+        holder = sys.stdin.fileno() if args.held else None
+        code = Watched(Door(config), log, manager, holder).run()
     finally:
         manager.close()
         log.close()

@@ -129,6 +129,7 @@ def _loop(robot: Client, teleop: Teleop) -> None:
     import select
     import time
 
+    from acsard.bus.subscription import encoded
     from acsard.messages.encodings import Decoder
     from acsard.messages.schema import RobotState
 
@@ -144,7 +145,7 @@ def _loop(robot: Client, teleop: Teleop) -> None:
             robot.send(wish.linear, wish.angular)
         while (sample := states.try_recv()) is not None:
             heard = time.monotonic()
-            state = decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+            state = decoder.decode(*encoded(sample))
             shown = f"x {state.x:7.2f}  y {state.y:7.2f}  yaw {state.yaw:6.2f}  {state.reason}"
         if time.monotonic() - heard > SILENT_S:
             shown = "no word from the daemon"

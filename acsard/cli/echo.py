@@ -26,6 +26,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
+    from acsard.bus.subscription import encoded
     from acsard.client import connect
 
     endpoint, robot_id, tls = robot_address(args)
@@ -34,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         try:
             for sample in robot.samples(args.topic, args.timeout):
-                print(json_line(str(sample.encoding), sample.payload.to_bytes()), flush=True)
+                print(json_line(*encoded(sample)), flush=True)
                 left = None if left is None else left - 1
                 if left == 0:
                     return 0

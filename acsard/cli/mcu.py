@@ -14,6 +14,7 @@ from acsard.cli.common import Overrides, add_config, find, load
 from acsard.cli.person import SIMULATOR, answering, ended_by_signals
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write the lines into the configuration file, and --port, comments kept (needs "
-        "the extra: pip install 'acsard[mcu]')",
+        f"an extra: {install('mcu')})",
     )
     check.set_defaults(main=main)
 

@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
     log, screen = Log(config.log), Writer(sys.stdout)
 
     def announce(device: str, trouble: str) -> None:
-        simulated = config.mcu.port == daemon.SIMULATOR
+        simulated = config.mcu.simulated
         if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
             # Not print: a full pipe that nobody reads would hold up the robot.
             screen.write(banner(config, where, device, trouble) + "\n")
@@ -92,7 +92,7 @@ def main(args: argparse.Namespace) -> int:
         for text in warnings(config):
             log.event(Event("configuration", text, "warning"))
 
-    door = [*(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
+    door = ["door", *(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
     # The watchdog ends a daemon that hangs by SIGABRT: where it hung goes to standard error.
     if sys.stderr is not None:  # None when it was closed before the start
         faulthandler.enable()
@@ -115,13 +115,12 @@ def _bus(config: Config) -> str:
 def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
     """What a person sees first."""
     from acsard import __version__
-    from acsard.runtime.daemon import SIMULATOR
     from acsard.values import ROOT
 
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:
         port = f"none yet: {trouble}"
-    if config.mcu.port == SIMULATOR:
+    if config.mcu.simulated:
         port = f"the built-in SIMULATOR ({device}); no real robot will move"
     return _BANNER.format(
         version=__version__,

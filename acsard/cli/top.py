@@ -8,6 +8,7 @@ import sys
 
 from acsard.cli.common import add_bus, robot_address
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,7 +18,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="the robot on one screen, live",
         description="Show mode, pose, wheels, command sources, link and timing on one screen, "
         "live; q or Ctrl-C leaves. Into a pipe, or with --once, print one screen as plain text. "
-        "Needs the extra: pip install 'acsard[top]'.",
+        f"Needs an extra: {install('top')}.",
     )
     parser.add_argument("--once", action="store_true", help="print one screen and end")
     add_bus(parser)
@@ -29,9 +30,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         from acsard.top import terminal
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE, "needs the library rich; run: pip install 'acsard[top]'"
-        ) from None
+        raise ExitError(Exit.FAILURE, f"needs the library rich; run: {install('top')}") from None
     from acsard.client import connect
     from acsard.top.feed import Feed
 

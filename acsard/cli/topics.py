@@ -31,7 +31,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.messages.encodings import encode
 
     _, config = load(args.config)
-    table = ros_table(config) if args.ros else topic_table(config.robot.id)
+    table = ros_table(config) if args.ros else topic_table(config)
     if args.json:
         print(encode(table, "json").decode())
         return 0

@@ -78,7 +78,7 @@ def _count_warnings(config: Config) -> list[str]:
             f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: counts come with checked "
             'lines only, and mcu.link_check = "off"; write "auto" or "require"'
         ]
-    if mcu.port == "sim" and mcu.encoder_counts != config.sim.encoder_counts:
+    if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
         return [
             f"mcu.encoder_counts = {mcu.encoder_counts} but the simulated robot's encoders have "
             f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong"

@@ -68,6 +68,7 @@ AngularJerk = Annotated[float, Meta(ge=0.0, le=5000.0, extra={"unit": "rad/s3 (0
 WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
 Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})]
 ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
+Deviation = Annotated[float, Meta(ge=0.0, le=1.0)]
 PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
 SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
 Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
@@ -89,14 +90,23 @@ class WheelMap(Struct, frozen=True):
     rear_right: Motor = "+d"
 
 
+SIMULATOR = "sim"
+"""The port of the built-in simulator."""
+
+
 class McuConfig(Struct, frozen=True):
-    port: Text = "sim"
+    port: Text = SIMULATOR
     baud_rate: Baud = 115200
     trailing_comma: bool = False
     reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
     link_check: Literal["off", "auto", "require"] = "off"
     encoder_counts: EncoderCounts = 0
     wheels: WheelMap = WheelMap()
+
+    @property
+    def simulated(self) -> bool:
+        """There is no device: the built-in simulator is behind the port."""
+        return self.port == SIMULATOR
 
     @property
     def wants_samples(self) -> bool:
@@ -176,11 +186,17 @@ class OdometryConfig(Struct, frozen=True):
     odom_frame: Frame = "odom"
     base_frame: Frame = "base_link"
     publish_tf: bool = True
+    gyro: bool = False
     pose_covariance_diagonal: Diagonal = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e-6)
     twist_covariance_diagonal: Diagonal = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2)
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
+    wheel_separation_multiplier_std: Deviation = 0.0
+    left_wheel_radius_multiplier_std: Deviation = 0.0
+    right_wheel_radius_multiplier_std: Deviation = 0.0
+    distance_scale_std: Deviation = 0.0
+    covariance: Literal["model", "constant"] = "model"
 
 
 class LidarConfig(Struct, frozen=True):
@@ -263,6 +279,15 @@ class SimConfig(Struct, frozen=True):
     motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
     encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
     boot_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s"})] = 0.0
+    track_multiplier: Factor = 1.0
+    track_rate_dependence: Annotated[float, Meta(ge=-0.4, le=2.0)] = 0.0
+    left_radius_multiplier: Factor = 1.0
+    right_radius_multiplier: Factor = 1.0
+    turn_slip: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
+    gyro_bias: Annotated[float, Meta(ge=-0.2, le=0.2, extra={"unit": "rad/s"})] = 0.0
+    gyro_noise: Annotated[float, Meta(ge=0.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
+    gyro_delay: Annotated[float, Meta(ge=0.0, le=0.2, extra={"unit": "s"})] = 0.0
+    seed: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 1
 
 
 class Config(Struct, frozen=True):

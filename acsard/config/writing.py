@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from acsard.config.validation import write
 
 
@@ -19,3 +21,16 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
         else:
             lines.append(f"{key} = {write(value)}")
     return lines + tables
+
+
+def excerpt(keys: Mapping[str, object]) -> list[str]:
+    """Some dotted keys as lines of TOML, by table."""
+    lines: list[str] = []
+    table = ""
+    for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):
+        where, _, name = key.rpartition(".")
+        if where != table:
+            lines += [""] * bool(lines) + [f"[{where}]"]
+            table = where
+        lines.append(f"{name} = {write(value)}")
+    return lines

@@ -6,12 +6,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.bus.certificates import check, ends_ns
-from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.bus.certificates import CA, CERTIFICATE, KEY, ends_ns, require_usable
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
+from acsard.host.extras import install
 from acsard.messages.expiry import expiry
 
 
@@ -28,7 +28,7 @@ def certificates(config: Config) -> Iterator[Finding]:
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
-        check(config.bus.tls)
+        require_usable(config.bus.tls)
     except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
@@ -36,5 +36,5 @@ def certificates(config: Config) -> Iterator[Finding]:
     level, words = expiry(ends, now().wall_ns)
     mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:
-        mend = "pip install 'acsard[lan]' to have it read"
+        mend = f"{install('lan')}, to have it read"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from acsard.values import NS_PER_S, Event
 
-STUCK_NS = 3 * NS_PER_S // 2
+STUCK_NS = NS_PER_S
 """A look at Zenoh takes a millisecond; longer than this, and somebody has taken its time."""
 
 MOMENT_NS = NS_PER_S // 2

@@ -15,10 +15,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Command
 
 DRIFT = 2e-4
-"""How much faster than the sender's clock ours may run; twice what a bad crystal does."""
+"""How far apart the sender's clock and ours may go; twice what a bad crystal does."""
 
 FORGET_NS = 250 * NS_PER_S
 """After so long a silence the drift may be 50 ms: who comes back is as good as new."""
@@ -111,11 +112,11 @@ class _Clock:
 
     def __init__(self, at_ns: int) -> None:
         self._state: State = "new"
-        self._promptest = 0.0
-        """The believed delay, as it may be by now."""
+        self._promptest = Promptest(DRIFT)
+        """Of those believed, in ns."""
         self._late = self._early = 0.0
         """By how much the last one came later; by how much lately some came ever earlier."""
-        self._heard_ns = at_ns
+        self._heard_ns, self._delay = at_ns, 0
         self._proof = _Proof()
 
     def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
@@ -125,18 +126,20 @@ class _Clock:
             self._state, self._proof = "new", _Proof()
         sign = self._sign(delay, at_ns, silence, timeout_ns)
         self._state, verdict = NEXT[self._state, sign]
+        self._delay = delay
         if sign == "proven":
-            self._promptest, self._late, self._early = delay, 0.0, 0.0
+            self._promptest, self._late, self._early = Promptest(DRIFT), 0.0, 0.0
         return verdict
 
     def _sign(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Sign:
         if self._state == "new":
             return self._proof.add(delay, at_ns, timeout_ns)
-        self._promptest += DRIFT * silence
-        before, self._late = self._late, delay - self._promptest
+        departed = silence - (delay - self._delay)  # so long after the last, by the sender's clock
+        before, self._late = self._late, self._promptest.measure(silence, departed)
         early = max(0.0, self._early - SLEWED * silence) + max(0.0, -self._late)
         if self._late <= timeout_ns and early <= EARLY_NS:
-            self._promptest, self._early = min(self._promptest, delay), early
+            self._promptest.believe()
+            self._early = early
             return "usual"
         if self._state == "stepped":
             return self._proof.add(delay, at_ns, timeout_ns)

@@ -23,13 +23,24 @@ class Kinematics:
     """Converts between twist (m/s, rad/s, in base_link) and wheel speeds (rad/s)."""
 
     def __init__(self, drive: DriveConfig) -> None:
+        self.multipliers = (
+            drive.left_wheel_radius_multiplier,
+            drive.right_wheel_radius_multiplier,
+            drive.wheel_separation_multiplier,
+        )
         self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
         self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
-        self._track = drive.wheel_separation * drive.wheel_separation_multiplier
+        self.track = drive.wheel_separation * drive.wheel_separation_multiplier
+        """L, m."""
+
+    @property
+    def radius(self) -> float:
+        """m, the mean of the sides' wheels."""
+        return (self._left_radius + self._right_radius) / 2
 
     def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
         """The wheel speeds that give this twist: equations (1) to (3) solved for them."""
-        half = twist.angular * self._track / 2
+        half = twist.angular * self.track / 2
         left = (twist.linear - half) / self._left_radius
         right = (twist.linear + half) / self._right_radius
         return WheelSpeeds(right, left, left, right)
@@ -38,7 +49,7 @@ class Kinematics:
         """The twist these wheel speeds give, equations (1) to (3)."""
         left = self._left_radius * (speeds.front_left + speeds.rear_left) / 2
         right = self._right_radius * (speeds.front_right + speeds.rear_right) / 2
-        return Twist((right + left) / 2, (right - left) / self._track)
+        return Twist((right + left) / 2, (right - left) / self.track)
 
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
         """The twist scaled down until no wheel exceeds `wheel_speed` rad/s; curvature is kept."""

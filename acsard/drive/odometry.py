@@ -7,12 +7,9 @@ One step of dt, with left and right the mean wheel speeds of a side (kinematics,
     (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
-Equations (8) and (9) step along a straight line; the product integrates the exact arc instead:
-the chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along
-yaw + dyaw/2. They agree as dyaw -> 0.
-
-The covariance is propagated by the arc's Jacobian with noise that grows with the distance and the
-angle travelled (Siegwart, Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2).
+Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
+agree as dyaw -> 0. How far that may be off is `uncertainty.py`'s, for the pose, and
+`twist_uncertainty.py`'s.
 """
 
 from __future__ import annotations
@@ -20,47 +17,59 @@ from __future__ import annotations
 import math
 
 from acsard.config.settings import OdometryConfig
+from acsard.drive.gaps import Gaps
+from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.path import Path
+from acsard.drive.twist_uncertainty import TwistUncertainty
+from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.values import REST, STILL, Estimate, Pose, PoseCovariance, WheelSpeeds
+from acsard.values import REST, STILL, Estimate, Pose, Twist, WheelSpeeds
 
 MAX_LOST_S = 0.05
 """s of lines that could not be true, up to which the robot is held to have gone on as it did."""
 
-MAX_VARIANCE = 1e9
-"""m2 or rad2; a pose this uncertain says nothing, and the numbers must stay finite for years."""
-
+REST_S = 0.2
+"""s of four wheels that report 0.00, after which the robot is at rest."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 
 class Odometry:
-    """Integrates feedback; the only state is pose, its covariance and the wheel angles."""
+    """Integrates feedback; its state is pose, covariance and the wheel angles."""
 
-    def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
-        self._settings = odometry
+    def __init__(
+        self, odometry: OdometryConfig, kinematics: Kinematics, encoder_counts: int = 0
+    ) -> None:
+        """`encoder_counts` per wheel turn, 0 if unknown."""
         self._kinematics = kinematics
         self._positions = NOWHERE
         self._lost_dt, self._lost_turned = 0.0, NOWHERE
+        self._path = Path()
+        self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
+        self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
+        self._gaps = Gaps()
+        self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
+        """rad that no wheel turns between the edges of one count."""
+        self._still = 0.0
+        """s without a wheel speed."""
         self.twist = REST
         """Twist of the last feedback."""
         self.speeds = STILL
         """Wheel speeds of the last feedback."""
         self.travelled = 0.0
         """m since the start, forwards and backwards."""
-        self.set_pose(Pose())
 
     def set_pose(self, pose: Pose) -> None:
         """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
-        diagonal = self._settings.pose_covariance_diagonal
-        self._pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
-        self._covariance = PoseCovariance(diagonal[0], 0.0, 0.0, diagonal[1], 0.0, diagonal[5])
+        self._path.set(pose)
+        self._uncertainty.set(pose.yaw)
 
     @property
     def pose(self) -> Pose:
         """Pose of base_link in odom now."""
-        return self._pose
+        return self._path.pose
 
     def skip(self, feedback: Feedback) -> None:
         """Pass over a line that cannot be true: what it should have told is left to the next one.
@@ -72,87 +81,84 @@ class Odometry:
         else:
             self._lost_turned = _sum(self._lost_turned, feedback.turned)
 
-    def fold(self, feedback: Feedback) -> Estimate:
+    def fold(self, feedback: Feedback, gyro: Turn | None = None) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
-        After a gap without counts only the uncertainty advances.
+        After a gap without counts only the uncertainty advances. At rest nothing does: a count to
+        and fro is left to the line that tells where it went. Where a gyro tells the turn since the
+        line before, the wheels tell the distance only.
         """
-        speeds, turned, gap = feedback.speeds, feedback.turned, feedback.gap
-        lost_dt, self._lost_dt = self._lost_dt, 0.0
-        lost_turned, self._lost_turned = self._lost_turned, NOWHERE
-        # Of lost lines without counts: it went on at about this speed, or too long to guess.
-        dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
-        if turned is None:
-            turned, dt, unknown = NOWHERE, dt + feedback.dt, unknown + gap
-        if unknown > 0.0:
-            self._add_gap(unknown)
+        speeds, dt, before = feedback.speeds, feedback.dt, self.twist
         twist = self._kinematics.twist(speeds)
-        self._move(_sum(turned, lost_turned))
-        if feedback.bridged > 0.0:
-            self._move(_between(self.speeds, speeds, feedback.bridged))
-            dt -= feedback.bridged
-        if dt > 0.0:
-            self._advance(twist.linear * dt, twist.angular * dt)
-            self._positions = _sum(self._positions, _times(speeds.as_tuple(), dt))
+        self._still = self._still + dt if speeds == STILL else 0.0
+        at_rest = self._still > REST_S
+        lost_dt, self._lost_dt = self._lost_dt, 0.0
+        # Of lost lines without counts: it went on at about this speed, or too long to guess.
+        moved_dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
+        turned, bridged = self._lost_turned, 0.0
+        if feedback.turned is None:
+            moved_dt, unknown, bridged = moved_dt + dt, unknown + feedback.gap, feedback.bridged
+        else:
+            turned = _sum(turned, feedback.turned)
+        if unknown > 0.0:
+            self._stand(unknown, before, twist)
+        rolled = NOWHERE
+        if not at_rest or max(map(abs, turned)) > self._unsettled:
+            rolled, turned = turned, NOWHERE
+        self._lost_turned = turned
+        between = _between(self.speeds, speeds, bridged)
+        self._move((rolled, between, _times(speeds.as_tuple(), moved_dt - bridged)), gyro)
+        if bridged > 0.0:
+            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
+        elif feedback.gap:
+            self._gaps.interrupt(twist)
+        else:
+            self._gaps.follow(twist, dt)
+        spread = self._twist_uncertainty
+        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt)
+        if gyro is not None and dt > 0.0:
+            twist = Twist(twist.linear, gyro.rate)
+            variances = spread.with_gyro(variances, gyro.rate_variance)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
-            self._pose,
+            self._path.pose,
             twist,
-            self._covariance,
+            self._uncertainty.covariance,
+            variances,
             self._positions,
             speeds,
             feedback.asked_ns,
             feedback.heard_ns,
         )
 
-    def _move(self, turned: Motors) -> None:
-        """Advance by these wheel angles in rad: equations (4) to (7) are linear."""
-        if turned == NOWHERE:
-            return
-        moved = self._kinematics.twist(WheelSpeeds(*turned))
-        self._advance(moved.linear, moved.angular)
-        self._positions = _sum(self._positions, turned)
+    def _move(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> None:
+        """Advance by wheel angles in rad, an arc for each piece: (4) to (7) are linear.
 
-    def _advance(self, distance: float, turn: float) -> None:
+        A gyro tells one turn for all of them.
+        """
+        rolled = [piece for piece in pieces if piece != NOWHERE]
+        moved = [self._kinematics.twist(WheelSpeeds(*piece)) for piece in rolled]
+        for piece in rolled:
+            self._positions = _sum(self._positions, piece)
+        if gyro is not None:
+            distance = sum(one.linear for one in moved)
+            self._advance(distance, gyro.angle, gyro.variance)
+            return
+        for one in moved:
+            self._advance(one.linear, one.angular)
+
+    def _advance(self, distance: float, turn: float, variance: float | None = None) -> None:
         self.travelled += abs(distance)
-        self._covariance = self._propagate(distance, turn)
-        self._pose = arc(self._pose, distance, turn)
+        dx, dy, heading = self._path.advance(distance, turn)
+        self._uncertainty.advance(distance, turn, dx, dy, heading, variance)
 
-    def _add_gap(self, gap: float) -> None:
-        """The robot may have gone on as it last moved, or stood: one deviation is all of that."""
-        p = self._covariance
-        if _over(p):
-            return
-        along = (self.twist.linear * gap) ** 2
-        turned = (self.twist.angular * gap) ** 2
-        self._covariance = PoseCovariance(
-            min(p.xx + along, MAX_VARIANCE),
-            p.xy,
-            p.xyaw,
-            min(p.yy + along, MAX_VARIANCE),
-            p.yyaw,
-            min(p.yawyaw + turned, MAX_VARIANCE),
-        )
-
-    def _propagate(self, distance: float, turn: float) -> PoseCovariance:
-        """F P F' + noise, with F the Jacobian of the step in (x, y, yaw)."""
-        settings, p = self._settings, self._covariance
-        if _over(p):
-            return p
-        heading = self._pose.yaw + turn / 2
-        c, s = math.cos(heading), math.sin(heading)
-        fx, fy = -distance * s, distance * c
-        along = settings.distance_variance_per_metre * abs(distance)
-        turned = settings.yaw_variance_per_metre * abs(distance)
-        turned += settings.yaw_variance_per_radian * abs(turn)
-        return PoseCovariance(
-            p.xx + 2 * fx * p.xyaw + fx * fx * p.yawyaw + along * c * c,
-            p.xy + fy * p.xyaw + fx * p.yyaw + fx * fy * p.yawyaw + along * c * s,
-            p.xyaw + fx * p.yawyaw,
-            p.yy + 2 * fy * p.yyaw + fy * fy * p.yawyaw + along * s * s,
-            p.yyaw + fy * p.yawyaw,
-            p.yawyaw + turned,
+    def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
+        """What the robot did in so many seconds between two twists is unknown: it has not moved."""
+        self._uncertainty.stand(
+            seconds * (before.linear + after.linear) / 2,
+            seconds * (before.angular + after.angular) / 2,
+            *self._gaps.unseen(seconds, before, after),
         )
 
 
@@ -167,20 +173,3 @@ def _times(a: Motors, dt: float) -> Motors:
 def _between(before: WheelSpeeds, after: WheelSpeeds, dt: float) -> Motors:
     """Wheel angles over a time that no line reported: linear from one report to the next."""
     return _times(_sum(before.as_tuple(), after.as_tuple()), dt / 2)
-
-
-def _over(p: PoseCovariance) -> bool:
-    return max(p.xx, p.yy, p.yawyaw) >= MAX_VARIANCE
-
-
-def arc(pose: Pose, distance: float, turn: float) -> Pose:
-    """`pose` after an arc of length `distance` m through `turn` rad."""
-    half = turn / 2
-    # sin(h)/h loses nothing in doubles down to tiny h; only h = 0 needs its limit.
-    chord = distance * (math.sin(half) / half if half else 1.0)
-    heading = pose.yaw + half
-    return Pose(
-        pose.x + chord * math.cos(heading),
-        pose.y + chord * math.sin(heading),
-        math.remainder(pose.yaw + turn, math.tau),
-    )

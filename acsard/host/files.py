@@ -12,6 +12,7 @@ from acsard.config.editing import edited
 from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 
 NEW_MODE = 0o644
 """A configuration has no secrets, and the service reads it as a user of its own."""
@@ -27,8 +28,8 @@ def require_tomlkit() -> None:
     except ImportError:
         raise ExitError(
             Exit.FAILURE,
-            "--write needs the library tomlkit; run: pip install 'acsard[mcu]', or leave --write "
-            "out and paste the lines",
+            f"--write needs the library tomlkit; run: {install('mcu')}, or leave --write out and "
+            "paste the lines",
         ) from None
 
 

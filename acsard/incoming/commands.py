@@ -17,6 +17,7 @@ from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import GID_BYTES, unpack
+from acsard.ros.transports import Transport
 from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
 from acsard.values import Twist as BodyTwist
 
@@ -26,7 +27,7 @@ MAX_COMMAND_BYTES = 4096
 REPLACED_NS = NS_PER_S // 2
 """Zenoh replaces timestamps that are further ahead of our clock."""
 
-Via = Literal["native", "bridge", "rmw"]
+Via = Literal["native"] | Transport
 """The tree a sample or query came by."""
 
 

@@ -28,7 +28,7 @@ from acsard.messages.schema import (
     TopicInfo,
     Topics,
 )
-from acsard.messages.topics import PUBLISHED, TOPICS, VERBS, full_key
+from acsard.messages.topics import PUBLISHED, VERBS, full_key, offered
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.transports import PARAMETERS
@@ -75,7 +75,7 @@ class Queries:
         self._fixed: dict[str, object] = {
             "info": info,
             "config": effective(config),
-            "topics": topic_table(config.robot.id),
+            "topics": topic_table(config),
         }
         self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
         self._parameters = Parameters(effective(config))
@@ -190,10 +190,14 @@ def schema(cls: type[Message]) -> dict[str, object]:
     return msgspec.json.schema(cls)
 
 
-def topic_table(robot_id: str) -> Topics:
+def topic_table(config: Config) -> Topics:
     """The table with this robot's full keys."""
+    robot = config.robot.id
     return Topics(
-        [TopicInfo(full_key(robot_id, t.key), t.direction, t.type, t.rate, t.note) for t in TOPICS]
+        [
+            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, t.note)
+            for t in offered(config)
+        ]
     )
 
 

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from acsard.bus.session import CA, CERTIFICATE, KEY
+from acsard.bus.certificates import CA, CERTIFICATE, KEY
 
 CA_KEY = "ca-key.pem"
 

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.session import CA
+from acsard.bus.certificates import CA
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 
 if TYPE_CHECKING:
     from acsard.bus.access import Role
@@ -79,7 +80,7 @@ def _maker() -> type[Authority]:
         from acsard.lan.authority import Authority
     except ImportError:
         raise ExitError(
-            Exit.FAILURE, "needs the library cryptography; run: pip install 'acsard[lan]'"
+            Exit.FAILURE, f"needs the library cryptography; run: {install('lan')}"
         ) from None
     return Authority
 

@@ -40,10 +40,10 @@ class Feedback(Struct, frozen=True):
     dt: float
     gap: float = 0.0
     turned: Motors | None = None
+    bridged: float = 0.0
+    """s: the first part of `dt`, that no line reported: the speeds of its neighbours stand in."""
     asked_ns: int | None = None
     """When the line it answers was made, monotonic, where the reply tells which one that is."""
-    bridged: float = 0.0
-    """s: the first part of `dt`, that no line reported."""
     since: float = 0.0
     """s since the previous line came, 0 after a silence: what it is judged by."""
     heard_ns: int = 0
@@ -143,7 +143,7 @@ class Timeline:
             dt = bridged = since = 0.0
         self._forgotten = False
         since = 0.0 if silent else since
-        return Feedback(at, speeds, dt, gap, wheels, asked_ns, bridged, since, came_ns)
+        return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _since_last(self, asked_ns: int | None) -> tuple[float, float, int | None]:
         """How long after the last good line this one was made, how much of it no line reported, s,

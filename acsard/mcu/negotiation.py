@@ -20,7 +20,9 @@ from typing import Literal
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.frames import FrameError
+from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
@@ -75,7 +77,7 @@ TRIES = 3
 WINDOW = 64
 """Lines whose answers may still come; far fewer than the sequence can tell apart."""
 
-LATE_NS = 3 * NS_PER_S // 10
+LATE_NS = round(WATCHDOG_S * NS_PER_S)
 """An answer later than this is to a line that the MCU's own watchdog has outlived."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
@@ -138,7 +140,7 @@ class Negotiation:
     def _begin(self, fresh: bool) -> None:
         self._pending.clear()
         self._made = None
-        self._asked_ns: int | None = None
+        self._asked = Throttle()
         self._unanswered, self._open = 0, False
         # The port makes the first line after an opening a plain stop, whatever it is given.
         self._plain_turn = 0 if fresh else 1
@@ -158,9 +160,8 @@ class Negotiation:
         """While asking: the stop that is due now, or None."""
         waking = self.state == "waking"
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
-        if self._asked_ns is not None and now_ns - self._asked_ns < wait_ns:
+        if not self._asked.lets(now_ns, wait_ns):
             return None
-        self._asked_ns = now_ns
         self._plain_turn += 1
         if waking and self._plain_turn % 2:
             return self._stop
@@ -219,12 +220,13 @@ class Negotiation:
 
     def judge(self, now_ns: int) -> None:
         """Count a question that goes unanswered; after the last one settle for what there is."""
-        if self.state != "asking" or not self._open or self._asked_ns is None:
+        asked_ns = self._asked.last_ns
+        if self.state != "asking" or not self._open or asked_ns is None:
             return
         if self.trouble == "echo":
             self._unanswered = 0  # it goes on asking, and nothing drives
             return
-        if now_ns - self._asked_ns < self._answer_ns:
+        if now_ns - asked_ns < self._answer_ns:
             return
         self._open = False
         self._unanswered += 1

@@ -25,5 +25,15 @@ class Promptest:
         How much later than the promptest so far: below 0 it is the promptest now.
         """
         later = self.late + ours - theirs
-        self.late = min(max(0.0, later - self._drift * ours), self._most)
+        self.measure(ours, theirs)
+        self.believe()
         return later
+
+    def measure(self, ours: float, theirs: float) -> float:
+        """`late` of one more, drift forgiven; below 0, it is prompter than whom we believe."""
+        self.late = self.late + ours - theirs - self._drift * ours
+        return self.late
+
+    def believe(self) -> None:
+        """The last one measured is the promptest, if none was prompter."""
+        self.late = min(max(0.0, self.late), self._most)

@@ -17,6 +17,7 @@ from acsard.mcu.lines import LineReader
 from acsard.mcu.link import WORDS, Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
+from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {
@@ -45,7 +46,7 @@ class McuSession:
         self._lines = LineReader()
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Silence after which the link is stale, ns."""
-        self.check = Negotiation(mcu, self.codec.stop)
+        self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self._wants_samples = mcu.wants_samples
@@ -57,9 +58,9 @@ class McuSession:
         self.events: list[Event] = []
         """What the last `update` found worth a log line."""
         self._starting_over = False
-        self._announced: tuple[LinkState, str, bool] = ("down", self.check.in_force, False)
+        self._announced: tuple[LinkState, str, bool] = ("down", self.negotiation.in_force, False)
         self._opened = 0
-        self._blind_ns = -BLIND_PERIOD_NS
+        self._blind = Throttle()
         self._made_ns: int | None = None
         """When the line just made was; what became of it is not known yet."""
 
@@ -82,7 +83,7 @@ class McuSession:
         the last line did not go out.
         """
         self.restarted, self._starting_over, self.events = False, False, []
-        self.check.settle(went=not unsent)
+        self.negotiation.settle(went=not unsent)
         if self._made_ns is not None and not unsent:
             self._timeline.left(self._made_ns)
         self._made_ns = None
@@ -111,14 +112,14 @@ class McuSession:
         return line
 
     def _next_line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
-        if self.check.asking:
-            return self.check.question(now_ns)
+        if self.negotiation.asking:
+            return self.negotiation.question(now_ns)
         if self.silent(now_ns):
-            if now_ns - self._blind_ns < BLIND_PERIOD_NS:
+            if not self._blind.lets(now_ns, BLIND_PERIOD_NS):
                 return None
-            self._blind_ns, speeds = now_ns, STILL
+            speeds = STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
-        return self.check.seal(line, now_ns)
+        return self.negotiation.seal(line, now_ns)
 
     def silent(self, now_ns: int) -> bool:
         """No good line within `quiet`, or none at all in this session."""
@@ -129,8 +130,8 @@ class McuSession:
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.link in ("booting", "stale"):
-            if self.check.trouble:
-                return MENDS[self.check.trouble]
+            if self.negotiation.trouble:
+                return MENDS[self.negotiation.trouble]
             if self._damaged:
                 return "the microcontroller's replies come damaged; asking it for the check again"
             if self._link.sparse_s:
@@ -144,12 +145,13 @@ class McuSession:
     @property
     def note(self) -> str:
         """Which check is in force, to go behind a reason; "" where none is wanted."""
-        return "" if self.check.state == "off" else f" (serial lines {self.check.in_force})"
+        check = self.negotiation
+        return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     @property
     def _damaged(self) -> bool:
         """The check is asked for because replies came damaged."""
-        return self._link.damaged and self.check.asking
+        return self._link.damaged and self.negotiation.asking
 
     # sessions
 
@@ -159,7 +161,7 @@ class McuSession:
         self._opened = opened
         self._lines.clear()
         self._timeline.forget()
-        self.check.begin(fresh=True)
+        self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
         """The MCU has started again: its motors stand, and nobody may drive on as if they did."""
@@ -168,12 +170,12 @@ class McuSession:
         self._link.sign("restarted")
         self.restarted = self._starting_over = True
         self._timeline.forget()
-        self.check.begin()
+        self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
         # Never up in the update that saw a restart: who drives has to see the link go first.
         self._link.judge(now_ns, may_rise=not self._starting_over)
-        check = self.check
+        check = self.negotiation
         settled = check.state == "plain" or check.checked
         if settled and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns:
             check.begin()
@@ -188,13 +190,13 @@ class McuSession:
 
     def _bad(self) -> None:
         """A line came that is none; so many in a row that a check in force has to be asked anew."""
-        if self._link.bad() and self.check.checked:
+        if self._link.bad() and self.negotiation.checked:
             self._link.sign("damaged")
-            self.check.begin()
+            self.negotiation.begin()
 
     def _announce(self) -> None:
         """An event for the link and one for the check, when they have changed."""
-        link, check = self.link, self.check
+        link, check = self.link, self.negotiation
         before, self._announced = self._announced, (link, check.in_force, bool(check.trouble))
         if link != before[0]:
             text = self.words() if self._damaged else WORDS[link]
@@ -230,7 +232,7 @@ class McuSession:
         if line.startswith(IDENTITY):
             self._restart(f"has started: {line.decode('ascii', 'replace')}")
             return None
-        check = self.check
+        check = self.negotiation
         if check.asking and check.echoed(line):
             self._reject("echo")
             self._link.missed()

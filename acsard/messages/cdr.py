@@ -192,8 +192,8 @@ class _List:
         self._get, self._most = get, most
         self._fixed = most if fixed else None
         self._code = number_code(kind)
-        array = self._code * (self._fixed or 0)
-        self._packs = _packs(array) if array else None
+        self._array = self._code * (self._fixed or 0)
+        self._packs = _packs(self._array) if self._array else None
         self._text = isinstance(plain(kind), inspect.StrType)
         self._parts: tuple[_Part, ...] = ()
         item = plain(kind)
@@ -228,7 +228,9 @@ class _List:
         count = source.count(least) if self._fixed is None else self._fixed
         if self._most is not None and count > self._most:
             raise CdrError(f"{count} items where {self._most} may be")
-        if self._code:
+        if self._array:
+            found.append(list(source.take(self._array)))
+        elif self._code:
             found.append(source.take_many(self._code, count) if count else [])
         elif self._text:
             found.append([source.text() for _ in range(count)])

@@ -13,7 +13,7 @@ DAY_NS = 86400 * NS_PER_S
 def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
     """How bad (0 ok, 1 warning, 2 error) and in words; wall-clock times, None when not known."""
     if ends_ns is None:
-        return 1, "unknown: no door, or no library to read it (pip install 'acsard[lan]')"
+        return 1, "unknown: no door, or no library to read it (`acsard doctor` says which)"
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
         return 2, f"ended {-days:.0f} days ago: nobody can join any more"

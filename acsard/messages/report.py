@@ -12,7 +12,9 @@ from msgspec.structs import asdict
 
 from acsard.config.settings import Config
 from acsard.config.wire_time import wire_use
+from acsard.drive.gyro import WORDS
 from acsard.drive.words import waiting
+from acsard.messages.covariances import Covariances
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -38,7 +40,7 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S, Estimate, Instant, Outputs, Snapshot
+from acsard.values import NS_PER_S, Estimate, GyroStatus, Instant, Outputs, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
 
@@ -53,7 +55,7 @@ class _Rate:
         self._next_ns = -2 * self._period_ns
 
     def due(self, now_ns: int, at_once: bool = False) -> bool:
-        # A twentieth of the period as grace, or a tick a microsecond early would wait for the
+        # A twentieth of the period as grace, or a step a microsecond early would wait for the
         # next one.
         if not at_once and now_ns < self._next_ns - self._period_ns // 20:
             return False
@@ -76,8 +78,7 @@ class Report:
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
-        self._twist_covariance = [0.0] * 36
-        self._twist_covariance[::7] = config.odometry.twist_covariance_diagonal
+        self._covariances = Covariances(config.odometry)
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
@@ -149,23 +150,14 @@ class Report:
         return TFMessage(transforms)
 
     def _odom(self, estimate: Estimate) -> Odometry:
-        frames, pose, p = self._config.odometry, estimate.pose, estimate.covariance
-        d = frames.pose_covariance_diagonal
-        # fmt: off
-        covariance = [
-            p.xx,    p.xy,   0.0,  0.0,  0.0,  p.xyaw,
-            p.xy,    p.yy,   0.0,  0.0,  0.0,  p.yyaw,
-            0.0,     0.0,    d[2], 0.0,  0.0,  0.0,
-            0.0,     0.0,    0.0,  d[3], 0.0,  0.0,
-            0.0,     0.0,    0.0,  0.0,  d[4], 0.0,
-            p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,  p.yawyaw,
-        ]
-        # fmt: on
+        frames, pose = self._config.odometry, estimate.pose
+        of_pose = self._covariances.of_pose(estimate.covariance)
+        of_twist = self._covariances.of_twist(estimate.twist_variances)
         return Odometry(
             Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,
-            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), covariance),
-            TwistWithCovariance(_twist(estimate.twist), self._twist_covariance),
+            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), of_pose),
+            TwistWithCovariance(_twist(estimate.twist), of_twist),
         )
 
     def _tf(self, estimate: Estimate) -> TFMessage:
@@ -210,6 +202,7 @@ class Report:
                 name: Figure(_spread(one.since_start), _spread(one.last_minute))
                 for name, one in snapshot.figures.items()
             },
+            gyro=snapshot.gyro.does,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -217,6 +210,20 @@ class Report:
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends_ns, now.wall_ns)
+
+    def _gyro(self, gyro: GyroStatus) -> list[tuple[str, int, str, dict[str, str]]]:
+        """The row of the gyro, none without one."""
+        if gyro.does == "off":
+            return []
+        values = {"delay_s": f"{gyro.delay:.3f}"}
+        if gyro.bias is not None:
+            values["bias_rad_s"] = f"{gyro.bias:.5f}"
+        if gyro.track is not None:
+            configured = self._config.drive.wheel_separation_multiplier
+            values["wheel_separation_multiplier"] = f"{configured:.3f}"
+            values["learned_multiplier"] = f"{configured * gyro.track:.3f}"
+        level = int(gyro.does not in ("used", "waiting for rest"))
+        return [("gyro", level, WORDS[gyro.does], values)]
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         config, counters, figures = self._config, snapshot.counters, snapshot.figures
@@ -254,6 +261,7 @@ class Report:
                 {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
+            *self._gyro(snapshot.gyro),
             *([("certificate", *certificate, {})] if certificate[1] else []),
         )
         return DiagnosticArray(

@@ -18,6 +18,8 @@ Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
+Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
 FEW = Meta(max_length=64)
 """More joints than any robot of ours; what a stranger sends must not take long to refuse."""
 
@@ -88,6 +90,13 @@ class Pose(Message, frozen=True):
     orientation: Quaternion
 
 
+class PoseStamped(Message, frozen=True):
+    """A pose in `header.frame_id` at the time of `header.stamp`."""
+
+    header: Header
+    pose: Pose
+
+
 class PoseWithCovariance(Message, frozen=True):
     """A pose and its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
 
@@ -142,6 +151,21 @@ class JointState(Message, frozen=True):
     effort: Annotated[list[float], FEW] = []
 
 
+class Imu(Message, frozen=True):
+    """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
+
+    A covariance that begins with -1 says that this is not measured.
+    """
+
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: Covariance3
+    angular_velocity: Vector3
+    angular_velocity_covariance: Covariance3
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: Covariance3
+
+
 class SourceState(Message, frozen=True):
     """One commander: seconds since its last accepted command (null: none) and what it waits for."""
 
@@ -190,6 +214,8 @@ class RobotState(Message, frozen=True):
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
+    gyro: str = "off"
+    """What the gyro does for odometry: `values.GyroDoes`."""
 
 
 class DoorState(Message, frozen=True):
@@ -298,6 +324,8 @@ MESSAGES: dict[str, type[Message]] = {
         Odometry,
         TFMessage,
         JointState,
+        PoseStamped,
+        Imu,
         Twist,
         TwistStamped,
         RobotState,

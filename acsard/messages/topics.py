@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
+from acsard.config.settings import Config
 from acsard.values import ROOT, Verb
 
 Direction = Literal["out", "in", "query", "service"]
@@ -26,6 +27,10 @@ class Topic(Struct, frozen=True):
     rate: str
     note: str
     latched: bool = False
+    simulated: bool = False
+    """Only the built-in simulator has it: on a real robot the key does not exist."""
+    gyro: bool = False
+    """Only with `[odometry] gyro = true`."""
 
     @property
     def pattern(self) -> str:
@@ -45,6 +50,10 @@ _SERVICE_NOTES: dict[Verb, str] = {
 }
 
 
+IMU = "imu"
+"""What a gyro says; the simulator's own comes in on it as anybody's."""
+
+
 def service_key(verb: str) -> str:
     """The key of a service."""
     return f"srv/{verb}"
@@ -61,8 +70,12 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
     Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
+    Topic(
+        "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
+    ),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
+    Topic(IMU, "in", "Imu", "any", "turn rate by a gyro, with [odometry] gyro", gyro=True),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
     Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
     *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
@@ -78,6 +91,19 @@ PUBLISHED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.direction == "out" and topic.key != "alive"
 )
 """The topics with a payload; each also answers queries with its last value."""
+
+
+def offered(config: Config) -> tuple[Topic, ...]:
+    """The rows that a daemon of this configuration has."""
+    simulated, gyro = config.mcu.simulated, config.odometry.gyro
+    rows = (topic for topic in TOPICS if simulated or not topic.simulated)
+    return tuple(topic for topic in rows if gyro or not topic.gyro)
+
+
+def published(config: Config) -> tuple[Topic, ...]:
+    """Those of them that it publishes; the simulator also what its gyro says."""
+    own = config.mcu.simulated
+    return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
 
 def full_key(robot_id: str, key: str) -> str:

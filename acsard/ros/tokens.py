@@ -21,10 +21,14 @@ RMW_DEFAULT_DEPTH = 42
 
 
 class Qos(Struct, frozen=True):
-    """Reliable, keep last `depth`; `transient` keeps it for those who come late."""
+    """Keep last `depth`; `transient` keeps it for those who come late.
+
+    A reader with `best_effort` takes from reliable writers too; a reliable one only from those.
+    """
 
     depth: int = 10
     transient: bool = False
+    best_effort: bool = False
 
 
 class Node(Struct, frozen=True):
@@ -56,7 +60,8 @@ class Node(Struct, frozen=True):
 def rmw_qos(qos: Qos) -> str:
     """QoS as rmw_zenoh_cpp writes it: what equals its default is left out."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
-    return f":{'1' if qos.transient else ''}:,{depth}:,:,:,,"
+    reliability = "2" if qos.best_effort else ""
+    return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:
@@ -75,7 +80,8 @@ def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> s
     head += f"/{_in_one_chunk(type_name)}"
     if kind == "SS":
         return head
-    return f"{head}/:1:{int(qos.transient)}:0,{qos.depth}:typehash={TYPE_HASHES[type_name]};"
+    how = f"{int(not qos.best_effort)}:{int(qos.transient)}:0,{qos.depth}"
+    return f"{head}/:{how}:typehash={TYPE_HASHES[type_name]};"
 
 
 def _mangled(name: str) -> str:

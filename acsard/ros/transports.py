@@ -12,7 +12,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.config.settings import Config, RosConfig
-from acsard.messages.topics import Direction, service_key
+from acsard.messages.topics import IMU, Direction, service_key
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
 
@@ -74,10 +74,15 @@ TWISTS = {"twist": "geometry_msgs/msg/Twist", "twist_stamped": "geometry_msgs/ms
 SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
 """The command source each commanding topic counts as."""
 
+GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
+"""As drivers of sensors publish it (SensorDataQoS) or better."""
+
 
 def left_out(config: Config) -> frozenset[str]:
-    """The native keys that have nothing to say: ROS tools would take them for a broadcaster."""
+    """The native keys that have nothing to say or to hear: ROS tools would take them for more."""
     silent = set() if config.odometry.publish_tf else {"tf"}
+    if not config.odometry.gyro or config.mcu.simulated:  # the simulated robot has a gyro itself
+        silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):
         silent.add("tf_static")
     return frozenset(silent)
@@ -99,6 +104,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
             "in",
             "sensor_msgs/msg/JointState",
         ),
+        *(row for row in (GYRO,) if row.native not in silent),
         *(
             RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
             for verb in TRIGGERS

@@ -33,8 +33,8 @@ class Pace:
         """There was something new to say, too soon after a line."""
         self._idle = 0
 
-    def tick(self, missed: int) -> bool:
-        """A period has ended: does its line go, or did one go in its place?
+    def period_ended(self, missed: int) -> bool:
+        """Does the clock's line go (`Inputs.tick`), or did one go in its place?
 
         After `missed` periods it goes in any case: the one before it is long ago.
         """
@@ -59,10 +59,10 @@ class Pace:
 
     @property
     def listens(self) -> bool:
-        """Worth waking for a command: none is in hand, and a line could go before the tick."""
+        """Worth waking for a command: none is in hand; a line could go before the next period."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """When the line for what is new may go, if that is before the tick; None for never."""
+        """When the line for what is new may go, if before the next period; None for never."""
         ahead = self._waiting and self._possible and not self._tried
         return sent_ns + self._gap_ns if ahead else None

@@ -18,11 +18,13 @@ from acsard.incoming.bus import Bus
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
+from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import Queries
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
+from acsard.messages.topics import IMU
 from acsard.robot import Robot
 from acsard.runtime.at_once import Pace
 from acsard.runtime.period import NO_PERIOD, Period
@@ -31,6 +33,7 @@ from acsard.values import (
     NS_PER_S,
     Command,
     Event,
+    GyroSample,
     Inputs,
     Instant,
     Outputs,
@@ -63,8 +66,12 @@ class ControlLoop:
         mono_ns: Callable[[], int],
         certificate_ends_ns: int | None = None,
         others: list[Event] | None = None,
+        beside: Callable[[str], Message | None] | None = None,
     ) -> None:
-        """`others` are the events of the daemon's other parts; each step takes what is there."""
+        """`others` are the events of the daemon's other parts; each step takes what is there.
+
+        `beside` has the present values of the keys that those parts publish.
+        """
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
@@ -72,6 +79,7 @@ class ControlLoop:
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
+        self._beside = beside
         stop = self.robot.session.codec.stop
         self._guard = Guard(
             stop,
@@ -81,7 +89,9 @@ class ControlLoop:
         )
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._door = DoorTold()
+        self._door, self._imu = DoorTold(), ImuTold()
+        self._turn_rates: list[GyroSample] = []
+        """What a gyro said since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._last = stop
         """The line that went last."""
@@ -123,7 +133,7 @@ class ControlLoop:
         port, pace = self._port, self._pace
         inputs = Inputs(
             now=now,
-            tick=ended and pace.tick(missed),
+            tick=ended and pace.period_ended(missed),
             at_once=pace.at_once(now.mono_ns, port.sent_ns),
             port_open=port.is_open,
             opened=port.opened,
@@ -132,6 +142,7 @@ class ControlLoop:
             commands=commands,
             requests=requests,
             refusals=refusals,
+            gyro=tuple(self._turn_rates),
             guard_trip=self._trip,
             superseded=self._superseded,
             missed=missed,
@@ -139,6 +150,7 @@ class ControlLoop:
             leaving=self.leaving,
         )
         self._others.clear()
+        self._turn_rates.clear()
         outputs = self.outputs = self.robot.step(inputs)
         went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
@@ -164,6 +176,11 @@ class ControlLoop:
             if arrival.key == DOOR:
                 ends_ns = self._door.hear(arrival, self.robot.counters)
                 self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
+                continue
+            if arrival.key == IMU:
+                heard = self._imu.hear(arrival, self.robot.counters, self._others)
+                if heard is not None:
+                    self._turn_rates.append(heard)
                 continue
             if arrival.key == "stop":
                 if arrival.put:
@@ -235,7 +252,8 @@ class ControlLoop:
             self._log(event)
 
     def _current(self, key: str) -> Message | None:
-        return self.report.current(key, self._look)
+        message = self.report.current(key, self._look)
+        return self._beside(key) if message is None and self._beside else message
 
     def _look(self) -> Snapshot:
         outputs = self.outputs

@@ -16,8 +16,8 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from acsard import __version__
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
-from acsard.bus.certificates import check as check_certificates
 from acsard.bus.certificates import ends_ns as ends_ns_of
+from acsard.bus.certificates import require_usable
 from acsard.bus.session import log_from_environment
 from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
@@ -25,15 +25,15 @@ from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
+from acsard.messages.topics import offered, published
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
 from acsard.runtime.doorkeeper import keep_door
+from acsard.runtime.simulated import Simulated
 from acsard.runtime.ticker import Ticker
 from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
-from acsard.serial.sim_pty import SimPty
-from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Event
 
 SWITCH_INTERVAL_S = 0.0005
@@ -41,9 +41,6 @@ SWITCH_INTERVAL_S = 0.0005
 
 LATCHED_PERIOD_S = 5.0
 """How often latched messages are sent again, for subscribers that cannot ask for history."""
-
-SIMULATOR = "sim"
-
 
 Announce = Callable[[str, str], None]
 """Called once when everything is up, with the serial device and what is wrong with it, if it is."""
@@ -87,10 +84,8 @@ async def _run(
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
-        path = config.mcu.port
-        if path == SIMULATOR:
-            mcu = FakeMcu(config, clock.now().mono_ns)
-            path = stack.enter_context(SimPty(mcu)).path
+        simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
+        path = config.mcu.port if simulated is None else simulated.path
         sources = tuple(source.name for source in config.commands.sources)
         bus = ZenohBus(
             config.bus,
@@ -100,6 +95,8 @@ async def _run(
             sources,
             access_control(config),
             wake,
+            offered(config),
+            published(config),
         )
         events: list[Event] = []
         period_ns = int(NS_PER_S / config.rate_hz)
@@ -110,10 +107,14 @@ async def _run(
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
+        beside = None
+        if simulated is not None:
+            simulated.tell(bus)
+            beside = simulated.current
         await stack.enter_async_context(port)
         info = _info(config, path)
         control = ControlLoop(
-            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events
+            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events, beside
         )
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
@@ -136,7 +137,7 @@ def _certificates(config: Config, ours: bool) -> int | None:
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
         return None
-    check_certificates(bus.tls)
+    require_usable(bus.tls)
     return ends_ns_of(bus.tls)
 
 
@@ -160,7 +161,7 @@ async def _control(
             manager.step(control.step(now, period))
             if departure.over(now.mono_ns, control.at_rest):
                 return None
-            return Next(control.listens, control.retry_ns, ticked=period.expired > 0)
+            return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
 
         ticker.start(clock.now().mono_ns)
         await wake.run(step)
@@ -203,7 +204,7 @@ def _info(config: Config, path: str) -> Info:
         version=__version__,
         pid=os.getpid(),
         port=path,
-        simulated=config.mcu.port == SIMULATOR,
+        simulated=config.mcu.simulated,
         rate=config.rate_hz,
         listen=list(config.bus.listen) if config.bus.mode == "peer" else [],
         connect=list(config.bus.connect),

@@ -1,6 +1,7 @@
-"""Keeps the door to the network open beside a daemon in the foreground: a process of its own.
+"""Keeps the door to the network, or a fleet's router, open: a process of its own, again and again.
 
-As a service it is a unit of its own (`acsard-door.service`), with limits that only systemd can set.
+As a service the door is a unit of its own (`acsard-door.service`), with limits that only systemd
+can set.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ LATER_S = 2.0
 """Before one is tried again that could not be opened."""
 
 
-async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
-    """`acsard door` with these words, again whenever it ends, until cancelled."""
+async def keep_door(
+    words: Sequence[str], log: Callable[[Event], None], what: str = "the door to the network"
+) -> None:
+    """`acsard` with these words ("door", ...), again whenever it ends, until cancelled."""
     while True:
         door = _Door(words)
         try:
@@ -33,7 +36,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None]) -> None:
             code, why = Exit.USAGE, f"could not be started ({error})"
         finally:
             door.let_go()
-        log(Event("door_ended", f"the door to the network {why}; it is opened anew", "warning"))
+        log(Event("door_ended", f"{what} {why}; it is opened anew", "warning"))
         await asyncio.sleep(AGAIN_S if code <= Exit.FAILURE else LATER_S)
 
 
@@ -42,7 +45,7 @@ class _Door:
 
     def __init__(self, words: Sequence[str]) -> None:
         # -P: what is installed, and not what lies in the directory that we were started in.
-        self._command = [sys.executable, "-P", "-m", "acsard", "door", "--held", *words]
+        self._command = [sys.executable, "-P", "-m", "acsard", *words, "--held"]
         self._process: subprocess.Popen[bytes] | None = None
         self._over = False
 

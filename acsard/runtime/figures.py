@@ -40,7 +40,7 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""How old the told values may be: adding up the minute costs more than a step."""
+"""How old the cached values may be: adding up the minute costs more than a step."""
 
 
 class _Figure:
@@ -77,8 +77,8 @@ class Figures:
 
     def __init__(self) -> None:
         self._figures = {name: _Figure() for name in NAMES}
-        self._told: dict[str, Measured] = {}
-        self._told_ns = -FRESH_NS
+        self._cached: dict[str, Measured] = {}
+        self._cached_ns = -FRESH_NS
 
     def add(self, name: Name, now_ns: int, duration_ns: int) -> None:
         """Count one measurement made at monotonic `now_ns`."""
@@ -86,7 +86,7 @@ class Figures:
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
         """Every figure by its name; at most a second old."""
-        if now_ns - self._told_ns >= FRESH_NS:
-            self._told_ns = now_ns
-            self._told = {name: figure.measured(now_ns) for name, figure in self._figures.items()}
-        return self._told
+        if now_ns - self._cached_ns >= FRESH_NS:
+            self._cached_ns = now_ns
+            self._cached = {name: figure.measured(now_ns) for name, figure in self._figures.items()}
+        return self._cached

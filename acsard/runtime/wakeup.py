@@ -1,6 +1,6 @@
 """When a step happens: whatever happens runs it, right where the event loop learns of it.
 
-    tick     a period has ended (`ticker.py`)
+    period   one has ended (`ticker.py`)
     bytes    the port has read something, or was lost
     retry    a line with something new may go now (`at_once.py`)
     command  the bus has what may be a command, if its line could go at once (`at_once.py`); else
@@ -22,14 +22,14 @@ from acsard.runtime.ticker import Alarm
 
 
 class Next(Struct, frozen=True):
-    """What a step leaves to wait for, beside tick, bytes, stop and signal."""
+    """What a step leaves to wait for, beside period, bytes, stop and signal."""
 
     listens: bool
     """A command is worth a step of its own."""
     retry_ns: int | None
     """When to step again, monotonic; None for no need."""
-    ticked: bool = True
-    """A period has ended: a stop may wake the loop again."""
+    period_ended: bool = True
+    """A stop may wake the loop again."""
 
 
 class Wakeup:
@@ -97,7 +97,7 @@ class Wakeup:
     def _arm(self, then: Next) -> None:
         self._alarm.set(then.retry_ns)
         self._listens = then.listens
-        if then.listens or then.ticked:
+        if then.listens or then.period_ended:
             self._stop_told = False
         if then.listens and self._heard:  # while the step ran, and perhaps too late for it
             self._listens, self._again = False, True

@@ -20,8 +20,8 @@ from itertools import count, cycle
 from acsard.config.settings import Config, WheelMap
 from acsard.config.wire_time import wire_ns
 from acsard.sim import protocol
+from acsard.sim.faults import USB_PACKET, Faults
 from acsard.sim.faults import WATCHDOG_NS as WATCHDOG_NS
-from acsard.sim.faults import Faults
 from acsard.sim.vehicle import Vehicle
 from acsard.values import NS_PER_S
 
@@ -50,7 +50,7 @@ class FakeMcu(Faults):
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
-        self._held = b""
+        self._held = self._batch = b""
         self._in_free_ns = self._out_free_ns = now_ns
         self._boot_until_ns = now_ns + int(config.sim.boot_time * NS_PER_S)
         self._fed_ns = now_ns
@@ -91,8 +91,8 @@ class FakeMcu(Faults):
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
             self._pass(due_ns)
-            if what == "sent":
-                out += data
+            if what in ("sent", "batch"):
+                out += self._handed_over(due_ns, what, data)
             elif what == "line":
                 self.heard.append((due_ns, data))
                 lost = self._hit("command", self.lose_command)
@@ -114,7 +114,7 @@ class FakeMcu(Faults):
         """Power on again: stopped, deaf while the bootloader runs, noise on the line first."""
         self._pass(now_ns)
         self._events.clear()
-        self._held = b""
+        self._held = self._batch = b""
         self.vehicle.set_points[:] = [0.0] * 4
         self._boot_until_ns = now_ns + deaf_ns
         self._on_ns = now_ns + deaf_ns
@@ -184,6 +184,22 @@ class FakeMcu(Faults):
     def _send(self, now_ns: int, data: bytes) -> None:
         self._out_free_ns = max(self._out_free_ns, now_ns) + wire_ns(len(data), self.baud_rate)
         self._schedule(self._out_free_ns, "sent", data)
+
+    def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
+        """What of bytes that have come so far reaches the host now; the rest waits."""
+        until_ns = self._stalled_until(now_ns)
+        if until_ns > now_ns:
+            self._schedule(until_ns, what, data)
+            return b""
+        begun, waited = bool(self._batch), self._batch + data
+        full = len(waited) // USB_PACKET * USB_PACKET
+        if what == "batch" or not self.latency_ns:
+            full = len(waited)
+        self._batch = waited[full:]
+        if self._batch and not begun:
+            tick_ns = -(-now_ns // self.latency_ns) * self.latency_ns
+            self._schedule(tick_ns, "batch", b"")
+        return waited[:full]
 
     def _encoders(self) -> list[int]:
         """Counts of motors a to d."""

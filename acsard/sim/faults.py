@@ -13,6 +13,9 @@ from acsard.values import NS_PER_S
 
 Fault = AbstractContextManager[None]
 
+USB_PACKET = 62
+"""Bytes after which an FTDI adapter waits no longer."""
+
 WATCHDOG_NS = 300_000_000
 """Silence after which the MCU stops the motors by itself."""
 
@@ -48,6 +51,9 @@ class Faults:
         self.encoder_signs = [1, 1, 1, 1]
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
+        self.latency_ns = 0
+        """Between two packets of the adapter at the host's end."""
+        self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
         """Every how many-th is hit; 0 is none."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
@@ -197,11 +203,28 @@ class Faults:
         """In every so many-th line, of either direction, one bit is turned; another each time."""
         return self._with(bit_error=every)
 
+    def ftdi(self, latency_s: float = 0.016) -> Fault:
+        """Comes through a USB adapter that hands on what it has only so often, or when it is full:
+        a line's bytes are late by up to that, and several lines come at once."""
+        return self._with(latency_ns=int(latency_s * NS_PER_S))
+
+    def stalls(self, every_s: float, length_s: float) -> Fault:
+        """Every so often nothing reaches the host for a while; then all of it at once."""
+        return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
+
+    def _stalled_until(self, now_ns: int) -> int:
+        """When the host hears again; `now_ns` itself when it does now."""
+        if not self.stall_every_ns:
+            return now_ns
+        began_ns = now_ns // self.stall_every_ns * self.stall_every_ns
+        return max(now_ns, began_ns + self.stall_ns)
+
 
 FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
     "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
+    "ftdi",
 )  # fmt: skip
 """The faults that need no argument, by method name: what `acsard sim --fault` offers."""
 
@@ -209,7 +232,7 @@ ARGUMENTS = {
     "stuck_encoder": "m", "dead_motor": "m", "reversed_motor": "m", "reversed_encoder": "m",
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
     "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
-    "pushed": "n",
+    "pushed": "n", "stalls": "nn",
 }  # fmt: skip
 """The faults that need arguments: `m` a motor, 0 to 3 for a to d; `n` a number."""
 

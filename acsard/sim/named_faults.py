@@ -45,6 +45,8 @@ def named(text: str) -> NamedFault:
     )
     if name == RESET and not fault.values[0] > 0:
         raise ValueError(f"{text}: seconds between resets must be above 0")
+    if name == "stalls" and not fault.values[0] > fault.values[1] > 0:
+        raise ValueError(f"{text}: seconds from one stall to the next, and fewer for each")
     if name == "other_baud" and fault.values[0] not in get_args(Baud):
         raise ValueError(f"{text}: rates are {', '.join(map(str, get_args(Baud)))}")
     return fault

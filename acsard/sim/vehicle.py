@@ -1,9 +1,18 @@
 """Four motors with lag on a base that moves: what the encoders and the floor would see.
 
-Motors follow their set points as first-order systems. The base moves by the wheels' real speeds;
+Motors follow their set points as first-order systems. The base moves by the wheels' real speeds,
+real radii and real effective track, which `[sim]` can make others than the host believes;
 `turn_slip` makes skidding wheels turn it less than they roll, `load` makes the motors give less
 than they are asked. Hands that push it are stronger than the motors. Wheels are in
 `values.WHEELS` order.
+
+With w the turn rate in rad/s that the wheels would give at track_multiplier x the configured
+effective track L, and k = track_rate_dependence, the base turns at
+
+    w / (1 + 2 k |w| / (1 + |w|))
+
+so that the effective track is L x track_multiplier at creeping, (1 + k) times that at 1 rad/s, and
+stays bounded.
 """
 
 from __future__ import annotations
@@ -11,8 +20,12 @@ from __future__ import annotations
 import math
 
 from acsard.config.settings import DriveConfig, SimConfig
-from acsard.drive.odometry import arc
+from acsard.drive.path import arc
+from acsard.sim.noise import uniform
 from acsard.values import Pose
+
+GRIP_S = 0.25
+"""How long the wheels grip the floor as they do, before they grip it otherwise."""
 
 HANDS_S = 0.1
 """How long hands take to bring the robot to their speed, as a motor's time constant."""
@@ -23,13 +36,20 @@ class Vehicle:
 
     def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
         self._lag = sim.motor_time_constant
-        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
-        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
-        self._track = drive.wheel_separation * drive.wheel_separation_multiplier
+        left, right = sim.left_radius_multiplier, sim.right_radius_multiplier
+        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier * left
+        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier * right
+        track = drive.wheel_separation * drive.wheel_separation_multiplier
+        self._track = track * sim.track_multiplier
+        self._rate_dependence = sim.track_rate_dependence
+        self._floor, self._seed, self._time = sim.turn_slip, sim.seed, 0.0
         self.set_points = [0.0] * 4
         self.speeds = [0.0] * 4
         self.angles = [0.0] * 4
         self.pose = Pose()
+        """Where it truly is: base_link from where it began."""
+        self.turned = 0.0
+        """rad to the left since it began, whole turns counted."""
         self.turn_slip = 0.0
         """Share of every turn that is lost to skidding, 0 to 1."""
         self.load = 0.0
@@ -39,6 +59,8 @@ class Vehicle:
         """Let `dt` s pass under the present set points, or pushed by hand at `push` m/s."""
         if dt <= 0.0:
             return
+        grip = self._grip()
+        self._time += dt
         if push is not None:
             right, left = push / self._right_radius, push / self._left_radius
             goals, lag = [right, left, left, right], HANDS_S
@@ -57,5 +79,15 @@ class Vehicle:
             self.angles[i] += turned[i]
         left = self._left_radius * (turned[1] + turned[2]) / 2
         right = self._right_radius * (turned[0] + turned[3]) / 2
-        turn = (right - left) / self._track * (1.0 - self.turn_slip)
+        turn = (right - left) / self._track
+        rate = abs(turn) / dt
+        turn *= grip / (1.0 + 2.0 * self._rate_dependence * rate / (1.0 + rate))
+        self.turned += turn
         self.pose = arc(self.pose, (left + right) / 2, turn)
+
+    def _grip(self) -> float:
+        """What the floor leaves of a turn now."""
+        kept = 1.0 - self.turn_slip
+        if self._floor:
+            kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))
+        return kept

@@ -12,7 +12,7 @@ from collections.abc import Collection
 
 import zenoh
 
-from acsard.bus.subscription import QUEUED
+from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
 from acsard.host.errors import MendableError, ReplyError
 from acsard.messages.encodings import DecodeError, Decoder
@@ -110,7 +110,7 @@ class Feed:
             waiting.append(sample)
         for sample in reversed(waiting):
             try:
-                state = self._decoder.decode(str(sample.encoding), sample.payload.to_bytes())
+                state = self._decoder.decode(*encoded(sample))
             except DecodeError:
                 self._undecodable += 1
             else:

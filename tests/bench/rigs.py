@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -95,3 +96,22 @@ def schedule(pid: int, policy: int, priority: int = 0) -> None:
     """Give every thread of a process this policy; raises PermissionError where that is not ours."""
     for task in os.listdir(f"/proc/{pid}/task"):
         os.sched_setscheduler(int(task), policy, os.sched_param(priority))
+
+
+HOGS_S = 120
+"""What keeps a core busy ends by itself, whatever becomes of the test."""
+
+
+@contextmanager
+def all_cores_busy(wanted: bool) -> Iterator[None]:
+    """A process for each core that does nothing but compute."""
+    busy = f"import time\nend = time.monotonic() + {HOGS_S}\nwhile time.monotonic() < end: pass"
+    words = [sys.executable, "-c", busy]
+    number = len(os.sched_getaffinity(0)) if wanted else 0
+    hogs = [subprocess.Popen(words) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()

@@ -10,15 +10,12 @@ carries; `unlimited.py` says how that is lifted. Sought by doubling, then by hal
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
 from acsard.bench.rig import Rig
-from tests.bench.rigs import config, rig, schedule
+from tests.bench.rigs import all_cores_busy, config, rig, schedule
 from tests.bench.unlimited import BAUD_RATE
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
@@ -84,25 +81,6 @@ def test_the_highest_control_rate(realtime: bool) -> None:
     print(f"  {good:.0f} Hz")
     # Others on the machine decide how much more when nothing keeps them back.
     assert good >= (5 * MADE_FOR if realtime else MADE_FOR)
-
-
-HOGS_S = 120
-"""What keeps a core busy ends by itself, whatever becomes of the test."""
-
-
-@contextmanager
-def all_cores_busy(wanted: bool) -> Iterator[None]:
-    """A process for each core that does nothing but compute."""
-    busy = f"import time\nend = time.monotonic() + {HOGS_S}\nwhile time.monotonic() < end: pass"
-    words = [sys.executable, "-c", busy]
-    number = len(os.sched_getaffinity(0)) if wanted else 0
-    hogs = [subprocess.Popen(words) for _ in range(number)]
-    try:
-        yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
 
 
 @pytest.mark.parametrize("realtime", [False, True], ids=["normal", "fifo"])

@@ -27,13 +27,12 @@ from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
 from acsard.bus.outlets import direct
 from acsard.bus.session import client_session
-from acsard.config.settings import Config
+from acsard.config.settings import SIMULATOR, Config
 from acsard.host import clock
 from acsard.messages import encodings
 from acsard.messages.schema import Message
-from acsard.messages.topics import full_key
+from acsard.messages.topics import full_key, offered, published
 from acsard.ros.transports import left_out
-from acsard.runtime.daemon import SIMULATOR
 from tests.bench.rigs import config, in_turns, rig, sibling
 from tests.unit.messages.test_cdr import odometry
 
@@ -198,6 +197,8 @@ def encoded(
             sources,
             access_control(one),
             Nobody(),
+            offered(one),
+            published(one),
         )
         async with bus:
             with listening(one, keys, 1 if keys else 0):

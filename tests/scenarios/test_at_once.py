@@ -36,7 +36,7 @@ def sent_after(world: World, at_ns: int) -> list[int]:
 
 def between_ticks(world: World, ms: float) -> None:
     """Go on to so many ms after a tick."""
-    world.run((world.next_tick_ns - world.now_ns) / 1e9)
+    world.run((world.next_period_ns - world.now_ns) / 1e9)
     world.run(ms / 1e3)
 
 

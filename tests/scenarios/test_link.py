@@ -8,6 +8,7 @@ import pytest
 
 from acsard.config.settings import Config, ControlConfig, McuConfig
 from acsard.sim.fake_mcu import FakeMcu
+from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -224,6 +225,45 @@ def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_block
         world.hold(0.5, seconds=0.2)
     assert world.lines()[0] == ZERO
     assert moving(world.lines())
+
+
+def test_a_line_that_the_loop_stood_still_over_is_superseded_and_the_next_one_goes(
+    world: World,
+) -> None:
+    world.drive(0.5, seconds=0.2)  # on the way up each line says another speed
+    made: list[bytes | None] = []
+    world.watch = lambda outputs: made.append(outputs.line) if outputs.due else None
+    sent = len(world.port.sent)
+    world.stall_in_step(0.015)
+    world.run(0.1)
+    old, *fresh = made
+    assert [line for _, line in list(world.port.sent)[sent:]] == fresh
+    assert len({old, *fresh}) == 1 + len(fresh) >= 8
+    assert world.state.counters["lines_superseded"] == 1
+
+
+def test_a_zero_goes_however_long_the_loop_stood_still_over_it(world: World) -> None:
+    sent, begun_ns = len(world.port.sent), world.now_ns
+    world.stall_in_step(0.2)
+    world.run(0.2)
+    (late_ns, line), *_ = list(world.port.sent)[sent:]
+    assert line == ZERO
+    assert late_ns >= begun_ns + NS_PER_S // 5
+    assert world.state.counters.get("lines_superseded", 0) == 0
+
+
+def test_a_torn_line_moves_nothing_and_spoils_none_behind_it(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.run(0.005)  # the last one is heard
+    valid, heard = world.mcu.valid_lines, len(world.mcu.heard)
+    world.port.takes = 10
+    world.run(0.1)
+    torn, *behind = [line for _, line in list(world.mcu.heard)[heard:]]
+    assert torn == b"ap10.00,bp\r\n"
+    assert len(behind) >= 8
+    assert world.mcu.valid_lines == valid + len(behind)
+    assert world.mcu.vehicle.set_points == [10.0] * 4
+    assert world.state.counters["lines_superseded"] == 1
 
 
 def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:

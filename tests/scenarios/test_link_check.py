@@ -525,7 +525,7 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
                 assert outputs.linked
                 assert protocol.whole(line)
                 assert b"#" in line
-                assert world.loop.robot.session.check.checked
+                assert world.loop.robot.session.negotiation.checked
             for estimate in outputs.estimates:
                 here = [estimate.pose.x, estimate.pose.y]
                 # 0.6 m/s for as long as counts bridge at most, and what the motors run on

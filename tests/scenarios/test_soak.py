@@ -143,7 +143,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     match kind:
         case "restart":
             again = quiet_bus(World(world.config, plugged=False))
-            again.now_ns = again.next_tick_ns = world.now_ns + dice.randrange(3 * NS_PER_S)
+            again.now_ns = again.next_period_ns = world.now_ns + dice.randrange(3 * NS_PER_S)
             again.mcu = world.mcu
             again.port.plug(world.mcu)
             return again

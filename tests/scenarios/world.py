@@ -17,12 +17,15 @@ from acsard.incoming.commands import Arrival
 from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
 from acsard.mcu.port import Gate, Offered
+from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.topics import PUBLISHED
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Event, Instant, Outputs, Received
+from acsard.sim.told import turn_rate
+from acsard.sim.watched import Sight, WatchedMcu
+from acsard.values import NS_PER_S, Event, Instant, Outputs, Pose, Received
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
@@ -31,12 +34,16 @@ LET_GO_NS = 4 * NS_PER_S // 10
 
 
 class VirtualPort:
-    """A serial port to the fake MCU that can be unplugged and blocked."""
+    """A serial port to the fake MCU that can be unplugged, blocked, late and stingy."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         self.is_open = False
         self.opened = 0
         self.blocked = False
+        self.pause: Callable[[], int] | None = None
+        """What happens between the making of the next line and its handing over; the time then."""
+        self.takes: int | None = None
+        """How many bytes of the next line the kernel takes."""
         self.trouble = ""
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
@@ -68,12 +75,15 @@ class VirtualPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         if self.mcu is None:
             return "down"
-        data = self._gate.prepare(line, now.mono_ns, now.mono_ns, int(self.blocked))
+        pause, self.pause = self.pause, None
+        now_ns = now.mono_ns if pause is None else pause()
+        data = self._gate.prepare(line, now.mono_ns, now_ns, int(self.blocked))
         if data is None:
             return "superseded"
-        self.mcu.receive(now.mono_ns, data)
-        self.sent.append((now.mono_ns, data.removeprefix(b"\r\n")))
-        return self._gate.took(line, data, len(data), now.mono_ns)
+        part, self.takes = data[: self.takes], None
+        self.mcu.receive(now_ns, part)
+        self.sent.append((now_ns, part.removeprefix(b"\r\n")))
+        return self._gate.took(line, data, len(part), now_ns)
 
 
 class MemoryBus:
@@ -113,8 +123,16 @@ class World:
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
         self.period_ns = int(NS_PER_S / self.config.rate_hz)
-        self.next_tick_ns = self.now_ns
-        self.mcu = FakeMcu(self.config, self.now_ns)
+        self.next_period_ns = self.now_ns
+        self.truth = Pose()
+        """Where the robot truly is, as far as somebody looks: with a gyro, each 10 ms."""
+        self.gyro_dead = False
+        watched = self.config.odometry.gyro
+        self.mcu = (
+            WatchedMcu(self.config, self.now_ns, self._see)
+            if watched
+            else FakeMcu(self.config, self.now_ns)
+        )
         self.port = VirtualPort(
             self.config.mcu.baud_rate,
             Codec(self.config.mcu.wheels, self.config.mcu.trailing_comma).stop,
@@ -146,17 +164,26 @@ class World:
         self._listens = False
         """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
 
+    def _see(self, sight: Sight) -> None:
+        self.truth = sight.pose
+        if not self.gyro_dead:
+            said = turn_rate(sight, "base_link", self.config.sim.gyro_noise)
+            payload = encode(said, "msgpack")
+            self.bus.arrivals.append(
+                Arrival("imu", True, payload, "", sight.at_ns, None, "", "native")
+            )
+
     @property
     def instant(self) -> Instant:
         return Instant(self.now_ns, self.now_ns + self.wall_offset_ns)
 
     def run(self, seconds: float) -> None:
-        """Let time pass: bytes arrive when they do, a tick comes every period."""
+        """Let time pass: bytes arrive when they do, a step comes every period."""
         end_ns = self.now_ns + int(seconds * NS_PER_S)
         while True:
             mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
-            tick = mcu_ns is None or self.next_tick_ns <= mcu_ns
-            at_ns = self.next_tick_ns if mcu_ns is None or tick else mcu_ns
+            tick = mcu_ns is None or self.next_period_ns <= mcu_ns
+            at_ns = self.next_period_ns if mcu_ns is None or tick else mcu_ns
             alarm_ns = self._alarm_ns
             if alarm_ns is not None and alarm_ns <= min(at_ns, end_ns):
                 self._alarm_ns = None
@@ -168,10 +195,10 @@ class World:
                 return
             self.now_ns = max(self.now_ns, at_ns)
             if tick:
-                due_ns = self.next_tick_ns - self._missed * self.period_ns
-                self.next_tick_ns += self.period_ns
-                self._step(Period(1 + self._missed, due_ns))
-                self._missed = 0
+                missed, self._missed = self._missed, 0
+                due_ns = self.next_period_ns - missed * self.period_ns
+                self.next_period_ns += self.period_ns
+                self._step(Period(1 + missed, due_ns))
             elif self.port.mcu is not None:
                 data = self.port.mcu.advance(at_ns)
                 if data:
@@ -185,8 +212,17 @@ class World:
             data = self.port.mcu.advance(self.now_ns)
             if data:
                 self.port.feed(Received(self.instant, data))
-        self._missed = max(0, (self.now_ns - self.next_tick_ns) // self.period_ns)
-        self.next_tick_ns += self._missed * self.period_ns
+        self._missed = max(0, (self.now_ns - self.next_period_ns) // self.period_ns)
+        self.next_period_ns += self._missed * self.period_ns
+
+    def stall_in_step(self, seconds: float) -> None:
+        """The loop stands still when the next line is made and not yet handed over."""
+
+        def pause() -> int:
+            self.stall(seconds)
+            return self.now_ns
+
+        self.port.pause = pause
 
     def _step(self, period: Period = NO_PERIOD) -> None:
         outputs = self.loop.step(self.instant, period)

@@ -54,7 +54,7 @@ def until(look: Callable[[], T | None], within: float, what: str) -> T:
         if got:
             return got
         if time.monotonic() > deadline:
-            raise AssertionError(f"not within {within:g} s: {what}")
+            raise AssertionError(f"not in {within + PATIENCE_S:g} s: {what}")
         time.sleep(0.005)
 
 
@@ -610,7 +610,7 @@ class Following:
                 left = deadline - time.monotonic()
                 if left <= 0 or not self._news.wait(left):
                     last = self.seen[-1].value if self.seen else None
-                    raise AssertionError(f"not within {within:g} s: {what}; last: {last}")
+                    raise AssertionError(f"not in {within + PATIENCE_S:g} s: {what}; last: {last}")
 
 
 def broken(states: Following, since: float, to: float = float("inf")) -> bool:

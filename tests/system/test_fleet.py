@@ -25,66 +25,36 @@ from acsard.config.contradictions import warnings
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.exits import Exit
-from acsard.lan.authority import Authority
 from acsard.messages.schema import MESSAGES
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
+from tests.system.fleet_router import (
+    ITS_NAME,
+    ROBOT_FILE,
+    ROUTER_FILE,
+    certified,
+    router,
+    tls_settings,
+)
 from tests.system.harness import (
-    ROOT,
     ZERO,
     Answered,
     Bus,
     Daemon,
-    Program,
     acsard,
     client_config,
     finish,
     until,
 )
 from tests.system.identities import free_tls_endpoint
-from tests.system.strangers import words
 
 pytestmark = pytest.mark.network
-
-FILES = ROOT / "deploy" / "zenoh"
-ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
-
-ROUTER = """\
-import json, sys, time
-import zenoh
-
-config = zenoh.Config.from_file(sys.argv[1])
-for key, value in json.loads(sys.argv[2]).items():
-    config.insert_json5(key, json.dumps(value))
-storages = json.loads(config.get_json("plugins/storage_manager/storages"))
-last = {}
-
-def keep(sample):
-    last[str(sample.key_expr)] = sample
-
-def answer(query):
-    for key, sample in list(last.items()):
-        if query.key_expr.intersects(zenoh.KeyExpr(key)):
-            query.reply(
-                key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp
-            )
-
-session = zenoh.open(config)
-kept = [
-    declare(storage["key_expr"], act)
-    for storage in storages.values()
-    for declare, act in ((session.declare_subscriber, keep), (session.declare_queryable, answer))
-]
-print("routing", flush=True)
-time.sleep(600)
-"""
-"""A router with a configuration and changes to it; has no plugins, and acts like the storages."""
 
 # who may, as SAFETY section 3 has it; robot2 is whoever has the certificate of that robot
 
 Who = frozenset[str]
 Verb = Literal["put", "delete", "query", "subscribe"]
 
-NAMES = ("viewer", "operator", "maintainer", "robot2", "unlisted", "router.local")
+NAMES = ("viewer", "operator", "maintainer", "robot2", "unlisted", ITS_NAME)
 NOBODY: Who = frozenset()
 KEEPERS: Who = frozenset({"maintainer"})
 DRIVERS: Who = KEEPERS | {"operator"}
@@ -207,16 +177,14 @@ class Fleet:
 
     def __init__(self, where: Path) -> None:
         self.where, self.endpoint = where, free_tls_endpoint()
-        authority = Authority.make(where, "fleet", 1)
-        for name in ("robot1", *NAMES):
-            authority.issue(where / name, name, ["127.0.0.1"], 1.0)
+        certified(where, "robot1", *NAMES)
         self._stack = ExitStack()
         self._fooled = threading.Event()
 
     def __enter__(self) -> Fleet:
         enter = self._stack.enter_context
         try:
-            enter(self._router()).says("routing")
+            enter(router(self.where, self.endpoint)).says("routing")
             self.daemons = [enter(self.robot(name, ready=False)) for name in ("robot1", "robot2")]
             for daemon in self.daemons:
                 daemon.says("bus ")
@@ -235,19 +203,6 @@ class Fleet:
     def __exit__(self, *error: object) -> None:
         self._stack.close()
 
-    def _router(self) -> Program:
-        config = zenoh.Config.from_file(str(ROUTER_FILE))
-        tls = json.loads(config.get_json("transport/link/tls"))
-        for key, value in tls.items():
-            if isinstance(value, str):
-                tls[key] = str(self.where / "router.local" / Path(value).name)
-        changes = {
-            "listen/endpoints": [self.endpoint],
-            "transport/link/tls": {key: value for key, value in tls.items() if value is not None},
-            "plugins_loading/enabled": False,
-        }
-        return Program(words(ROUTER, ROUTER_FILE, json.dumps(changes)), self.where)
-
     def robot(self, robot_id: str, name: str = "", *, ready: bool = True) -> Daemon:
         """A daemon with robot.toml and the certificate of its id, quick to drive and to tell.
 
@@ -264,14 +219,8 @@ class Fleet:
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:
         """A client with this certificate, set up as README.md has it for any language."""
-        own = self.where / name
         config = client_config(self.endpoint)
-        tls = {
-            "root_ca_certificate": str(own / "ca.pem"),
-            "connect_certificate": str(own / "certificate.pem"),
-            "connect_private_key": str(own / "key.pem"),
-            "enable_mtls": True,
-        }
+        tls = tls_settings(self.where / name)
         config.insert_json5("transport/link/tls", json.dumps(tls))
         return Member(config, robot_id)
 

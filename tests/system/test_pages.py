@@ -217,3 +217,15 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
         assert done.code == 0, done
     files = finish([str(venv / "bin/acsard"), "service", "install", "--dry-run"], clone.parent)
     assert "acsard.service" in files.out
+
+
+@pytest.mark.network
+@pytest.mark.timeout(2 * INSTALL_S)
+def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs(
+    clone: Path,
+) -> None:
+    page = "deploy/zenoh/README.md"
+    typed = [find(page, words) for words in ("pip install", "bin/activate", "lan init")]
+    done = finish(["bash", "-ec", "\n".join(typed)], clone, INSTALL_S, of_a_stranger())
+    assert done.code == 0, done
+    assert (clone / "fleet/ca-key.pem").is_file()

@@ -228,7 +228,7 @@ def test_odometry_follows_the_wheels() -> None:
     assert estimate.pose.x == pytest.approx(0.5)
     assert estimate.twist == Twist(0.5, 0.0)
     assert estimate.positions == pytest.approx((10.0,) * 4)
-    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4)  # 1e-4 m2 per metre
+    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4, rel=1e-4)  # 1e-4 m2 per metre
     snapshot = bench.robot.snapshot(bench.now_ns)
     assert (snapshot.pose, snapshot.measured) == (estimate.pose, estimate.twist)
     assert snapshot.speeds == ROLLING

@@ -26,6 +26,11 @@ nav_msgs/msg/Odometry: \
     std_msgs/msg/Header header, string child_frame_id, \
     geometry_msgs/msg/PoseWithCovariance pose, geometry_msgs/msg/TwistWithCovariance twist
 tf2_msgs/msg/TFMessage: geometry_msgs/msg/TransformStamped[] transforms
+sensor_msgs/msg/Imu: \
+    std_msgs/msg/Header header, \
+    geometry_msgs/msg/Quaternion orientation, float64[9] orientation_covariance, \
+    geometry_msgs/msg/Vector3 angular_velocity, float64[9] angular_velocity_covariance, \
+    geometry_msgs/msg/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
 sensor_msgs/msg/JointState: \
     std_msgs/msg/Header header, string[] name, \
     float64[] position, float64[] velocity, float64[] effort

@@ -16,6 +16,8 @@ from acsard.config.settings import (
     AccessConfig,
     CommandsConfig,
     Config,
+    McuConfig,
+    OdometryConfig,
     RobotConfig,
     RosConfig,
     Source,
@@ -62,6 +64,8 @@ class Access:
 
 
 DEFAULT = Access()
+REAL, GYRO = McuConfig(port="/dev/ttyACM0"), OdometryConfig(gyro=True)
+SENSING = Access(mcu=REAL, odometry=GYRO)
 TRUSTING = Access(access=AccessConfig(wildcards=True))
 FROM: dict[Role, set[str]] = {
     "viewer": {"viewer", "operator", "maintainer", "local"},
@@ -142,6 +146,7 @@ def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
 LEAST: dict[str, Role] = {
     "cmd/<source>": "operator",
     "wheel_cmd/<source>": "operator",
+    "imu": "maintainer",
     "stop": "viewer",
     "info": "viewer",
     "topics": "viewer",
@@ -161,13 +166,25 @@ LEAST: dict[str, Role] = {
     "topic", [t for t in TOPICS if t.direction != "out"], ids=lambda topic: topic.key
 )
 def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
-    key = DEFAULT.key(written(topic.key))
+    access = SENSING if topic.gyro else DEFAULT
+    key = access.key(written(topic.key))
     message = "put" if topic.direction == "in" else "query"
     allowed = {"local"} if topic.key == "door" else FROM[LEAST[topic.key]]
-    assert DEFAULT.who(message, key) == allowed
+    assert access.who(message, key) == allowed
     declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
     for who in EVERYBODY:
-        assert DEFAULT.lets(who, declared, DEFAULT.key(topic.pattern), "egress")
+        assert access.lets(who, declared, access.key(topic.pattern), "egress")
+
+
+def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:
+    for key in (DEFAULT.key("imu"), "imu/data"):
+        assert not any(DEFAULT.lets(role, "put", key) for role in ROLES)
+
+
+def test_nobody_speaks_in_the_simulated_gyros_place_and_everybody_may_follow_it() -> None:
+    simulated = Access(odometry=GYRO)
+    assert simulated.who("put", simulated.key("imu")) == set()
+    assert simulated.who("declare_subscriber", simulated.key("imu")) == FROM["viewer"]
 
 
 def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
@@ -271,7 +288,7 @@ def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
         for name in {"teleop", "app", "nav", "ros2_control"}.difference(names):
             assert not access.lets("operator", "put", access.key(f"{kind}/{name}"))
     for endpoint in endpoints(RosConfig(), ZID):
-        if endpoint.direction == "in":
+        if endpoint.direction == "in" and endpoint.native != "imu":
             listed = endpoint.native.partition("/")[2] in names
             assert access.lets("operator", "put", endpoint.key) == listed
 
@@ -288,7 +305,7 @@ def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() ->
 def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
     other = "rmw" if transport == "bridge" else "bridge"
     ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
-    access = Access(ros=ros)
+    access = Access(ros=ros, mcu=REAL, odometry=GYRO)
     found = endpoints(ros, ZID)
     assert {endpoint.direction for endpoint in found} == {"in", "out", "query", "service"}
     for endpoint in found:
@@ -298,7 +315,7 @@ def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, name
             assert access.lets("viewer", "put", key, "egress")
             assert not any(access.lets(role, "put", key) for role in ROLES)
         elif endpoint.direction == "in":
-            assert access.who("put", key) == FROM["operator"]
+            assert access.who("put", key) == FROM[LEAST.get(native, "operator")]
         else:
             least = "maintainer" if native.startswith(PARAMETERS) else LEAST[native]
             assert access.who("query", key) == FROM[least]

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 
-from acsard.bus.certificates import check, ends_ns
+from acsard.bus.certificates import ends_ns, require_usable
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
@@ -22,7 +23,7 @@ def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
 
 
 def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:
-    check(str(made(tmp_path)))
+    require_usable(str(made(tmp_path)))
 
 
 def mixed(where: Path) -> None:
@@ -32,12 +33,20 @@ def mixed(where: Path) -> None:
     (where / "key.pem").write_bytes((other / "key.pem").read_bytes())
 
 
+def with_password(where: Path) -> None:
+    file, lock = where / "key.pem", serialization.BestAvailableEncryption(b"secret")
+    key = serialization.load_pem_private_key(file.read_bytes(), None)
+    pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+    file.write_bytes(key.private_bytes(pem, pkcs8, lock))
+
+
 BROKEN: dict[str, Callable[[Path], object]] = {
     "nothing": lambda where: [path.rename(where / path.stem) for path in where.glob("*.pem")],
     "no key": lambda where: [path.rename(where / "gone") for path in where.glob("key.pem")],
     "junk": lambda where: (where / "certificate.pem").write_text("junk"),
     "junk authority": lambda where: (where / "ca.pem").write_text("junk"),
     "another's key": mixed,
+    "a key with a password": with_password,
 }
 
 
@@ -45,7 +54,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
 def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
     BROKEN[how](made(tmp_path))
     with pytest.raises(CertificateError) as caught:
-        check(str(tmp_path))
+        require_usable(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
     assert "acsard lan" in str(caught.value)
 
@@ -54,7 +63,7 @@ def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: 
 def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
     (made(tmp_path) / "key.pem").chmod(0)
     with pytest.raises(NotPermittedError):
-        check(str(tmp_path))
+        require_usable(str(tmp_path))
 
 
 @pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-
 from acsard.checkup import advice
 from acsard.checkup.findings import Finding
 from acsard.config.contradictions import contradictions
@@ -19,16 +17,6 @@ def found(**keys: object) -> list[Finding]:
 def test_only_what_differs_is_to_be_written() -> None:
     findings = found(baud_rate=115200, trailing_comma=True, reply_period=0.0)
     assert advice.changes(findings, Config()) == {"mcu.trailing_comma": True}
-
-
-def test_lines_are_toml_by_table() -> None:
-    keys = {"mcu.wheels.rear_left": "-c", "mcu.baud_rate": 57600, "control.rate": "auto"}
-    text = "\n".join(advice.lines(keys))
-    assert tomllib.loads(text) == {
-        "mcu": {"baud_rate": 57600, "wheels": {"rear_left": "-c"}},
-        "control": {"rate": "auto"},
-    }
-    assert text.splitlines()[0] == "[mcu]"
 
 
 def test_longer_lines_are_not_advised_where_the_wire_has_no_room() -> None:

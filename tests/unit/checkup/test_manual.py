@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
 
 from acsard.checkup import manual
+from acsard.checkup.limits import WATCHDOG_MOST_S
 from acsard.checkup.manual import MANUAL, find
 from acsard.checkup.procedure import STEPS
+from acsard.mcu.contract import WATCHDOG_S
 
 
 @pytest.mark.parametrize("outcome", MANUAL)
@@ -35,6 +38,13 @@ class Seen(float):
 
 SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
         for part in manual.OUTCOMES.split("{")[1:]}  # fmt: skip
+
+
+def test_the_watchdog_it_advises_is_that_of_the_contract() -> None:
+    entries = [entry for name, entry in MANUAL.items() if name.startswith("watchdog:")]
+    told = " ".join(part for entry in entries for part in (entry.text, entry.mend))
+    times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, WATCHDOG_MOST_S)}
+    assert set(re.findall(r"(\d+) ms", told)) == times
 
 
 def test_every_step_can_pass_or_be_left_out() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from acsard.config.parsing import effective, from_builtins, parse
 from acsard.config.settings import Config, McuConfig
-from acsard.config.writing import document
+from acsard.config.writing import document, excerpt
 from tests.unit.keys import KEYS
 
 CONFIGS = [
@@ -63,3 +63,13 @@ def test_every_key_is_printed_once_with_its_table() -> None:
 def test_a_delete_character_survives_printing() -> None:
     config = Config(mcu=McuConfig(port="a\x7fb"))
     assert parse("\n".join(document(effective(config))).encode()) == config
+
+
+def test_some_keys_are_toml_by_table() -> None:
+    keys = {"mcu.wheels.rear_left": "-c", "mcu.baud_rate": 57600, "control.rate": "auto"}
+    text = "\n".join(excerpt(keys))
+    assert tomllib.loads(text) == {
+        "mcu": {"baud_rate": 57600, "wheels": {"rear_left": "-c"}},
+        "control": {"rate": "auto"},
+    }
+    assert text.splitlines()[0] == "[mcu]"

@@ -39,6 +39,20 @@ def test_the_drift_is_forgiven_by_the_time_that_passed_and_no_further_than_promp
     assert promptest.late == 0.0
 
 
+def test_one_that_is_measured_and_not_believed_leaves_the_promptest_as_it_is() -> None:
+    promptest = Promptest(0.0)
+    assert promptest.measure(10, 25) == -15
+    assert promptest.measure(10, 5) == -10
+    promptest.believe()
+    assert promptest.measure(10, 10) == 0.0
+
+
+def test_the_drift_is_forgiven_of_all_that_is_measured() -> None:
+    promptest = Promptest(0.01)
+    assert promptest.measure(1000, 900) == 90
+    assert promptest.measure(1000, 1000) == 80
+
+
 def test_no_more_than_the_most_is_remembered() -> None:
     promptest = Promptest(0.0, most=1000)
     assert promptest.add(5000, 0) == 5000

@@ -62,7 +62,7 @@ class Bench:
         """A session whose link is up and checked."""
         self.open().wait(10)
         self.talk(count=30)
-        assert (self.link(), self.session.check.state) == ("up", "checked")
+        assert (self.link(), self.session.negotiation.state) == ("up", "checked")
         return self
 
     def names(self) -> list[str]:
@@ -496,7 +496,7 @@ def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() 
 def test_the_link_is_up_with_the_third_right_reply() -> None:
     bench = Bench(AUTO).open()
     bench.wait(10)
-    while bench.session.check.asking:
+    while bench.session.negotiation.asking:
         bench.talk()
     assert (bench.link(), bench.session.good_lines) == ("booting", 1)
     bench.talk(count=2)
@@ -508,7 +508,7 @@ def test_an_mcu_without_the_check_is_driven_plainly() -> None:
     for _ in range(40):
         bench.wait(10, GOOD)
         bench.line()
-    assert (bench.link(), bench.session.check.state) == ("up", "plain")
+    assert (bench.link(), bench.session.negotiation.state) == ("up", "plain")
     assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
     assert bench.session.rejects == {}
 
@@ -554,7 +554,7 @@ def test_five_bad_replies_in_a_row_are_no_link_and_the_check_is_asked_for_again(
     bench.wait(1, BAD * (BAD_LINES - 1))
     assert bench.link() == "up"
     bench.wait(1, BAD)
-    assert (bench.link(), bench.session.check.asking) == ("stale", True)
+    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
     assert "damaged" in bench.session.words()
     line = bench.line()
     assert line is not None
@@ -578,7 +578,7 @@ def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
         bench.wait(30, GOOD)
     assert bench.link() == "up"
     bench.wait(11, GOOD)
-    assert (bench.link(), bench.session.check.asking) == ("stale", True)
+    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
 
 
 def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
@@ -587,7 +587,7 @@ def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
         bench.wait(10, GOOD)
         line = bench.line()
         assert line is None or line.startswith(ZERO) or bench.link() == "up"
-    assert bench.session.check.asking
+    assert bench.session.negotiation.asking
     assert "before and now does not" in bench.session.words()
 
 

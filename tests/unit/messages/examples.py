@@ -17,6 +17,7 @@ from acsard.values import (
     SourceStatus,
     Spread,
     Twist,
+    TwistVariances,
     Wait,
     WheelSpeeds,
 )
@@ -28,6 +29,7 @@ ESTIMATE = Estimate(
     pose=Pose(1.5, -2.5, 0.5),
     twist=Twist(0.25, -0.75),
     covariance=PoseCovariance(0.11, 0.12, 0.16, 0.22, 0.26, 0.66),
+    twist_variances=TwistVariances(0.01, 0.02, 0.06),
     positions=(10.0, 20.0, 30.0, 40.0),
     speeds=WheelSpeeds(1.0, 2.0, 3.0, 4.0),
 )

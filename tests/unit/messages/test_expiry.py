@@ -28,4 +28,4 @@ def test_it_is_a_warning_a_month_before_and_an_error_after(
 def test_an_end_that_nobody_can_read_is_a_warning_with_its_mend() -> None:
     level, words = expiry(None, NOW_NS)
     assert level == 1
-    assert "pip install 'acsard[lan]'" in words
+    assert "`acsard doctor`" in words

@@ -16,6 +16,7 @@ from acsard.config.settings import (
     BusConfig,
     Config,
     ControlConfig,
+    DriveConfig,
     FootprintConfig,
     LidarConfig,
     McuConfig,
@@ -23,6 +24,7 @@ from acsard.config.settings import (
     RatesConfig,
     RobotConfig,
 )
+from acsard.drive.gyro import WORDS
 from acsard.messages.report import Report, from_rpy, from_yaw
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -41,10 +43,11 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.messages.topics import PUBLISHED
-from acsard.values import Estimate, Instant, Outputs, Snapshot
+from acsard.values import Estimate, GyroDoes, GyroStatus, Instant, Outputs, Snapshot
 from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
-ALL = {topic.key for topic in PUBLISHED}
+ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
+"""What is measured or decided; what is true of a simulated robot does not come by a report."""
 FRAMES = OdometryConfig(
     odom_frame="r7/odom",
     base_frame="r7/base",
@@ -116,7 +119,8 @@ def test_each_message_is_of_the_type_its_topic_says() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     for topic in PUBLISHED:
-        assert type(report.current(topic.key, look)).__name__ == topic.type
+        if topic.key in ALL:
+            assert type(report.current(topic.key, look)).__name__ == topic.type
 
 
 # odometry and transforms
@@ -144,10 +148,10 @@ def test_the_pose_covariance_has_each_figure_in_its_cell() -> None:
     # fmt: on
 
 
-def test_the_twist_covariance_is_the_configured_diagonal() -> None:
+def test_the_twist_covariance_is_the_samples_and_of_other_axes_the_configured() -> None:
     covariance = published()["odom"].twist.covariance
     rows = [covariance[6 * i : 6 * i + 6] for i in range(6)]
-    assert [rows[i][i] for i in range(6)] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    assert [rows[i][i] for i in range(6)] == [0.01, 0.02, 0.3, 0.4, 0.5, 0.06]
     assert all(rows[i][j] == 0.0 for i in range(6) for j in range(6) if i != j)
 
 
@@ -573,6 +577,47 @@ def test_at_ten_hertz_the_gaps_are_even_too() -> None:
     assert {b - a for a, b in pairwise(found[2:])} == {10}
 
 
+# the gyro
+
+
+def with_gyro(status: GyroStatus) -> tuple[RobotState, list[DiagnosticStatus]]:
+    report = Report(replace(CONFIG, drive=DriveConfig(wheel_separation_multiplier=1.5)), START)
+    list(report.due(OUTPUTS, set(), never))
+
+    def seen() -> Snapshot:
+        return replace(SNAPSHOT, gyro=status)
+
+    state, array = report.current("state", seen), report.current("diagnostics", seen)
+    assert isinstance(state, RobotState)
+    assert isinstance(array, DiagnosticArray)
+    return state, [one for one in array.status if one.name == "acsard: gyro"]
+
+
+def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
+    state, rows = with_gyro(GyroStatus())
+    assert (state.gyro, rows) == ("off", [])
+
+
+@pytest.mark.parametrize(
+    ("does", "level"),
+    [("waiting for rest", 0), ("used", 0), ("silent", 1), ("disagrees", 1), ("not believed", 1)],
+)
+def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
+    state, (row,) = with_gyro(GyroStatus(does))
+    assert (state.gyro, row.level, row.message) == (does, level, WORDS[does])
+    assert {pair.key for pair in row.values} == {"delay_s"}
+
+
+def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> None:
+    _, (row,) = with_gyro(GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2))
+    assert {pair.key: pair.value for pair in row.values} == {
+        "delay_s": "0.020",
+        "bias_rad_s": "-0.01230",
+        "wheel_separation_multiplier": "1.500",
+        "learned_multiplier": "1.800",
+    }
+
+
 # the certificate of the bus
 
 DAY_NS = 86400 * 10**9
@@ -605,7 +650,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert "acsard[lan]" in state.certificate
+    assert "`acsard doctor`" in state.certificate
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:

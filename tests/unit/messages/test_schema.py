@@ -27,6 +27,11 @@ ROS_FIELDS: dict[str, tuple[str, ...]] = {
     "Twist": ("linear", "angular"),
     "TwistStamped": ("header", "twist"),
     "Pose": ("position", "orientation"),
+    "Imu": (
+        "header", "orientation", "orientation_covariance", "angular_velocity",
+        "angular_velocity_covariance", "linear_acceleration", "linear_acceleration_covariance",
+    ),
+    "PoseStamped": ("header", "pose"),
     "PoseWithCovariance": ("pose", "covariance"),
     "TwistWithCovariance": ("twist", "covariance"),
     "Odometry": ("header", "child_frame_id", "pose", "twist"),
@@ -37,7 +42,7 @@ ROS_FIELDS: dict[str, tuple[str, ...]] = {
     "KeyValue": ("key", "value"),
     "DiagnosticStatus": ("level", "name", "message", "hardware_id", "values"),
     "DiagnosticArray": ("header", "status"),
-}
+}  # fmt: skip
 """Fields in order, from the .msg files of common_interfaces and rcl_interfaces (ROS 2 Jazzy)."""
 
 

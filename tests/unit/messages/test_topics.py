@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
+from acsard.config.settings import Config, McuConfig, OdometryConfig
 from acsard.messages.schema import MESSAGES
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, VERBS, by_key, full_key, source_keys
+from acsard.messages.topics import (
+    PUBLISHED,
+    SERVICES,
+    TOPICS,
+    VERBS,
+    by_key,
+    full_key,
+    offered,
+    published,
+    source_keys,
+)
 
 PROMISED = [
     ("odom", "out", "Odometry"),
@@ -15,8 +27,10 @@ PROMISED = [
     ("cmd_vel_out", "out", "TwistStamped"),
     ("state", "out", "RobotState"),
     ("diagnostics", "out", "DiagnosticArray"),
+    ("sim/pose", "out", "PoseStamped"),
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
+    ("imu", "in", "Imu"),
     ("stop", "in", "anything"),
     ("door", "in", "DoorState"),
     ("srv/stop", "service", "ServiceReply"),
@@ -55,6 +69,31 @@ def test_published_is_every_way_out_but_the_token() -> None:
 
 def test_only_the_static_transforms_wait_for_late_joiners() -> None:
     assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
+
+
+GYRO = OdometryConfig(gyro=True)
+REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+
+
+def test_the_truth_is_offered_where_the_robot_is_simulated_and_nowhere_else() -> None:
+    simulated = {topic.key for topic in offered(Config())}
+    assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
+
+
+@pytest.mark.parametrize("config", [Config(), REAL, replace(REAL, odometry=GYRO)])
+def test_published_is_what_goes_out_of_what_is_offered(config: Config) -> None:
+    assert published(config) == tuple(row for row in offered(config) if row in PUBLISHED)
+
+
+@pytest.mark.parametrize("config", [Config(), REAL])
+def test_a_gyro_is_listened_to_only_where_it_is_wanted(config: Config) -> None:
+    wanted = {topic.key for topic in offered(replace(config, odometry=GYRO))}
+    assert wanted - {topic.key for topic in offered(config)} == {"imu"}
+
+
+def test_the_simulator_publishes_what_its_gyro_says() -> None:
+    said = {topic.key for topic in published(Config(odometry=GYRO))}
+    assert said - {topic.key for topic in PUBLISHED} == {"imu"}
 
 
 @pytest.mark.parametrize("service", SERVICES)

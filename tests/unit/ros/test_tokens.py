@@ -42,6 +42,7 @@ def test_the_gid_of_another_token_is_another() -> None:
         (Qos(42), "::,:,:,:,,"),
         (Qos(1, transient=True), ":1:,1:,:,:,,"),
         (Qos(42, transient=True), ":1:,:,:,:,,"),
+        (Qos(5, best_effort=True), "2::,5:,:,:,,"),
     ],
 )
 def test_qos_leaves_out_what_is_the_default(qos: Qos, text: str) -> None:

@@ -9,6 +9,7 @@ from acsard.config.settings import (
     Config,
     FootprintConfig,
     LidarConfig,
+    McuConfig,
     OdometryConfig,
     RosConfig,
 )
@@ -25,6 +26,7 @@ from acsard.ros.transports import (
 )
 
 ZID = "abc"
+REAL = McuConfig(port="/dev/ttyACM0")
 
 
 def found(ros: RosConfig) -> list[Endpoint]:
@@ -51,6 +53,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
         "cmd/nav": "cmd_vel",
         "cmd/teleop": "cmd_vel_teleop",
         "wheel_cmd/ros2_control": "joint_commands",
+        "imu": "imu/data",
         "srv/stop": "acsard/stop",
         "srv/clear": "acsard/clear",
         "srv/activate": "acsard/activate",
@@ -108,7 +111,7 @@ def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
     for row in ros_names(RosConfig()):
         if row.native.startswith(PARAMETERS):
             continue
-        if row.direction == "in":
+        if row.direction == "in" and row.native != "imu":
             head, _, source = row.native.partition("/")
             assert source in sources
             assert patterns[f"{head}/"].direction == "in"
@@ -150,11 +153,12 @@ def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
 def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
     assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
-    assert len(rate_limited) == 3 + 5
+    assert len(rate_limited) == 4 + 6
 
 
 def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
-    off = Config(odometry=OdometryConfig(publish_tf=False), lidar=LidarConfig(publish_tf=False))
+    odometry = OdometryConfig(publish_tf=False, gyro=True)
+    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False))
     assert left_out(off) == {"tf", "tf_static"}
     kept = endpoints(RosConfig(), ZID, left_out(off))
     assert not {e.native for e in kept} & {"tf", "tf_static"}
@@ -165,6 +169,25 @@ def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
 
 
 def test_either_static_transform_keeps_tf_static() -> None:
-    assert left_out(Config()) == set()
+    assert "tf_static" not in left_out(Config())
     footprint = FootprintConfig(publish_tf=True)
-    assert left_out(Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)) == set()
+    config = Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)
+    assert "tf_static" not in left_out(config)
+
+
+def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_itself() -> None:
+    wanted = OdometryConfig(gyro=True)
+    assert left_out(Config(mcu=REAL, odometry=wanted)) == set()
+    for other in (Config(mcu=REAL), Config(), Config(odometry=wanted)):
+        assert left_out(other) == {"imu"}
+        assert not [e for e in endpoints(RosConfig(), ZID, left_out(other)) if e.native == "imu"]
+
+
+def test_a_gyro_that_publishes_as_sensors_do_is_heard() -> None:
+    bridge, rmw = (
+        next(e for e in found(RosConfig()) if e.native == "imu" and e.transport == transport)
+        for transport in ("bridge", "rmw")
+    )
+    assert "/MS/imu§data/sensor_msgs§msg§Imu/:0:0:0,10:" in bridge.token
+    assert rmw.token.endswith("/2::,10:,:,:,,")
+    assert rmw.key.startswith("0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a00ff")

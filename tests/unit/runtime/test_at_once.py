@@ -25,7 +25,7 @@ class Paced:
 
     def ticks(self, at_ns: int, missed: int = 0) -> bool:
         """A period without news; whether its line went."""
-        due = self.pace.tick(missed)
+        due = self.pace.period_ended(missed)
         self.pace.note(due, due, due, False, False)
         self.sent_ns = at_ns if due else self.sent_ns
         return due
@@ -65,7 +65,7 @@ def test_a_line_at_once_keeps_the_gap() -> None:
 
 def test_the_gap_counts_from_when_the_line_left() -> None:
     paced = Paced()
-    paced.pace.tick(0)
+    paced.pace.period_ended(0)
     paced.pace.note(True, True, True, False, False)
     paced.sent_ns = 2 * MS
     assert not paced.at_once(2 * MS + GAP_NS - 1)
@@ -146,7 +146,7 @@ def test_no_traffic_makes_more_lines_than_the_clock_or_closer_ones(
         expired = max(0, (now_ns - due_ns) // PERIOD_NS + 1)
         due_ns += expired * PERIOD_NS
         periods += expired
-        tick = expired > 0 and pace.tick(expired - 1)
+        tick = expired > 0 and pace.period_ended(expired - 1)
         sent_ns = lines[-1] if lines else -GAP_NS
         due = tick or (news and pace.at_once(now_ns, sent_ns))
         sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)

@@ -15,7 +15,7 @@ from acsard.values import Event
 async def told() -> Event:
     """The first that the keeper says."""
     said: asyncio.Queue[Event] = asyncio.Queue()
-    keeper = asyncio.create_task(keep_door([], said.put_nowait))
+    keeper = asyncio.create_task(keep_door(["door"], said.put_nowait))
     first = asyncio.create_task(said.get())
     await asyncio.wait({keeper, first}, return_when=asyncio.FIRST_COMPLETED, timeout=10.0)
     assert not keeper.done(), keeper

@@ -626,3 +626,69 @@ def test_a_latching_mcu_is_not_poisoned_by_words() -> None:
         mcu.receive(0, b"apnan,bp01.00,cp01.00,dp01.00,\r\n")
         mcu.receive(50 * MS, LINE)
         mcu.advance(500 * MS)
+
+
+def arrivals(mcu: FakeMcu, count: int = 100) -> Heard:
+    """What the host reads, a look every ms, of an MCU that is asked every 10 ms."""
+    found = []
+    for ms in range(10 * count + 200):
+        if ms % 10 == 0 and ms < 10 * count:
+            mcu.receive(ms * MS, LINE)
+        data = mcu.advance(ms * MS)
+        if data:
+            found.append((ms * MS, data))
+    return found
+
+
+def joined(found: Heard) -> bytes:
+    return b"".join(data for _, data in found)
+
+
+def test_a_usb_adapter_hands_on_every_16_ms_and_loses_nothing() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.ftdi():
+        found = arrivals(mcu)
+    assert {len(data) for when, data in found if when % (16 * MS)} <= {62}
+    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+    assert any(len(data) > len(LINE) for _, data in found)
+
+
+def test_a_full_packet_of_the_adapter_does_not_wait() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.ftdi(latency_s=0.1):
+        found = arrivals(mcu)
+    early = [data for when, data in found if when % (100 * MS)]
+    assert early
+    assert {len(data) for data in early} == {62}
+    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+
+
+def test_what_the_adapter_holds_when_the_fault_ends_still_comes_in_order() -> None:
+    mcu, sound = FakeMcu(TRUE), FakeMcu(TRUE)
+    with mcu.ftdi(latency_s=10.0):
+        assert drive(mcu, 0, 1) == []
+        replies(mcu, 50 * MS)
+    drive(sound, 0, 1)
+    replies(sound, 50 * MS)
+    whole = joined(drive(mcu, 50 * MS, 20))
+    later = joined(drive(sound, 50 * MS, 20))
+    assert whole.endswith(later)
+    assert len(whole) == len(later) + len(LINE)
+
+
+def test_in_a_stall_nothing_comes_and_after_it_all_of_it_at_once() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.stalls(0.5, 0.15):
+        found = arrivals(mcu)
+    assert not [when for when, _ in found if when % (500 * MS) < 150 * MS]
+    (burst,) = [data for when, data in found if when == 650 * MS]
+    assert burst.count(b"\n") >= 14
+    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+
+
+def test_stalls_and_an_adapter_together_lose_nothing_either() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.ftdi(), mcu.stalls(0.3, 0.1):
+        found = arrivals(mcu)
+    assert not [when for when, _ in found if when % (300 * MS) < 100 * MS]
+    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))

@@ -19,6 +19,7 @@ from acsard.sim.named_faults import NamedFault, forms, named
         ("bias=c:1.2", (2, 1.2)),
         ("other_baud=57600", (57600,)),
         ("pushed=0.12", (0.12,)),
+        ("stalls=5:0.15", (5, 0.15)),
         ("reset=0.5", (0.5,)),
         ("reset=5", (5,)),
     ],
@@ -40,6 +41,10 @@ def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) 
         ("stuck_encoder=ab", "motors are a, b, c and d"),
         ("bias=a:much", "much is not a number"),
         ("other_baud=300", "rates are 9600"),
+        ("stalls=5", "is not a fault"),
+        ("stalls=0.1:0.2", "fewer for each"),
+        ("stalls=5:0", "fewer for each"),
+        ("stalls=nan:1", "fewer for each"),
         ("reset=0", "above 0"),
         ("reset=nan", "above 0"),
     ],
@@ -53,7 +58,7 @@ def test_what_is_no_fault_is_refused_in_words(text: str, words: str) -> None:
 def test_each_fault_can_be_turned_on_and_back() -> None:
     mcu = FakeMcu(Config())
     before = dict(vars(mcu))
-    example = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600"}
+    example = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1"}
     arguments = [f"{name}={example[kinds]}" for name, kinds in ARGUMENTS.items()]
     for text in (*FAULTS, *arguments):
         with named(text).on(mcu):

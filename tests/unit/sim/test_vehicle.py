@@ -179,3 +179,79 @@ def test_hands_move_it_whatever_its_motors_do(speed: float) -> None:
     made.advance(1.0)
     assert made.speeds == [0.0] * 4
     assert math.dist((made.pose.x, made.pose.y), (before.x, before.y)) > 1.5 * abs(speed)
+
+
+# what the host does not know of it
+
+SPIN = (3.0, -3.0, -3.0, 3.0)
+"""1 rad/s on the spot, as the host believes."""
+
+
+def turned(seconds: float, sim: SimConfig, *set_points: float, steps: int = 1) -> float:
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = set_points or SPIN
+    for _ in range(steps):
+        made.advance(seconds / steps)
+    return made.turned
+
+
+def test_a_wider_true_track_turns_it_less_than_it_is_believed_to() -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_multiplier=1.6)
+    assert turned(10.0, sim) == pytest.approx(10.0 / 1.6)
+
+
+def test_each_sides_true_radius_counts() -> None:
+    sim = SimConfig(
+        motor_time_constant=0.0, left_radius_multiplier=0.98, right_radius_multiplier=1.01
+    )
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = [10.0] * 4
+    made.advance(2.0)
+    assert made.turned == pytest.approx(20.0 * RADIUS * 0.03 / TRACK)
+    assert made.angles == [20.0] * 4
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("dependence", [0.08, -0.3])
+def test_the_track_grows_by_its_share_at_1_rad_per_s_either_way(
+    direction: float, dependence: float
+) -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
+    at_one = turned(1.0, sim, *(direction * wheel for wheel in SPIN))
+    assert at_one == pytest.approx(direction / (1 + dependence))
+    creeping = turned(1000.0, sim, *(direction * wheel / 1000 for wheel in SPIN))
+    assert creeping == pytest.approx(direction, rel=1e-3)
+
+
+@given(st.floats(-0.4, 2.0), st.floats(0.01, 20.0))
+def test_faster_wheels_never_turn_it_slower(dependence: float, rate: float) -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
+    slow = turned(1.0, sim, *(rate * wheel for wheel in SPIN))
+    fast = turned(1.0, sim, *(1.1 * rate * wheel for wheel in SPIN))
+    assert fast > slow > 0.0
+
+
+def test_a_slippery_floor_takes_up_to_its_share_and_another_each_time() -> None:
+    sim = SimConfig(motor_time_constant=0.0, turn_slip=0.4)
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = SPIN
+    kept = []
+    for _ in range(400):
+        before = made.turned
+        made.advance(0.25)
+        kept.append((made.turned - before) / 0.25)
+    assert all(0.6 < share <= 1.0 for share in kept)
+    assert len(set(kept)) == 400
+    assert sum(kept) / 400 == pytest.approx(0.8, abs=0.03)
+
+
+def test_a_floor_of_the_same_seed_is_the_same_and_another_is_another() -> None:
+    one, other = (SimConfig(turn_slip=0.4, seed=seed) for seed in (1, 2))
+    assert turned(5.0, one, steps=500) == turned(5.0, one, steps=500)
+    assert turned(5.0, one, steps=500) != turned(5.0, other, steps=500)
+
+
+def test_whole_turns_are_counted_beside_the_pose() -> None:
+    made = moved(12.0, *SPIN)
+    assert made.turned == pytest.approx(12.0)
+    assert math.remainder(made.turned - made.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)

@@ -15,7 +15,7 @@ from acsard.messages.encodings import DecodeError, encode, encoding_name
 from acsard.messages.schema import Info, RobotState, Time
 from acsard.top import feed as top_feed
 from acsard.top.feed import GAPS, Feed, anew, silence
-from tests.unit.top.test_view import BEFORE, INFO, STATE
+from tests.unit.top.screens import BEFORE, INFO, STATE
 
 KEY = "acsard/acsar/state"
 

@@ -1,0 +1,134 @@
+"""What a calibration improves, on drives it was not fitted to.
+
+Each run (or, of few runs, each fifth of the log) is left out in turn, and what is found without it
+is tried on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.evidence import RATE, TURN, Base
+from acsard.calibration.fit import Fit
+from acsard.calibration.heading import Rows
+from acsard.calibration.multipliers import TURNING, Rates
+from acsard.calibration.paths import Block
+from acsard.calibration.places import Grid, Spots, path, spread
+from acsard.calibration.table import Floats
+from acsard.calibration.turning import turned
+
+FOLDS = 5
+LEAST_RUNS = 3
+"""So many runs are left out each; of fewer, fifths of the log."""
+
+TOLD = 0.1
+"""Standard deviation, as a share, of a block's own track by positions that is sure enough."""
+
+
+class Error(Struct, frozen=True):
+    """How far off, as configured and as calibrated; None: nothing to tell it by."""
+
+    now: float | None
+    then: float | None
+
+
+class Gain(Struct, frozen=True):
+    """The errors of both, with the parameters of the calibration found without what they are
+    tried on."""
+
+    turn: Error
+    """deg after a turn of 360."""
+    straight: Error
+    """deg after 10 m straight on, by turns that were not commanded or seen by the wheels."""
+    place: Error
+    """m rms of positions off the path, over a block's length."""
+
+
+class Held(Struct, frozen=True):
+    """Blocks that were left out, and the parameters without them."""
+
+    blocks: npt.NDArray[np.bool_]
+    parameters: Floats
+
+
+def folds(fit: Fit, parts: Sequence[Block], rate: Rates) -> Iterator[Held]:
+    """Every block once among those left out."""
+    runs = np.array([part.run for part in parts])
+    group = runs
+    if len(set(runs.tolist())) < LEAST_RUNS:
+        group = np.arange(len(parts)) * FOLDS // len(parts)
+    for number in sorted(set(group.tolist())):
+        out = np.asarray(group == number)
+        yield Held(out, constant(fit.without(out), rate))
+
+
+def constant(parameters: Floats, rate: Rates) -> Floats:
+    """With one track for all rates, as the robot will have it."""
+    fixed = parameters.copy()
+    fixed[TURN] *= 1.0 - fixed[RATE] * rate.mean
+    fixed[RATE] = 0.0
+    return fixed
+
+
+def gain(
+    fit: Fit, base: Base, parts: Sequence[Block], rate: Rates, rows: Rows, truth: Floats,
+    spots: Sequence[Spots], grids: Sequence[Grid],
+) -> Gain:  # fmt: skip
+    """`truth`: how far the robot turned in each row, rad, as well as it is known."""
+    held = list(folds(fit, parts, rate))
+    now = fit.parameters.copy()
+    now[: RATE + 1] = base.start()[: RATE + 1]
+    off_now = truth - turned(rows, base, now)
+    off_then = np.zeros_like(truth)
+    for one in held:
+        mine = one.blocks[rows.block]
+        off_then[mine] = (truth - turned(rows, base, one.parameters))[mine]
+    turning = np.abs(truth) > TURNING * rows.seconds
+    way = base.radius * np.abs(rows.left + rows.right) / 2
+    ahead = ~turning & (way > 0.0) & (truth != 0.0)
+    side = 2 * rows.block + (truth > 0.0)
+    amount, metres = float(np.abs(truth[turning]).sum()), float(way[ahead].sum())
+    return Gain(
+        _error(off_now, off_then, side, turning, 360.0, amount),
+        _error(off_now, off_then, rows.block, ahead, np.degrees(10.0), metres),
+        _place(held, now, base, spots, grids),
+    )
+
+
+def _error(
+    now: Floats, then: Floats, group: npt.NDArray[np.int64], among: npt.NDArray[np.bool_],
+    unit: float, amount: float,
+) -> Error:  # fmt: skip
+    """The sizes of what is summed in each group, per unit of the amount."""
+    if amount <= 0.0:
+        return Error(None, None)
+    sizes = [np.abs(np.bincount(group[among], off[among])).sum() for off in (now, then)]
+    return Error(*(float(unit * size / amount) for size in sizes))
+
+
+def _place(
+    held: Sequence[Held], now: Floats, base: Base, spots: Sequence[Spots], grids: Sequence[Grid]
+) -> Error:
+    if not spots:
+        return Error(None, None)
+    then = []
+    for one in held:
+        mine = [spot for spot in spots if one.blocks[spot.block]]
+        paths = [path(grid, base, one.parameters) for grid in grids]
+        then.append((spread(mine, paths, one.parameters), sum(len(spot.t) for spot in mine)))
+    squares = sum(size**2 * count for size, count in then)
+    off = float(np.sqrt(squares / max(1, sum(count for _, count in then))))
+    return Error(spread(spots, [path(grid, base, now) for grid in grids], now), off)
+
+
+def seen_by_places(fit: Fit, rows: Rows, base: Base) -> Floats:
+    """How far the robot turned in each row by positions alone, rad: each block with the track that
+    suits it best; 0 where that is not sure enough."""
+    size = np.maximum(fit.normal[:, TURN, TURN], 1e-300)
+    own = 1.0 + fit.score[:, TURN] / size / fit.parameters[TURN]
+    own[1 / np.sqrt(size) > TOLD * abs(fit.parameters[TURN])] = 0.0
+    return np.asarray(turned(rows, base, fit.parameters) * own[rows.block])

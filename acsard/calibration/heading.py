@@ -1,0 +1,213 @@
+"""What a gyro, or the yaw of a pose source, says of how far the robot turned.
+
+The rows follow Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots
+based on the least-squares technique, 2005): turned = g_r dphi_r - g_l dphi_l, linear in
+g_r = R_r / L and g_l = R_l / L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.paths import Block, Wheels, cumulative, gaps, inside, rests
+from acsard.calibration.runs import Run
+from acsard.calibration.table import Floats, LogError
+
+REST_S, EDGE_S = 0.6, 0.3
+"""The bias is what the gyro says while all wheels stand for so long, less what shakes after."""
+
+TURNED_BY_HAND = 0.05
+"""rad/s from the usual bias: no bias but a robot that somebody turns."""
+
+ROW_S = 1.0
+"""Turns are compared over about so long."""
+
+GRID_S, FURTHEST_S = 0.02, 2.0
+"""Steps and reach of the search for the time offset."""
+
+DEGREES = 10.0
+"""Times as far as the wheels say: in degrees, not in radians."""
+
+
+class Heading(Struct, frozen=True):
+    """The angle of a run as a sensor has it, rad, at the sensor's own times."""
+
+    t: Floats
+    angle: Floats
+    gaps: Floats
+
+
+class Headings(Struct, frozen=True):
+    """Of all runs: one each, and what they share."""
+
+    source: str
+    """The column it comes from."""
+    of: tuple[Heading, ...]
+    late: float
+    """s by which the sensor's times are later than the wheels' for the same event."""
+    bias: float
+    """rad/s, the mean of what was taken off."""
+    drifts: bool
+    """The bias was not seen at rest: it has to be found with the rest."""
+
+
+class Rows(Struct, frozen=True):
+    """Turns over a second or so: what the sensor says and what the wheels did."""
+
+    block: npt.NDArray[np.int64]
+    turned: Floats
+    """rad by the sensor."""
+    left: Floats
+    """rad of the wheels."""
+    right: Floats
+    fast: Floats
+    """Integral of |right - left| (right - left), rad2/s: what a track that grows with the rate
+    is told by."""
+    seconds: Floats
+
+
+def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
+    """From the yaw rate; None when no run has it."""
+    if not any(len(run.gyro) for run in driven):
+        return None
+    if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
+        raise LogError("yaw_rate is the same in every row: the gyro is not recorded or dead")
+    seen = [_biases(run) for run in driven]
+    every = np.concatenate([values for _, values in seen])
+    usual = float(np.median(every)) if len(every) else 0.0
+    found = []
+    for run, (t, values) in zip(driven, seen, strict=True):
+        true = np.abs(values - usual) < TURNED_BY_HAND
+        bias = np.interp(run.gyro_t, t[true], values[true]) if true.any() else usual
+        rate = run.gyro - bias
+        holes = gaps(run.gyro_t)
+        steps = np.diff(run.gyro_t)
+        steps[np.isin(run.gyro_t[:-1], holes[:, 0])] = 0.0
+        found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
+    late = offset(found, angles)
+    return Headings("yaw_rate", tuple(found), late, usual, not len(every))
+
+
+def of_yaw(driven: Sequence[Run], angles: Sequence[Wheels], gain: float) -> Headings | None:
+    """From the yaw of positions; None when no run has it. `gain`: R / L as configured, about.
+
+    Raises `LogError` when it is in degrees: they would be unwrapped in the wrong places.
+    """
+    if not any(len(run.yaw) for run in driven):
+        return None
+    found = []
+    for run, turned in zip(driven, angles, strict=True):
+        if _in_degrees(run, turned, gain):
+            raise LogError("yaw is in degrees: multiply it by pi / 180, it must be in radians")
+        angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
+        found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
+    return Headings("yaw", tuple(found), offset(found, angles), 0.0, drifts=False)
+
+
+def _in_degrees(run: Run, turned: Wheels, gain: float) -> bool:
+    if len(run.yaw) < 2 or np.ptp(run.yaw) < 3 * np.pi:
+        return False
+    steps = np.diff(run.yaw)
+    if np.any((np.abs(steps) > 300.0) & (np.abs(steps) < 400.0)):
+        return True
+    left, right = turned.angles(run.yaw_t)
+    wheels = gain * np.diff(right - left)
+    small = np.abs(steps) < 100.0
+    return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(wheels[small])))
+
+
+def _biases(run: Run) -> tuple[Floats, Floats]:
+    """Middle and bias of each rest of a run in which the gyro spoke."""
+    times, values = [], []
+    for begin, end in rests(run, REST_S, EDGE_S):
+        a, b = np.searchsorted(run.gyro_t, (begin, end))
+        if b - a >= 5:
+            times.append((begin + end) / 2)
+            values.append(float(np.median(run.gyro[a:b])))
+    return np.array(times), np.array(values)
+
+
+def _sums(rate: Floats, steps: Floats) -> Floats:
+    return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
+
+
+def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
+    """By how many s the sensor is late: where its turn rate resembles the wheels' most.
+
+    Of the wheels, what they turn against each other; or together, should a side be reversed.
+    """
+    reach = round(FURTHEST_S / GRID_S)
+    scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
+    for heading, turned in zip(found, angles, strict=True):
+        grid = np.arange(turned.t[0], turned.t[-1], GRID_S)
+        if len(heading.t) < 2 or len(grid) < 4:
+            continue
+        left, right = turned.angles(grid)
+        sensor = np.diff(np.interp(grid, heading.t, heading.angle))
+        sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
+        sensor -= sensor.mean()
+        for at, wheels in enumerate((np.diff(right - left), np.diff(right + left))):
+            wheels = wheels - wheels.mean()
+            scores[at] += _correlation(sensor, wheels, reach)
+            sizes[at] += float(wheels @ wheels)
+    alike = np.abs(scores) / np.sqrt(np.maximum(sizes, 1e-300))[:, None]
+    score = alike[int(np.argmax(alike.max(axis=1)))]
+    best = int(np.argmax(score))
+    if not 0 < best < 2 * reach:
+        return 0.0 if not score.any() else float(best - reach) * GRID_S
+    before, top, after = score[best - 1 : best + 2]
+    bend = before - 2 * top + after
+    return float(best - reach + (0.5 * (before - after) / bend if bend else 0.0)) * GRID_S
+
+
+def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
+    """Of two series of one length for shifts of -reach to reach."""
+    size = 1 << (len(later) + reach).bit_length()
+    spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
+    whole = np.fft.irfft(spectrum, size)
+    return np.concatenate((whole[-reach:], whole[: reach + 1]))
+
+
+def rows(
+    headings: Headings | None,
+    driven: Sequence[Run],
+    angles: Sequence[Wheels],
+    parts: Sequence[Block],
+) -> Rows:
+    """What each block says; of the wheels alone where there is no sensor of heading."""
+    fast = [_fast(run) for run in driven]
+    found: list[tuple[Floats, ...]] = []
+    for number, part in enumerate(parts):
+        count = max(1, round((part.end - part.begin) / ROW_S))
+        edges = np.linspace(part.begin, part.end, count + 1)
+        angle, whole = np.zeros(count + 1), np.ones(count, dtype=bool)
+        if headings is not None:
+            heading, seen = headings.of[part.run], edges + headings.late
+            if not len(heading.t):
+                continue
+            angle = np.interp(seen, heading.t, heading.angle)
+            whole = inside(seen[:-1], seen[1:], heading.gaps)
+            whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
+        left, right = angles[part.run].angles(edges)
+        slow = np.interp(edges, driven[part.run].t, fast[part.run])
+        series = (angle, left, right, slow, edges)
+        found.append((np.full(count, number)[whole], *(np.diff(one)[whole] for one in series)))
+    if not found:
+        return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
+    block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
+    if headings is not None and headings.drifts:
+        # What one bias for all would explain is taken out of every column alike.
+        seconds = columns[-1]
+        share = seconds / float(seconds @ seconds)
+        columns[:-1] = [column - seconds * float(share @ column) for column in columns[:-1]]
+    return Rows(block.astype(np.int64), *columns)
+
+
+def _fast(run: Run) -> Floats:
+    apart = run.right - run.left
+    steps = np.minimum(np.diff(run.t), ROW_S)
+    return _sums(np.abs(apart) * apart, steps)

@@ -1,0 +1,125 @@
+"""What the wheels did in a run: angles over time, where they stood, and the blocks it is cut into.
+
+A block is a few seconds of driving. All that is estimated is a sum over blocks, and how far blocks
+disagree is what the standard deviations come from: within a block errors hang together (a skid
+lasts as long as the turn), from one to the next hardly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.runs import Run
+from acsard.calibration.table import Floats
+
+GAP_S, GAP_PERIODS = 0.3, 5.0
+"""Samples further apart than both are a gap: nothing is known of what was between."""
+
+STILL = 0.02
+"""rad/s; wheels that turn slower all stand."""
+
+BLOCKS = 16
+SHORTEST_S, LONGEST_S = 4.0, 12.0
+"""As many blocks are aimed at, of such lengths."""
+
+LEAST_TURN = 0.2
+"""rad that the faster side must turn in a block for it to tell anything."""
+
+
+class Wheels(Struct, frozen=True):
+    """Angles of each side in rad at times `t`, with what happened in gaps left out."""
+
+    t: Floats
+    left: Floats
+    right: Floats
+    gaps: Floats
+    """Rows of (begin, end) in s."""
+
+    def angles(self, t: Floats) -> tuple[Floats, Floats]:
+        """Of left and right, at any times."""
+        return np.interp(t, self.t, self.left), np.interp(t, self.t, self.right)
+
+
+class Block(Struct, frozen=True):
+    """A stretch of a run, s."""
+
+    run: int
+    begin: float
+    end: float
+
+
+def gaps(t: Floats) -> Floats:
+    """(begin, end) of each gap between sample times, one row each."""
+    steps = np.diff(t)
+    if not len(steps):
+        return np.zeros((0, 2))
+    wide = steps > max(GAP_S, GAP_PERIODS * float(np.median(steps)))
+    return np.column_stack((t[:-1][wide], t[1:][wide]))
+
+
+def inside(begin: Floats, end: Floats, holes: Floats) -> npt.NDArray[np.bool_]:
+    """Which stretches touch none of the gaps."""
+    after = np.searchsorted(holes[:, 1], begin, side="right")
+    before = np.searchsorted(holes[:, 0], end, side="left")
+    return np.asarray(after == before)
+
+
+def wheels(run: Run) -> Wheels:
+    """Angles from the speeds of a run, by the trapezoid."""
+    holes = gaps(run.t)
+    steps = np.diff(run.t)
+    steps[np.isin(run.t[:-1], holes[:, 0])] = 0.0
+    angles = [cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (run.left, run.right)]
+    return Wheels(run.t, angles[0], angles[1], holes)
+
+
+def cumulative(steps: Floats) -> Floats:
+    """Sums from 0 on, one more than there are steps."""
+    return np.concatenate((np.zeros(1), np.cumsum(steps)))
+
+
+def rests(run: Run, least_s: float, edge_s: float) -> Floats:
+    """(begin, end) of each time of at least so long in which all wheels stood, less its edges."""
+    moving = (np.abs(run.left) > STILL) | (np.abs(run.right) > STILL)
+    changes = np.flatnonzero(np.diff(np.concatenate(([True], moving, [True])).astype(np.int8)))
+    spans = [(run.t[a], run.t[b - 1]) for a, b in changes.reshape(-1, 2)]
+    found = [(a + edge_s, b - edge_s) for a, b in spans if b - a >= least_s + 2 * edge_s]
+    return np.array(found, dtype=np.float64).reshape(-1, 2)
+
+
+def blocks(driven: Sequence[Run], angles: Sequence[Wheels], shortest_s: float) -> list[Block]:
+    """The parts of all runs in which the robot moved."""
+    moved = sum(_moving_s(run) for run in driven)
+    length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
+    found = []
+    for number, (run, turned) in enumerate(zip(driven, angles, strict=True)):
+        ends = np.concatenate((turned.gaps[:, 0], run.t[-1:]))
+        begins = np.concatenate((run.t[:1], turned.gaps[:, 1]))
+        for begin, end in zip(begins, ends, strict=True):
+            count = max(1, round((end - begin) / length))
+            edges = np.linspace(begin, end, count + 1)
+            left, right = turned.angles(edges)
+            for at in range(count):
+                a, b = edges[at], edges[at + 1]
+                if b > a and _turned(run, a, b, left[at : at + 2], right[at : at + 2]):
+                    found.append(Block(number, float(a), float(b)))
+    return found
+
+
+def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
+    """The wheels did enough there; back and forth counts as well."""
+    if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
+        return True
+    a, b = np.searchsorted(run.t, (begin, end))
+    speed = max(float(np.sum(np.abs(v[a:b]))) for v in (run.left, run.right))
+    return bool(speed * (end - begin) / max(1, b - a) >= LEAST_TURN)
+
+
+def _moving_s(run: Run) -> float:
+    moving = (np.abs(run.left) > STILL) | (np.abs(run.right) > STILL)
+    steps = np.minimum(np.diff(run.t), GAP_S)
+    return float(np.sum(steps[moving[1:]]))

@@ -1,0 +1,89 @@
+"""A log cut into blocks, with what is compared in each and parameters to begin with.
+
+Here it is seen whether the log can be used at all: signs, units, whether anything follows the
+wheels, whether there is enough of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from acsard.calibration import heading, places, turning
+from acsard.calibration.doubts import (
+    RefusedError,
+    heading_follows,
+    places_follow,
+    turn_units,
+    turns_the_right_way,
+    way_units,
+)  # fmt: skip
+from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
+from acsard.calibration.excitation import drives_enough, rolls_enough, turns_enough
+from acsard.calibration.fit import Source
+from acsard.calibration.heading import Headings, Rows
+from acsard.calibration.paths import Block, Wheels, blocks
+from acsard.calibration.places import Grid, Spots
+from acsard.calibration.runs import Run
+from acsard.calibration.search import search
+from acsard.calibration.table import Floats
+
+
+class Prepared(Struct, frozen=True):
+    """Blocks of one length and what is compared in them."""
+
+    parts: list[Block]
+    rows: Rows
+    spots: list[Spots]
+    grids: list[Grid]
+    sources: list[Source]
+    start: Floats
+
+
+def prepared(
+    driven: Sequence[Run], angles: Sequence[Wheels], headings: Headings | None, base: Base,
+    length: float,
+) -> Prepared:  # fmt: skip
+    """Cut into blocks, and checked for what would lead astray: signs, units, nothing to go by."""
+    parts = blocks(driven, angles, length)
+    drives_enough(parts)
+    count, start = len(parts), base.start()
+    rows = heading.rows(headings, driven, angles, parts)
+    rolls_enough(rows)
+    spots = places.spots(driven, angles, parts)
+    grids = [places.grid(*pair) for pair in zip(driven, angles, strict=True)] if spots else []
+    sources: list[Source] = []
+    sides = begun = None
+    if headings is not None and len(rows.turned):
+        turns_enough(rows.turned)
+        sides = turning.first(rows, base)
+        heading_follows(headings.source, rows.turned, turning.by_sides(rows, base, sides))
+        sources.append(lambda p: turning.evidence(rows, base, p, count))
+    if spots:
+        begun = search(spots, driven, angles, base)
+        places_follow(begun)
+        sources.append(
+            lambda p: places.evidence(spots, [places.path(g, base, p) for g in grids], p, count)
+        )
+        start = begun.parameters.copy()
+    if not sources:
+        raise RefusedError(
+            "there are no positions or turn rates while the robot drives: record both at the same "
+            "time, with times of one clock"
+        )
+    turns_the_right_way(headings.source if headings else "", sides, begun)
+    if sides is not None:
+        mean, size = float(sides.mean()), float(start[[LEFT, RIGHT]].mean())
+        start[[LEFT, RIGHT]] = size * sides / mean
+        start[TURN] = mean / size
+    _units(headings, start, base, begun is not None)
+    return Prepared(parts, rows, spots, grids, sources, start)
+
+
+def _units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
+    size, was = float(start[[LEFT, RIGHT]].mean()), base.start()
+    if sized:
+        way_units(size, base)
+    turn = size * start[TURN] / (was[[LEFT, RIGHT]].mean() * was[TURN])
+    turn_units(headings.source if headings else "the positions' yaw", float(turn), base)

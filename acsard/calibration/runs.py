@@ -1,0 +1,158 @@
+"""A table of a log -> runs, each with its sensors as streams in order of time.
+
+Times may be anything that counts seconds: each run begins at 0 here. Rows out of order are sorted;
+where the time itself began anew, so does a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.table import FOUR, TWO, Floats, LogError, Table
+
+Complexes = npt.NDArray[np.complex128]
+Rows = npt.NDArray[np.int64]
+
+RESTART_S = 1.0
+"""A time that much before the last one is out of order, or begins anew."""
+
+FEW_RESTARTS = 100
+"""More blocks than that are rows in no order at all."""
+
+SLOWEST_S = 2.0
+"""Between two wheel samples: more is no log of a drive, or not in seconds."""
+
+LEAST_ROWS = 20
+"""Wheel samples of a run, and of a log."""
+
+
+class Run(Struct, frozen=True):
+    """One drive: times in s since `start`, in order and each only once."""
+
+    name: str
+    start: float
+    t: Floats
+    left: Floats
+    """Mean speed of the side's wheels, rad/s."""
+    right: Floats
+    gyro_t: Floats
+    gyro: Floats
+    """Yaw rate, rad/s."""
+    yaw_t: Floats
+    yaw: Floats
+    """As it was recorded: rad, wrapped or not."""
+    place_t: Floats
+    place: Complexes
+    """x + iy, m from the first one."""
+
+
+class Log(Struct, frozen=True):
+    """The drives of a file, and what was told while it was read."""
+
+    runs: tuple[Run, ...]
+    notes: tuple[str, ...]
+
+
+def runs(table: Table) -> Log:
+    """The drives in a table; raises `LogError`."""
+    notes = list(table.notes)
+    columns = dict(table.columns)
+    t = columns["t"]
+    columns["left"], columns["right"] = _sides(columns)
+    timed = np.isfinite(t)
+    if lost := int((~timed).sum()):
+        notes.append(f"{lost} of {len(t)} rows have no time and are left out")
+    found: list[Run] = []
+    for number, name in enumerate(table.names):
+        rows = np.flatnonzero(timed & (table.runs == number))
+        parts = _restarts(t, rows, columns)
+        if len(parts) > 1:
+            of = f"run {name}: " if name else ""
+            notes.append(f"{of}the time begins anew {len(parts) - 1} times: as many runs more")
+        for at, part in enumerate(parts):
+            label = name or str(len(found) + 1)
+            made = _run(label if at == 0 or not name else f"{name}.{at + 1}", columns, part, notes)
+            if made is not None:
+                found.append(made)
+    if not found:
+        raise LogError(
+            f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
+            "record the wheels at 5 Hz or more while the robot drives"
+        )
+    return Log(tuple(found), tuple(dict.fromkeys(notes)))
+
+
+def _sides(columns: dict[str, Floats]) -> tuple[Floats, Floats]:
+    if set(TWO) <= set(columns):
+        return columns["left"], columns["right"]
+    fr, fl, rl, rr = (columns[name] for name in FOUR)
+    return (fl + rl) / 2, (fr + rr) / 2
+
+
+def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
+    """The rows of each drive of a run that has no other mark than that its time begins anew.
+
+    Told by the wheels' rows alone: sensors may follow each other in a file, each in its own order.
+    """
+    wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
+    back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
+    if not 0 < len(back) <= FEW_RESTARTS:
+        return [rows]
+    blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
+    spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
+    if not any(a[1] > b[0] for a, b in pairwise(spans)):
+        return [rows]  # blocks of one drive in another order
+    return list(np.split(rows, np.searchsorted(rows, wheels[back])))
+
+
+def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) -> Run | None:
+    names = ("left", "right"), ("yaw_rate",), ("yaw",), ("x", "y")
+    wheels, gyro, yaw, place = (_stream(columns, rows, n, name, notes) for n in names)
+    if len(wheels[0]) < LEAST_ROWS:
+        if len(rows):
+            notes.append(f"run {name} has {len(wheels[0])} rows of wheel speeds and is left out")
+        return None
+    start = float(wheels[0][0])
+    period = float(np.median(np.diff(wheels[0])))
+    if period > SLOWEST_S:
+        raise LogError(
+            f"run {name}: {period:g} s between two rows of wheel speeds: t is in seconds (divide "
+            "ms by 1000, ns by 1e9), and the wheels are needed at 5 Hz or more"
+        )
+    x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
+    points = (x - x[:1]) + 1j * (y - y[:1])
+    return Run(
+        name, start, wheels[0] - start, wheels[1], wheels[2], gyro[0] - start, gyro[1],
+        yaw[0] - start, yaw[1], place[0] - start, points,
+    )  # fmt: skip
+
+
+def _stream(
+    columns: dict[str, Floats], rows: Rows, names: Iterable[str], run: str, notes: list[str]
+) -> tuple[Floats, ...]:
+    """The times and values of one sensor: rows that have all of it, sorted, one a time."""
+    held = [columns.get(name) for name in names]
+    if any(values is None for values in held):
+        return (np.zeros(0),) * (1 + len(held))
+    stream = [columns["t"][rows], *(values[rows] for values in held if values is not None)]
+    whole = np.all(np.isfinite(stream), axis=0)
+    return tuple(_ordered([values[whole] for values in stream], " ".join(names), run, notes))
+
+
+def _ordered(stream: list[Floats], what: str, run: str, notes: list[str]) -> Iterator[Floats]:
+    """Sorted by time; of several samples at one time the first."""
+    t = stream[0]
+    if count := int((np.diff(t) < 0).sum()):
+        notes.append(f"run {run}: {count} rows of {what} are out of order and were sorted")
+    order = np.argsort(t, kind="stable")
+    times, first = np.unique(t[order], return_index=True)
+    if count := len(t) - len(times):
+        notes.append(f"run {run}: {count} rows of {what} repeat a time: the first of each is taken")
+    yield times
+    for values in stream[1:]:
+        yield values[order][first]

@@ -1,0 +1,174 @@
+"""A log -> the calibration, or why it gives none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration import fit as fitting
+from acsard.calibration import heading, places, turning
+from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
+from acsard.calibration.evidence import LATE, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.excitation import DRIVE, sure_enough, told_apart, turns_enough
+from acsard.calibration.fit import Fit, fit
+from acsard.calibration.gain import Gain, gain, seen_by_places
+from acsard.calibration.heading import Headings
+from acsard.calibration.multipliers import (
+    LEFT_RADIUS,
+    RIGHT_RADIUS,
+    SEPARATION,
+    Multipliers,
+    Rates,
+    configured,
+    found,
+    rates,
+)  # fmt: skip
+from acsard.calibration.paths import Wheels, wheels
+from acsard.calibration.prepared import Prepared, prepared
+from acsard.calibration.runs import Log, Run
+from acsard.calibration.table import Floats
+from acsard.calibration.tape import Follow, Tape, Way, scaled
+from acsard.config.settings import DriveConfig
+
+LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
+"""Of blocks: with a sensor of heading, and without. Where positions are coarse, longer blocks tell
+more; where they are fine, more blocks do."""
+
+
+PLENTY = 100
+"""Blocks after which others are not worth the time."""
+
+
+class Drives(Struct, frozen=True):
+    """What was driven, in sums."""
+
+    runs: int
+    seconds: float
+    metres: float
+    turns: float
+    """Of 360 deg, to both sides together, with the parameters found."""
+    fastest: float
+    """rad/s, of the fastest turns."""
+
+
+class Calibration(Struct, frozen=True):
+    """What was found; all standard deviations are in the unit of what they belong to."""
+
+    way: str
+    """What the wheels were compared with."""
+    drives: Drives
+    now: Multipliers
+    found: Multipliers
+    scale: str
+    """What measured how far the robot went: "positions", "distance" or, with nothing, ""."""
+    growth: float
+    """Share by which the effective track grows with each rad/s of turn rate."""
+    growth_std: float
+    gain: Gain
+    late: dict[str, float]
+    """s by which each sensor is later than the wheels."""
+    bias: float
+    """rad/s, of the gyro."""
+    notes: tuple[str, ...]
+
+
+def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
+    """Of the robot that left this log; raises `LogError` or `RefusedError`."""
+    base = Base(
+        drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
+        drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
+    )  # fmt: skip
+    angles = [wheels(run) for run in log.runs]
+    headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
+    tries: list[tuple[float, int, Prepared, Fit]] = []
+    unlike: UnlikeError | None = None
+    for length in LENGTHS_S[headings is not None]:
+        try:
+            made = prepared(log.runs, angles, headings, base, length)
+        except UnlikeError as error:
+            unlike = unlike or error
+            continue  # coarse positions may follow over a longer time
+        except RefusedError as error:
+            raise unlike or error from None
+        fitted = fit(made.sources, made.start, places=bool(made.spots))
+        unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
+        tries.append((unsure, len(tries), made, fitted))
+        if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
+            break  # half as many would be too few, or these are plenty
+    if unlike is not None and not tries:
+        raise unlike
+    _, _, made, fitted = min(tries)
+    return _calibration(log, angles, headings, base, tape, made, fitted)
+
+
+def _calibration(
+    log: Log, angles: Sequence[Wheels], headings: Headings | None, base: Base, tape: Tape | None,
+    made: Prepared, fitted: Fit,
+) -> Calibration:  # fmt: skip
+    """What was fitted, as settings; and what it is worth."""
+    rows, spots, every = made.rows, made.spots, fitted.covariance()
+    if not fitted.converged:
+        raise RefusedError(f"the search for the parameters does not settle: {DRIVE}")
+    told_apart(fitted.apart())
+    by_wheels = turning.turned(rows, base, fitted.parameters)
+    rate, truth = rates(rows, by_wheels), rows.turned
+    if headings is None:
+        turns_enough(by_wheels)
+        truth = seen_by_places(fitted, rows, base)
+    result = found(fitted, rate)
+    sure_enough(result, float(np.sqrt(every[TURN, TURN])) / abs(fitted.parameters[TURN]))
+    better = gain(fitted, base, made.parts, rate, rows, truth, spots, made.grids)
+    late = {headings.source: headings.late} if headings is not None else {}
+    if spots:
+        late["positions"] = float(fitted.parameters[LATE])
+    scale, notes = ["positions"] if spots else [], list(log.notes)
+    if tape is not None:
+        follow = _follow(log.runs, angles, base, fitted, rate)
+        names = [run.name for run in log.runs]
+        result, name = scaled(result, tape, names, follow, known=bool(spots))
+        scale.append("distance")
+        notes.append(f"the distance of {tape.metres:g} m is taken for run {name}")
+    in_range(result.values)
+    size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
+    drives = Drives(
+        len(log.runs), sum(float(run.t[-1]) for run in log.runs),
+        size * float(np.abs(rows.left + rows.right).sum()) / 2,
+        float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
+    )  # fmt: skip
+    bias = headings.bias if headings is not None else 0.0
+    notes += _cuts(log.runs, angles)
+    notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))
+    return Calibration(
+        " and ".join(late), drives, configured(base), result, " and ".join(scale),
+        float(fitted.parameters[RATE]), float(np.sqrt(every[RATE, RATE])), better, late, bias,
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
+    """Where the log was taken apart, a sentence each."""
+    if gone := sum(len(turned.gaps) for turned in angles):
+        yield f"the wheel speeds have {gone} gaps: nothing is taken across them"
+    pairs = zip(driven, angles, strict=True)
+    if jumps := sum(len(places.jumps(run, turned)) for run, turned in pairs):
+        yield (
+            f"the positions jump {jumps} times (outliers, or a source that found itself "
+            "elsewhere): nothing is taken across that"
+        )
+
+
+def _follow(
+    driven: Sequence[Run], angles: Sequence[Wheels], base: Base, fitted: Fit, rate: Rates
+) -> Follow:
+    """What a run did by some multipliers, the track changing with the rate as it was found to."""
+
+    def follow(values: Floats, number: int) -> Way:
+        parameters = fitted.parameters.copy()
+        parameters[[LEFT, RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
+        parameters[TURN] = 1 / (values[SEPARATION] * (1 - parameters[RATE] * rate.mean))
+        place = places.path(places.grid(driven[number], angles[number]), base, parameters).place
+        return Way(float(abs(place[-1])), float(np.abs(np.diff(place)).sum()))
+
+    return follow

@@ -1,0 +1,88 @@
+"""A distance measured by tape: what makes turn rates know how large the wheels are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.multipliers import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION, Multipliers
+from acsard.calibration.table import Floats
+
+TAPE_M = 0.01
+"""Standard deviation of a distance read off by tape, and of where on the robot it was taken."""
+
+UNKNOWN = 1.0
+"""Standard deviation of the scale's logarithm where nothing else has measured it."""
+
+LEAST_M = 0.5
+"""A run that ends nearer to its start, by odometry, is none to measure."""
+
+STRAIGHT = 0.8
+"""The start and the end must be so far apart, as a share of the way between."""
+
+
+class Tape(Struct, frozen=True):
+    """How far a run's end is from its start in a straight line, m; `run` "" is the
+    straightest."""
+
+    metres: float
+    run: str = ""
+
+
+class Way(Struct, frozen=True):
+    """What a run did by some multipliers: from start to end, and along the path, m."""
+
+    apart: float
+    along: float
+
+    @property
+    def straight(self) -> float:
+        """1 for a straight line, 0 for a run that gets nowhere."""
+        return self.apart / self.along if self.apart > LEAST_M else 0.0
+
+
+Follow = Callable[[Floats, int], Way]
+"""What run number n did by these multipliers (as in `Multipliers.values`)."""
+
+
+def scaled(
+    found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
+) -> tuple[Multipliers, str]:
+    """The multipliers with the distance taken in (a Kalman step in their logarithms), and the
+    run it was taken for; `known`: positions have measured the scale already.
+
+    Raises `RefusedError` when there is no such run, or none that got anywhere.
+    """
+    if tape.run and tape.run not in names:
+        raise RefusedError(
+            f'--distance: there is no run "{tape.run}" in the log; it has {", ".join(names[:10])}'
+        )
+    numbers = [names.index(tape.run)] if tape.run else range(len(names))
+    ways = {number: follow(found.values, number) for number in numbers}
+    best = max(ways, key=lambda number: ways[number].straight)
+    way = ways[best]
+    if way.straight < STRAIGHT:
+        raise RefusedError(
+            f"--distance: run {names[best]} ends {way.apart:.2f} m from where it began, after "
+            f"{way.along:.2f} m: drive straight on for 2 m or more in a run of its own, and "
+            "measure from start to end"
+        )
+    slopes = np.zeros(3)
+    for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
+        longer = found.values.copy()
+        longer[index] *= 1.0 + 1e-4
+        slopes[index] = np.log(follow(longer, best).apart / way.apart) / 1e-4
+    logs = np.diag(1 / found.values)
+    covariance = logs @ found.covariance @ logs
+    if not known:
+        covariance = covariance + UNKNOWN**2
+    noise = (TAPE_M / tape.metres) ** 2
+    pull = covariance @ slopes / (slopes @ covariance @ slopes + noise)
+    values = found.values * np.exp(pull * np.log(tape.metres / way.apart))
+    rest = np.eye(3) - np.outer(pull, slopes)
+    covariance = rest @ covariance @ rest.T + np.outer(pull, pull) * noise
+    back = np.diag(values)
+    return Multipliers(values, back @ covariance @ back), names[best]

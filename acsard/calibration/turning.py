@@ -1,0 +1,70 @@
+"""The rows of a heading sensor as evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from acsard.calibration.evidence import (
+    COUNT,
+    LEFT,
+    RATE,
+    RIGHT,
+    TURN,
+    Base,
+    Evidence,
+    huber,
+    of_rows,
+)  # fmt: skip
+from acsard.calibration.heading import Rows
+from acsard.calibration.table import Floats
+
+NOISE = 0.01
+"""rad in a second, and this share of the turn, are taken for usual when outliers are sought."""
+SHARE = 0.03
+
+
+def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
+    """rad that the wheels say each row is, by these parameters."""
+    left, right, turn, slope = parameters[[LEFT, RIGHT, TURN, RATE]]
+    straight = base.gain * turn * (right * rows.right - left * rows.left)
+    return np.asarray(straight + slope * _slower(rows, base, parameters))
+
+
+def _slower(rows: Rows, base: Base, parameters: Floats) -> Floats:
+    """rad that each row turns less for each unit of `RATE`."""
+    left, right, turn = parameters[[LEFT, RIGHT, TURN]]
+    rate = base.gain * turn * (left + right) / 2
+    return np.asarray(-rate * abs(rate) * rows.fast)
+
+
+def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
+    """At these parameters."""
+    turn = parameters[TURN]
+    by_wheels = turned(rows, base, parameters)
+    jacobian = np.zeros((len(rows.turned), COUNT))
+    jacobian[:, LEFT] = -base.gain * turn * rows.left
+    jacobian[:, RIGHT] = base.gain * turn * rows.right
+    jacobian[:, RATE] = _slower(rows, base, parameters)
+    jacobian[:, TURN] = (by_wheels + jacobian[:, RATE] * parameters[RATE]) / turn
+    residual = rows.turned - by_wheels
+    usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
+    return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
+
+
+def first(rows: Rows, base: Base) -> Floats:
+    """g_l and g_r over the gain of parameters that are all 1: by least squares, whatever sign."""
+    columns = base.gain * np.column_stack((-rows.left, rows.right))
+    weight = np.ones(len(rows.turned))
+    found: Floats = np.zeros(2)
+    for _ in range(10):
+        root = np.sqrt(weight)[:, None]
+        found = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
+        by_wheels = columns @ found
+        usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
+        weight = huber((rows.turned - by_wheels) / usual, 1.0)
+    return found
+
+
+def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
+    """rad that the wheels say each row is, by what `first` found."""
+    return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

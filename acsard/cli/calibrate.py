@@ -1,0 +1,123 @@
+"""`acsard calibrate`: wheel radii and effective track from a recorded drive.
+
+How they are found is `calibration/`'s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import add_config, find, load
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+from acsard.host.files import change, require_tomlkit
+
+if TYPE_CHECKING:
+    from acsard.calibration.solve import Calibration
+    from acsard.calibration.tape import Tape
+    from acsard.config.settings import DriveConfig
+
+DESCRIPTION = """\
+Find the wheels' radii and the effective track from a log of a drive, each with its standard
+deviation, and tell what they improve. The log is a CSV file with a header: column t (s) and the
+wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right"; and yaw_rate (rad/s, of a gyro), or x and y
+(m, of any source of positions) with or without yaw (rad), or both; run (any name) tells several
+drives apart. Columns may be in any order, cells empty where a sensor has nothing to say. Good logs
+begin with 3 s of standing, and have straight drives, turns to both sides, slow and fast, and
+curves, for 60 s or more. Exit 0 when something was found, 1 when the log gives nothing, with what
+to drive instead.
+"""
+
+MOST_BYTES = 1 << 30
+"""Of a log: it is read into memory."""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "calibrate",
+        help="wheel radii and effective track from a recorded drive",
+        description=DESCRIPTION,
+    )
+    add_config(parser)
+    parser.add_argument(
+        "--log", type=Path, required=True, metavar="FILE", help="the recorded drive, CSV"
+    )
+    parser.add_argument(
+        "--distance",
+        type=_distance,
+        metavar="[RUN=]METRES",
+        help="how far from its start a run ends, in a straight line by tape measure: tells how "
+        "large the wheels are; without RUN it is the straightest run",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help="also write what was found into the configuration file, comments kept (needs the "
+        f"extra: {install('mcu')})",
+    )
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Calibrate and tell."""
+    import msgspec
+
+    from acsard.calibration.doubts import RefusedError
+    from acsard.calibration.report import Refusal, keys, report, text
+    from acsard.calibration.table import LogError
+
+    where, config = load(args.config)
+    if args.write:
+        require_tomlkit()
+        if not find(args.config)[1] and not Path(where).is_file():
+            raise ExitError(
+                Exit.FAILURE,
+                "--write has no configuration file to write to: name it by --config, or make an "
+                "acsard.toml here (an empty one is valid)",
+            )
+    try:
+        found = _calibrated(args.log, config.drive, args.distance)
+    except (LogError, RefusedError) as error:
+        if args.json:
+            refusal = Refusal(str(args.log), str(error))
+            print(msgspec.json.encode(refusal).decode(), flush=True)
+        raise ExitError(Exit.FAILURE, f"{args.log}: {error}") from None
+    if args.write:
+        change(Path(where), keys(found))
+    told = report(str(args.log), found, config.drive, where if args.write else "")
+    print(msgspec.json.encode(told).decode() if args.json else text(told, found, where))
+    return int(Exit.OK)
+
+
+def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
+    from acsard.calibration.runs import runs
+    from acsard.calibration.solve import calibrate
+    from acsard.calibration.table import read
+
+    try:
+        if log.stat().st_size > MOST_BYTES:
+            raise ExitError(Exit.FAILURE, f"{log} is over 1 GiB: cut it, ten minutes are plenty")
+        data = log.read_bytes()
+    except OSError as error:
+        raise ExitError(
+            Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
+        ) from None
+    return calibrate(runs(read(data)), drive, tape)
+
+
+def _distance(text: str) -> Tape:
+    from acsard.calibration.tape import Tape
+
+    run, _, metres = text.rpartition("=")
+    try:
+        value = float(metres)
+    except ValueError:
+        value = math.nan
+    if not 0.1 <= value <= 1e4:
+        raise argparse.ArgumentTypeError(f"{text} is not a distance in m from 0.1 to 10000")
+    return Tape(value, run)

@@ -1,0 +1,212 @@
+"""The heading from a gyro, where there is one: the distance stays the wheels'.
+
+Gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
+odometry in mobile robots, 1996): a gyro knows nothing of skidding wheels, wheels nothing of its
+bias. The bias is what it says at rest (`gyro_bias.py`), its delay and the track it implies come
+from comparing both (`gyro_match.py`). Silent, or out of all proportion to the wheels, it leaves
+them alone.
+
+What has been handed out is remembered and not the time: whatever came late or was held over for a
+moment is in the next line's turn, and no error of that kind adds up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from msgspec import Struct
+
+from acsard.drive.gyro_bias import Bias
+from acsard.drive.gyro_match import WINDOW_S, Match
+from acsard.mcu.promptest import Promptest
+from acsard.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
+
+REST_S = 0.2
+"""s of four zeros until the robot stands."""
+
+SILENT_NS = NS_PER_S // 5
+"""A gyro of which nothing came for so long is silent; until then it turns on as it did."""
+
+LATEST_NS = NS_PER_S // 4
+"""A stamp that says more is of a clock that was set."""
+
+DRIFT = 0.01
+"""By which share the gyro's clock may go apart from ours."""
+
+DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
+"""How much earlier or later than the wheels a gyro may tell."""
+
+LEAST_DELAY_S = 0.002
+"""Less is not worth moving it for."""
+
+SCALE_VARIANCE = 1e-4
+"""rad2 per rad turned, for the gyro's scale: 1.4 degrees after a turn."""
+
+SLIP_S = 0.5
+"""s after the last contradiction for which it slips on."""
+
+MOST_SLIP_S = 5.0
+"""s that wheels slip in one go; a gyro that contradicts them for longer is stuck, or no gyro."""
+
+PROPORTIONS = (0.25, 2.5)
+"""Between these a robot turns per turn of its wheels, whatever it skids."""
+
+ENOUGH_BLOCKS = 20.0
+"""Blocks of turning after which the proportion is believed."""
+
+WORDS: dict[GyroDoes, str] = {
+    "off": "",
+    "waiting for rest": "the gyro's bias is not known yet: the robot must stand for a second",
+    "used": "the heading is the gyro's",
+    "silent": "the gyro is silent: the heading is the wheels' alone",
+    "disagrees": "the wheels slip: the gyro says another turn than they do",
+    "not believed": "the gyro turns out of all proportion to the wheels: does its z point up?",
+}
+
+
+class Turn(Struct, frozen=True):
+    """By how much the robot turned since the line before: rad, and its variance, rad2."""
+
+    angle: float
+    variance: float
+    rate: float
+    """rad/s, what it says now, and its variance: the angle may hold what came late."""
+    rate_variance: float
+
+
+class Gyro:
+    """One gyro beside the wheels: `hear` its samples, then ask each line's `turn`."""
+
+    def __init__(self) -> None:
+        self._bias, self._match = Bias(), Match()
+        self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
+        """Samples of times that no line has reached yet."""
+        self._promptest = Promptest(DRIFT)
+        self._last: GyroSample | None = None
+        self._delay_ns = 0
+        self._told_ns: int | None = None
+        """The time of the last sample that was taken."""
+        self._rate = 0.0
+        self._angle = self._given = 0.0
+        """rad turned by all samples taken, and what of it was handed out."""
+        self._variance = 0.0
+        """rad2 of what was not handed out yet."""
+        self._rest_s = self._since_rest_s = self._slip_s = self._slipped_s = 0.0
+        self._noise = 0.0
+        """Variance of the last sample."""
+        self._hole = False
+        """Since the last line some of the turn was not heard."""
+        self._does: GyroDoes = "silent"
+        self.events: list[Event] = []
+        """What the last `turn` found worth a log line."""
+
+    @property
+    def status(self) -> GyroStatus:
+        """What it does now."""
+        match, bias = self._match, self._bias
+        track = 1.0 / match.ratio if match.blocks >= ENOUGH_BLOCKS and match.ratio > 0.0 else None
+        known = bias.value if bias.known else None
+        return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track)
+
+    def hear(self, samples: tuple[GyroSample, ...]) -> None:
+        """What came since the last step, in order."""
+        for sample in samples:
+            self._hole |= len(self._heard) == self._heard.maxlen
+            self._heard.append((self._time_of(sample), sample))
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
+        """What it turned until a line of the time `at_ns`; None when only the wheels can tell.
+
+        `wheels` rad over `dt` s is what they say; `still` that all four stood. After a gap `dt` is
+        0 and the turn is all that came about in it.
+        """
+        self.events = []
+        self._rest_s = self._rest_s + dt if still else 0.0
+        resting = self._rest_s > REST_S
+        self._take(at_ns, resting)
+        ahead = SILENT_NS if self._told_ns is None else at_ns - self._told_ns
+        silent = ahead >= SILENT_NS
+        held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
+        angle, variance = self._angle + held - self._given, self._variance
+        self._given, self._variance = self._angle + held, 0.0
+        self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
+        variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
+        variance += SCALE_VARIANCE * abs(angle)
+        if not silent and self._bias.known and dt > 0.0:
+            self._compare(wheels, angle, dt)
+        if resting:
+            self._shift()
+        self._judge(silent)
+        hole, self._hole = self._hole, False
+        if hole or self._does not in ("used", "disagrees"):
+            return None
+        return Turn(angle, variance, self._rate, self._noise + self._bias.variance)
+
+    # samples
+
+    def _time_of(self, sample: GyroSample) -> int:
+        """When it was measured, by our clock and but for a constant: stamps come without jitter."""
+        last, self._last = self._last, sample
+        if last is None or sample.stamp_ns is None or last.stamp_ns is None:
+            return sample.at_ns
+        late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
+        if late > LATEST_NS:
+            self._promptest = Promptest(DRIFT)
+            return sample.at_ns
+        return sample.at_ns - max(0, int(late))
+
+    def _take(self, until_ns: int, resting: bool) -> None:
+        """Add up the samples of times until then; at rest they tell the bias."""
+        bias, heard = self._bias, self._heard
+        until_ns += self._delay_ns
+        while heard and heard[0][0] <= until_ns:
+            time_ns, sample = heard.popleft()
+            time_ns -= self._delay_ns
+            span_ns = SILENT_NS if self._told_ns is None else time_ns - self._told_ns
+            self._hole |= span_ns >= SILENT_NS
+            self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
+            span = max(0, span_ns) / NS_PER_S if span_ns < SILENT_NS else 0.0
+            bias.drift(max(0, span_ns) / NS_PER_S)
+            stands = resting and bias.rest(sample.rate, sample.variance, span)
+            self._rate = 0.0 if stands else sample.rate - bias.value
+            self._noise = max(bias.noise, sample.variance)
+            self._angle += self._rate * span
+            if not stands:
+                self._variance += self._noise * span * span
+
+    # beside the wheels
+
+    def _compare(self, wheels: float, angle: float, dt: float) -> None:
+        self._match.add(wheels, angle, dt, self._slip_s > 0.0)
+        noise = 2.0 * self._bias.variance * WINDOW_S * WINDOW_S + self._bias.noise * WINDOW_S * dt
+        if self._match.contradiction(noise):
+            self._slip_s = SLIP_S
+        else:
+            self._slip_s = max(0.0, self._slip_s - dt)
+        self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
+
+    def _shift(self) -> None:
+        """At rest, where it moves nothing, put the gyro's time right."""
+        delay = self._match.delay()
+        if delay is not None and abs(delay) >= LEAST_DELAY_S:
+            earliest, latest = DELAYS_NS
+            shifted = self._delay_ns + math.floor(delay * NS_PER_S)
+            self._delay_ns = min(max(earliest, shifted), latest)
+
+    def _judge(self, silent: bool) -> None:
+        match, before = self._match, self._does
+        least, most = PROPORTIONS
+        wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
+        if silent:
+            self._does = "silent"
+        elif not self._bias.known:
+            self._does = "waiting for rest"
+        elif wrong or self._slipped_s > MOST_SLIP_S:
+            self._does = "not believed"
+        else:
+            self._does = "disagrees" if self._slip_s > 0.0 else "used"
+        if self._does != before:
+            good = self._does in ("used", "waiting for rest")
+            level: Level = "info" if good else "warning"
+            self.events.append(Event("gyro", WORDS[self._does], level, kind=self._does))

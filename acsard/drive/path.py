@@ -1,0 +1,68 @@
+"""Where a chain of arcs leads: exact arcs, summed so that millions of them stay exact.
+
+The chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along
+yaw + dyaw/2. What rounding loses of each sum is kept beside it and added to the next (Kahan,
+Further Remarks on Reducing Truncation Errors, 1965); a turn is 2 pi, not the double nearest to it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.values import Pose
+
+TAU_REST = 2.4492935982947064e-16
+"""rad; 2 pi less `math.tau`."""
+
+
+class Path:
+    """The pose at the end of the arcs driven so far."""
+
+    def __init__(self) -> None:
+        self.set(Pose())
+
+    def set(self, pose: Pose) -> None:
+        """Go on from `pose`."""
+        self._x, self._x_rest = pose.x, 0.0
+        self._y, self._y_rest = pose.y, 0.0
+        self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
+        self.pose = Pose(self._x, self._y, self._yaw)
+        """Pose of base_link in odom, yaw within [-pi, pi]."""
+
+    def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
+        """Go on by an arc of length `distance` m through `turn` rad.
+
+        Returns its chord: m along x, m along y, and its direction in rad.
+        """
+        half = turn / 2
+        # sin(h)/h loses nothing in doubles down to tiny h; only h = 0 needs its limit.
+        chord = distance * (math.sin(half) / half if half else 1.0)
+        heading = self._yaw + half
+        dx, dy = chord * math.cos(heading), chord * math.sin(heading)
+        self._x, self._x_rest = plus(self._x, dx + self._x_rest)
+        self._y, self._y_rest = plus(self._y, dy + self._y_rest)
+        self._turn(turn)
+        self.pose = Pose(self._x, self._y, self._yaw)
+        return dx, dy, heading
+
+    def _turn(self, turn: float) -> None:
+        yaw, rest = plus(self._yaw, turn)
+        wrapped = math.remainder(yaw, math.tau)
+        if wrapped != yaw:
+            rest -= round((yaw - wrapped) / math.tau) * TAU_REST
+        self._yaw, self._yaw_rest = plus(wrapped, rest + self._yaw_rest)
+
+
+def plus(a: float, b: float) -> tuple[float, float]:
+    """a + b as the double nearest to it and what that leaves out, exactly (Knuth)."""
+    total = a + b
+    of_b = total - a
+    return total, (a - (total - of_b)) + (b - of_b)
+
+
+def arc(pose: Pose, distance: float, turn: float) -> Pose:
+    """`pose` after an arc of length `distance` m through `turn` rad."""
+    path = Path()
+    path.set(pose)
+    path.advance(distance, turn)
+    return path.pose

@@ -1,0 +1,116 @@
+"""Errors of a planar pose as motions in SE(2), in axes of odom at the robot.
+
+The error of an estimate is log(estimate^-1 truth): the constant twist that leads, in one unit of
+time, from where the robot is believed to be to where it is. In axes of base_link a step carries it
+on by the adjoint of the step's inverse; turned into the axes of odom, which keep their direction,
+only the lever of the way is left of that: `seen_from`.
+"""
+
+from __future__ import annotations
+
+from acsard.values import PoseCovariance
+
+Vector = tuple[float, float, float]
+"""x, y (m) and yaw (rad) of an error."""
+
+Planar = tuple[float, float]
+
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+
+
+def plus(a: Vector, b: Vector) -> Vector:
+    """a + b"""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def bracket(a: Vector, b: Vector) -> Planar:
+    """x and y of the Lie bracket [a, b]; its yaw is always 0."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+
+
+def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
+    """The rows of `times` E[[a, e] e'], e of covariance `p`."""
+    x, y, yaw = times * a[0], times * a[1], times * a[2]
+    return (
+        (y * p.xyaw - yaw * p.xy, y * p.yyaw - yaw * p.yy, y * p.yawyaw - yaw * p.yyaw),
+        (yaw * p.xx - x * p.xyaw, yaw * p.xy - x * p.yyaw, yaw * p.xyaw - x * p.yawyaw),
+    )
+
+
+def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
+    """xx, xy and yy of E[[a, b] [a, b]'], a and b independent with covariances `p` and `q`."""
+    return (
+        p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
+        p.yyaw * q.xyaw - p.xy * q.yawyaw - p.yawyaw * q.xy + p.xyaw * q.yyaw,
+        p.yawyaw * q.xx - 2 * p.xyaw * q.xyaw + p.xx * q.yawyaw,
+    )
+
+
+def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
+    """E[[e, [e, b]] b'] and its transpose, b of covariance `p`; `a` is E[e yaw] of an e."""
+    x, y, yaw = a
+    return PoseCovariance(
+        2 * (x * p.xyaw - yaw * p.xx),
+        x * p.yyaw + y * p.xyaw - 2 * yaw * p.xy,
+        x * p.yawyaw - yaw * p.xyaw,
+        2 * (y * p.yyaw - yaw * p.yy),
+        y * p.yawyaw - yaw * p.yyaw,
+        0.0,
+    )
+
+
+def seen_from(error: Vector, dx: float, dy: float) -> Vector:
+    """The same error after the robot has moved by `dx`, `dy` m in odom."""
+    x, y, yaw = error
+    return x - dy * yaw, y + dx * yaw, yaw
+
+
+def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
+    """The covariance of an error of covariance `p`, seen from `dx`, `dy` m further."""
+    return PoseCovariance(
+        p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
+        p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
+        p.xyaw - dy * p.yawyaw,
+        p.yy + 2 * dx * p.yyaw + dx * dx * p.yawyaw,
+        p.yyaw + dx * p.yawyaw,
+        p.yawyaw,
+    )
+
+
+def added(
+    p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
+) -> PoseCovariance:
+    """`p` and the noise of a step in direction (`c`, `s`): its variances and their covariance."""
+    cc, cs = along * c, along * s
+    return PoseCovariance(
+        p.xx + cc * c,
+        p.xy + cc * s,
+        p.xyaw + both * c,
+        p.yy + cs * s,
+        p.yyaw + both * s,
+        p.yawyaw + yaw,
+    )
+
+
+def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
+    """p + q"""
+    return PoseCovariance(
+        p.xx + q.xx,
+        p.xy + q.xy,
+        p.xyaw + q.xyaw,
+        p.yy + q.yy,
+        p.yyaw + q.yyaw,
+        p.yawyaw + q.yawyaw,
+    )
+
+
+def difference(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
+    """p - q"""
+    return PoseCovariance(
+        p.xx - q.xx,
+        p.xy - q.xy,
+        p.xyaw - q.xyaw,
+        p.yy - q.yy,
+        p.yyaw - q.yyaw,
+        p.yawyaw - q.yawyaw,
+    )

@@ -1,0 +1,223 @@
+"""How far the pose may be off: the covariance of its error, step by step.
+
+The error is log(estimate^-1 truth) in SE(2) (`se2.py`). A step sees it from the robot's new place
+and adds noise (`noise.py`): P <- F P F' + G Q G'. The parameters' errors stay the same all the way,
+so what each of them bends the pose by is summed as a column, J <- F J + G_p, and
+
+    P_total = P + J J' + what is of second order (`second_order.py`)
+
+In nav_msgs/Odometry the covariance is that of x and y along the axes of odom and of yaw. To first
+order the place's error is the twist's, so the same numbers are published: turned by -yaw they are
+those of the Lie algebra in base_link, which still hold when the heading is known badly, where an
+ellipse in x and y cannot be right.
+
+Turning counts as far as it exceeds what encoders feign. A count more on one side and then on the
+other is no turn, but |dyaw| taken line by line would make one of it, 2 to 4 times the yaw's
+variance on a straight. So the heading has play, a count wide, and only what goes beyond counts.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.config.settings import OdometryConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.noise import Column, Noise, columns
+from acsard.drive.se2 import (
+    ORIGIN,
+    Vector,
+    added,
+    carried,
+    difference,
+    plus,
+    seen_from,
+    total,
+)
+from acsard.drive.second_order import SecondOrder
+from acsard.values import PoseCovariance
+
+MAX_VARIANCE = 1e9
+"""m2 or rad2; a pose this uncertain says nothing, and the numbers must stay finite for years."""
+
+COARSE_COUNTS = 400
+"""Per wheel turn, where the configuration does not tell: hardly an encoder has fewer."""
+
+NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
+
+NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
+
+STRETCH = 0.2
+"""m the wheels roll between two looks at what is of second order: it changes slowly."""
+
+
+class PoseUncertainty:
+    """The covariance of the pose, in pure floats for the 100 Hz path."""
+
+    def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
+        """`counts` of the encoders per wheel turn, 0 if unknown."""
+        self._start = odometry.pose_covariance_diagonal
+        self._half = kinematics.track / 2
+        self._noise = Noise(odometry, kinematics)
+        self._parameters = columns(odometry, kinematics)
+        # A side is the mean of two wheels, each of which may stand anywhere within a count.
+        count = kinematics.radius * math.tau / (counts or COARSE_COUNTS)
+        self._play = count / kinematics.track
+        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / kinematics.track**2, 0.0)
+        self._counted = counts > 0
+        self._dx = self._dy = self._rolled = 0.0
+        """m in odom, and of the wheels' way, since the last look at what is of second order."""
+        self.set(0.0)
+
+    def set(self, yaw: float) -> None:
+        """The pose is as certain as at the start, with its heading at `yaw`."""
+        xx, yy, _, _, _, yawyaw = self._start
+        self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
+        self._cos, self._sin = math.cos(yaw), math.sin(yaw)
+        if self._counted:
+            self._p = added(self._p, *self._phase, self._cos, self._sin)
+        self._effects = self._parameters
+        self._columns: list[Vector] = [ORIGIN for _ in self._effects]
+        """J, column by column; the last is what it may have gone on by in gaps, once there are."""
+        self._columns_before = self._columns
+        self._turned = self._middle = 0.0
+        self._second = SecondOrder(len(self._effects))
+        self._begin_stretch()
+        self._lost = False
+        self.covariance = self._p
+        """As published: of x, y and yaw in odom."""
+        self._publish()
+
+    def advance(
+        self, distance: float, turn: float, dx: float, dy: float, heading: float,
+        variance: float | None = None,
+    ) -> None:  # fmt: skip
+        """An arc of `distance` m through `turn` rad has moved the robot by `dx`, `dy` m in odom.
+
+        `heading` is that of its chord. `variance` is that of the turn, rad2, where it is not the
+        wheels that tell it: then their parameters bend the distance only.
+        """
+        if self._lost:
+            self._forget_where(distance, turn)
+            return
+        c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
+        along, yaw, both = self._noise.of(distance, turn, self._beyond_play(turn))
+        if variance is not None:
+            yaw, both = variance, 0.0
+        self._p = added(carried(self._p, dx, dy), along, yaw, both, c, s)
+        if self._effects:
+            self._columns = [
+                _bent(
+                    column, effect if variance is None else (*effect[:2], 0.0, 0.0),
+                    distance, turn, dx, dy, c, s,
+                )
+                for column, effect in zip(self._columns, self._effects, strict=True)
+            ]  # fmt: skip
+        self._dx, self._dy = self._dx + dx, self._dy + dy
+        self._rolled += abs(distance) + self._half * abs(turn)
+        if self._rolled > STRETCH:
+            self._end_stretch()
+        self._publish()
+
+    def doubt(self, along: float, yaw: float) -> None:
+        """The last way may have been another one: m2 along it, rad2 of heading."""
+        if not self._lost:
+            self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
+            self._publish()
+
+    def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
+        """It may have gone on unseen by `distance` and `turn`, or stood: the pose says it stood.
+
+        So does every gap: such errors all point one way and do not average out, which makes them a
+        column like a parameter's. `along` m2 and `yaw` rad2 are how well that is known.
+        """
+        if self._lost:
+            self._forget_where(distance, turn)
+            return
+        c, s = self._cos, self._sin
+        if len(self._effects) == len(self._parameters):
+            self._effects = (*self._parameters, NO_EFFECT)
+            self._columns = [*self._columns, ORIGIN]
+            self._columns_before = [*self._columns_before, ORIGIN]
+            self._second.widen()
+        gone_on = plus(self._columns[-1], (c * distance, s * distance, turn))
+        self._columns = [*self._columns[:-1], gone_on]
+        # An unknown arc leads to any side.
+        aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
+        way_along, way_yaw, both = self._noise.of(distance, turn, abs(turn))
+        p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
+        self._p = added(p, aside, 0.0, 0.0, -s, c)
+        self._publish()
+
+    def _forget_where(self, distance: float, turn: float) -> None:
+        """Who moves without a known heading, or place, knows neither."""
+        if distance or turn:
+            self.covariance = NOWHERE
+
+    def _beyond_play(self, turn: float) -> float:
+        """rad of `turn` that are no encoder noise."""
+        self._turned += turn
+        off = self._turned - self._middle
+        if abs(off) <= self._play:
+            return 0.0
+        beyond = abs(off) - self._play
+        self._middle += math.copysign(beyond, off)
+        return beyond
+
+    def _begin_stretch(self) -> None:
+        self._before = self._p
+        self._columns_before = self._columns
+        self._dx = self._dy = self._rolled = 0.0
+
+    def _end_stretch(self) -> None:
+        """Look at what the way since the last look adds to second order."""
+        dx, dy, p = self._dx, self._dy, self._p
+        before = carried(self._before, dx, dy)
+        columns_before = [seen_from(column, dx, dy) for column in self._columns_before]
+        new = [
+            (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+            for a, b in zip(self._columns, columns_before, strict=True)
+        ]
+        self._second.carry(dx, dy)
+        self._p = total(p, self._second.compose(before, difference(p, before), columns_before, new))
+        self._begin_stretch()
+
+    def _publish(self) -> None:
+        p, second = self._p, self._second
+        xx, xy, yy = p.xx + second.xx, p.xy + second.xy, p.yy + second.yy
+        xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
+        for x, y, yaw in self._columns:
+            xx, xy, xyaw = xx + x * x, xy + x * y, xyaw + x * yaw
+            yy, yyaw, yawyaw = yy + y * y, yyaw + y * yaw, yawyaw + yaw * yaw
+        published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)
+        if self._counted:
+            published = added(published, *self._phase, self._cos, self._sin)
+        if max(xx, yy, yawyaw) >= MAX_VARIANCE:
+            self._lost = True
+            published = _capped(published)
+        self.covariance = published
+
+
+def _bent(
+    column: Vector, effect: Column, distance: float, turn: float,
+    dx: float, dy: float, c: float, s: float,
+) -> Vector:  # fmt: skip
+    """F J + G_p for one parameter; half of the step's own turn has the step as its lever."""
+    along = effect[0] * distance + effect[1] * turn
+    yaw = effect[2] * distance + effect[3] * turn
+    lever = column[2] + yaw / 2
+    return column[0] + c * along - dy * lever, column[1] + s * along + dx * lever, column[2] + yaw
+
+
+def _capped(p: PoseCovariance) -> PoseCovariance:
+    """No variance over the maximum, and the same correlations."""
+    x, y, yaw = (
+        min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
+    )
+    return PoseCovariance(
+        min(p.xx, MAX_VARIANCE),
+        p.xy * x * y,
+        p.xyaw * x * yaw,
+        min(p.yy, MAX_VARIANCE),
+        p.yyaw * y * yaw,
+        min(p.yawyaw, MAX_VARIANCE),
+    )

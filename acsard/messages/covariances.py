@@ -1,0 +1,57 @@
+"""Covariances of the plane -> the 6x6 that ROS messages have, row major: x y z, roll pitch yaw.
+
+Wheels cannot measure z, roll and pitch: they get what is configured, in a range that RViz draws and
+a filter can invert. With `odometry.covariance = "constant"` both are the configured diagonals.
+"""
+
+from __future__ import annotations
+
+from acsard.config.settings import Diagonal, OdometryConfig
+from acsard.values import PoseCovariance, TwistVariances
+
+SMALLEST, LARGEST = 1e-6, 1e6
+"""Of the axes that are not measured."""
+
+
+class Covariances:
+    """Fills the matrices of nav_msgs/Odometry."""
+
+    def __init__(self, odometry: OdometryConfig) -> None:
+        self._constant = odometry.covariance == "constant"
+        self._pose = odometry.pose_covariance_diagonal
+        self._twist = odometry.twist_covariance_diagonal
+        self._unmeasured = _bounded(self._pose)
+        self._unmeasured_rates = _bounded(self._twist)
+
+    def of_pose(self, p: PoseCovariance) -> list[float]:
+        """Of the pose in the odom frame, with the axes of odom at the robot."""
+        if self._constant:
+            return _diagonal(*self._pose)
+        z, roll, pitch = self._unmeasured
+        # fmt: off
+        return [
+            p.xx,    p.xy,   0.0,  0.0,  0.0,   p.xyaw,
+            p.xy,    p.yy,   0.0,  0.0,  0.0,   p.yyaw,
+            0.0,     0.0,    z,    0.0,  0.0,   0.0,
+            0.0,     0.0,    0.0,  roll, 0.0,   0.0,
+            0.0,     0.0,    0.0,  0.0,  pitch, 0.0,
+            p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,   p.yawyaw,
+        ]
+        # fmt: on
+
+    def of_twist(self, v: TwistVariances) -> list[float]:
+        """Of the twist in the base frame."""
+        if self._constant:
+            return _diagonal(*self._twist)
+        return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)
+
+
+def _bounded(diagonal: Diagonal) -> tuple[float, float, float]:
+    z, roll, pitch = (min(max(v, SMALLEST), LARGEST) for v in diagonal[2:5])
+    return z, roll, pitch
+
+
+def _diagonal(*variances: float) -> list[float]:
+    cells = [0.0] * 36
+    cells[::7] = variances
+    return cells

@@ -1,0 +1,90 @@
+"""The latencies of a busy machine beside those of a quiet one, in one table.
+
+pytest -s -m bench tests/bench/test_busy.py
+
+Busy: a process on each core that does nothing but compute, at the same priority. The two ends of
+the measurement go ahead of those: what is measured is the daemon, with the loop's real-time
+scheduling that its unit permits and without any. Then a flood besides: a program that puts
+commands as fast as it can.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.bench.matching import staircase
+from acsard.config.settings import Config
+from tests.bench.rigs import all_cores_busy, config, delays_us, rig, schedule, share, waits_us
+from tests.system.strangers import FLOOD, words
+
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
+
+SECONDS = 20.0
+
+AHEAD = 60
+"""Of the measuring process, SCHED_FIFO."""
+
+
+@contextmanager
+def ahead_of_all() -> Iterator[None]:
+    """All threads of this process, as far as that is permitted."""
+    try:
+        schedule(os.getpid(), os.SCHED_FIFO, AHEAD)
+    except PermissionError:
+        pytest.skip("real-time scheduling is not permitted here")
+    try:
+        yield
+    finally:
+        schedule(os.getpid(), os.SCHED_OTHER)
+
+
+@contextmanager
+def flooded(one: Config, wanted: bool) -> Iterator[None]:
+    """Somebody who puts zeros on another source as fast as one process can."""
+    if not wanted:
+        yield
+        return
+    text = FLOOD.replace("acsard/acsar/cmd/app", f"acsard/{one.robot.id}/cmd/nav")
+    flood = subprocess.Popen(
+        words(text, one.bus.listen[0], 0.0, 2 * SECONDS), stdout=subprocess.PIPE
+    )
+    try:
+        yield
+    finally:
+        flood.kill()
+        flood.communicate()
+
+
+CASES = {
+    "quiet": (False, False),
+    "all cores busy": (True, False),
+    "flood": (False, True),
+    "all cores busy, flood": (True, True),
+}
+
+
+@pytest.mark.parametrize("real_time", [True, False], ids=["as the unit", "no real time"])
+def test_a_busy_machine_beside_a_quiet_one(real_time: bool) -> None:
+    how = "as the unit may" if real_time else "without real-time scheduling"
+    print(f"\n{SECONDS:g} s each, {how}, us{'command -> wire':>28}{'feedback -> odometry':>33}")
+    print(f"{'':26}{'p50':>9}{'p99':>9}{'max':>9}   {'p50':>9}{'p99':>9}{'max':>9}")
+    late = {}
+    for name, (busy, flood) in CASES.items():
+        one = config()
+        one = replace(one, control=replace(one.control, real_time=real_time))
+        with rig(one) as running, all_cores_busy(busy), flooded(one, flood), ahead_of_all():
+            running.command(SECONDS, staircase, 1)
+            record = running.end()
+        waits, delays = waits_us(record), delays_us(one, record)
+        cells = [f"{share(values, p):9.0f}" for values in (waits, delays) for p in (0.5, 0.99, 1.0)]
+        print(f"{name:26}{''.join(cells[:3])}   {''.join(cells[3:])}", flush=True)
+        late[name] = sum(wait > 10_000 for wait in waits) / len(waits)
+    if real_time:
+        # A period at most, but for what the machine itself loses. A flood takes what it gets.
+        assert max(late["quiet"], late["all cores busy"]) < 0.05

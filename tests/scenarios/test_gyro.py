@@ -1,0 +1,151 @@
+"""A skid-steer robot with a gyro: the heading is the gyro's, and what becomes of it is told."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from acsard.config.settings import Config, OdometryConfig, SimConfig
+from acsard.messages.schema import DiagnosticArray
+from tests.scenarios.world import World
+
+SKIDDING = SimConfig(
+    track_multiplier=1.6, track_rate_dependence=0.08, gyro_bias=0.01, gyro_noise=0.005
+)
+
+
+def world(sim: SimConfig = SKIDDING, gyro: bool = True) -> World:
+    """A robot that has stood for a while."""
+    made = World(Config(odometry=OdometryConfig(gyro=True), sim=sim))
+    made.gyro_dead = not gyro
+    made.run(1.5)
+    return made
+
+
+class Drive:
+    """What was turned, in truth and by odometry, whole turns counted."""
+
+    def __init__(self, made: World) -> None:
+        self.world, self.told, self.all = made, 0.0, 0.0
+        self._yaw, self._true = made.state.yaw, made.mcu.vehicle.turned
+        self._begun = self._true
+
+    def hold(self, linear: float, angular: float, seconds: float) -> None:
+        for _ in range(round(seconds * 20)):
+            self.world.hold(linear, angular, 0.05)
+            yaw, true = self.world.state.yaw, self.world.mcu.vehicle.turned
+            self.told += math.remainder(yaw - self._yaw, math.tau)
+            self.all += abs(true - self._true)
+            self._yaw, self._true = yaw, true
+
+    @property
+    def error(self) -> float:
+        """Of the heading, as a share of all that was turned."""
+        return abs(self.told - (self._true - self._begun)) / self.all
+
+
+def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
+    """A drive at random with a stop now and then, and at rest in the end."""
+    chance, drive, left = random.Random(seed), Drive(made), seconds
+    made.drive(0.0, 0.0, 0.2)
+    while left > 0.0:
+        linear, angular = chance.uniform(-0.3, 0.8), chance.uniform(-1.5, 1.5)
+        if chance.random() < 0.2:
+            linear = angular = 0.0
+        length = chance.uniform(1.0, 4.0)
+        drive.hold(linear, angular, length)
+        left -= length
+    drive.hold(0.0, 0.0, 1.5)
+    return drive
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turned(
+    seed: int,
+) -> None:
+    drive = wandering(world(), seed)
+    print(f"with a gyro {drive.error:.2%} of {drive.all:.1f} rad")
+    assert drive.error < 0.01
+    assert drive.world.state.gyro == "used"
+
+
+def test_to_turn_on_and_on_the_same_way_costs_no_more() -> None:
+    with_gyro, without = Drive(world()), Drive(world(gyro=False))
+    for drive in (with_gyro, without):
+        drive.world.drive(0.0, 0.0, 0.2)
+        drive.hold(0.2, 1.0, 30.0)
+        drive.hold(0.0, 0.0, 1.0)
+    print(f"turning on: gyro {with_gyro.error:.2%}, wheels {without.error:.0%}")
+    assert with_gyro.error < 0.01
+    assert without.error > 0.6
+
+
+def test_the_position_follows_the_truth_too() -> None:
+    made = world()
+    wandering(made, 3, seconds=30.0)
+    pose, truth = made.state, made.truth
+    assert math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.02 * made.loop.robot.travelled
+
+
+def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
+    made = world(SimConfig(track_multiplier=1.6, gyro_bias=0.01, gyro_delay=0.04))
+    wandering(made, 4)
+    message = made.loop.report.current("diagnostics", made.loop._look)
+    assert isinstance(message, DiagnosticArray)
+    (row,) = [status for status in message.status if status.name == "acsard: gyro"]
+    values = {pair.key: float(pair.value) for pair in row.values}
+    assert row.level == 0
+    assert values["bias_rad_s"] == pytest.approx(0.01, abs=1e-3)
+    assert values["delay_s"] == pytest.approx(0.036, abs=0.01)
+    assert values["wheel_separation_multiplier"] == 1.0
+    assert values["learned_multiplier"] == pytest.approx(1.6, rel=0.02)
+
+
+def test_a_gyro_that_dies_is_told_and_the_wheels_go_on() -> None:
+    made = world()
+    made.drive(0.3, 0.5, 1.0)
+    made.gyro_dead = True
+    before = made.state.yaw
+    made.hold(0.3, 0.5, 2.0)
+    assert made.state.gyro == "silent"
+    assert made.state.mode == "driving"
+    assert made.state.yaw - before == pytest.approx(1.0, abs=0.1)
+    made.gyro_dead = False
+    made.hold(0.3, 0.5, 1.0)
+    told = [event.text.partition(":")[0] for event in made.events if event.name == "gyro"]
+    assert told == ["waiting for rest", "used", "silent", "used"]
+
+
+def test_wheels_that_lose_their_grip_are_told() -> None:
+    made = world()
+    wandering(made, 5, seconds=20.0)
+    made.drive(0.0, 1.0, 2.0)
+    assert made.state.gyro == "used"
+    made.mcu.vehicle.turn_slip = 0.9
+    made.hold(0.0, 1.0, 0.5)
+    assert made.state.gyro == "disagrees"
+    drive = Drive(made)
+    drive.hold(0.0, 1.0, 3.0)
+    assert drive.error < 0.02
+
+
+def test_a_sample_that_cannot_be_is_counted_and_changes_nothing() -> None:
+    made = world()
+    made.put("imu", b'{"angular_velocity": {"z": 1e9}}')
+    made.put("imu", b'{"angular_velocity": {"z": NaN}}')
+    made.run(1.0)
+    assert made.state.counters["imu_absurd"] == 1
+    assert made.state.counters["imu_malformed"] == 1
+    assert made.state.gyro == "used"
+    assert made.state.yaw == 0.0
+
+
+def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
+    made = World()
+    made.run(1.0)
+    assert made.state.gyro == "off"
+    message = made.loop.report.current("diagnostics", made.loop._look)
+    assert isinstance(message, DiagnosticArray)
+    assert not [status for status in message.status if "gyro" in status.name]

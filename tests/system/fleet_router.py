@@ -1,0 +1,108 @@
+"""deploy/zenoh's router.json5 as a process: Python's Zenoh, `acsard router`, or zenohd itself."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from acsard.lan.authority import Authority
+from tests.system.harness import ROOT, Program, acsard
+from tests.system.strangers import words
+
+FILES = ROOT / "deploy" / "zenoh"
+ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
+
+ITS_NAME = "router.local"
+
+_ROUTER = """\
+import json, sys, time
+import zenoh
+
+config = zenoh.Config.from_file(sys.argv[1])
+for key, value in json.loads(sys.argv[2]).items():
+    config.insert_json5(key, json.dumps(value))
+storages = json.loads(config.get_json("plugins/storage_manager/storages"))
+last = {}
+
+def keep(sample):
+    last[str(sample.key_expr)] = sample
+
+def answer(query):
+    for key, sample in list(last.items()):
+        if query.key_expr.intersects(zenoh.KeyExpr(key)):
+            query.reply(
+                key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp
+            )
+
+session = zenoh.open(config)
+kept = [
+    declare(storage["key_expr"], act)
+    for storage in storages.values()
+    for declare, act in ((session.declare_subscriber, keep), (session.declare_queryable, answer))
+]
+print("routing", flush=True)
+time.sleep(600)
+"""
+"""A router with a configuration and changes to it; has no plugins, and acts like the storages."""
+
+
+def certified(where: Path, *names: str) -> None:
+    """A fleet's authority below `where`, and a certificate for each name in a directory of it."""
+    authority = Authority.make(where, "fleet", 1)
+    for name in names:
+        authority.issue(where / name, name, ["127.0.0.1"], 1.0)
+
+
+def tls_settings(own: Path) -> dict[str, object]:
+    """Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
+    return {
+        "root_ca_certificate": str(own / "ca.pem"),
+        "connect_certificate": str(own / "certificate.pem"),
+        "connect_private_key": str(own / "key.pem"),
+        "enable_mtls": True,
+    }
+
+
+def _changes(where: Path, endpoint: str) -> dict[str, object]:
+    """What differs from router.json5 here: the address, the files, no plugins."""
+    config = zenoh.Config.from_file(str(ROUTER_FILE))
+    tls = json.loads(config.get_json("transport/link/tls"))
+    for key, value in tls.items():
+        if isinstance(value, str):
+            tls[key] = str(where / ITS_NAME / Path(value).name)
+    return {
+        "listen/endpoints": [endpoint],
+        "transport/link/tls": {key: value for key, value in tls.items() if value is not None},
+        "plugins_loading/enabled": False,
+    }
+
+
+def router(where: Path, endpoint: str) -> Program:
+    """Python's Zenoh as the router; says "routing"."""
+    return Program(words(_ROUTER, ROUTER_FILE, json.dumps(_changes(where, endpoint))), where)
+
+
+def watched_router(where: Path, endpoint: str) -> Program:
+    """`acsard router` with the file; its log says when it listens."""
+    return Program(acsard("router", str(_file(where, endpoint))), where)
+
+
+def zenohd(where: Path, endpoint: str) -> Program:
+    """The real one, where it is on the PATH, without its plugins."""
+    program = shutil.which("zenohd")
+    if program is None:
+        pytest.skip("needs zenohd")
+    return Program([program, "-c", str(_file(where, endpoint))], where)
+
+
+def _file(where: Path, endpoint: str) -> Path:
+    config = zenoh.Config.from_file(str(ROUTER_FILE))
+    for key, value in _changes(where, endpoint).items():
+        config.insert_json5(key, json.dumps(value))
+    file = where / "router.json"
+    file.write_text(str(config))
+    return file

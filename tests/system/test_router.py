@@ -1,0 +1,82 @@
+"""`acsard router`: there again whatever ends it, until it is told to go."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.system.fleet_router import ITS_NAME, certified, watched_router
+from tests.system.harness import Program, acsard, children, finish, until
+from tests.system.identities import free_tls_endpoint
+
+pytestmark = [pytest.mark.network, pytest.mark.timeout(60)]
+
+
+def listens(program: Program, times: int = 1) -> None:
+    """It has opened so often."""
+    until(
+        lambda: sum("door_open" in line for line in list(program.err)) >= times,
+        10.0,
+        f"the router listens\n{program}",
+    )
+
+
+def the_router(program: Program) -> int:
+    """The process that may be lost."""
+    return until(lambda: children(program.pid, "--held"), 5.0, "its process")[0]
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+@pytest.fixture
+def where(tmp_path: Path) -> Path:
+    certified(tmp_path, ITS_NAME)
+    return tmp_path
+
+
+def test_one_that_is_killed_is_there_again(where: Path) -> None:
+    with watched_router(where, free_tls_endpoint()) as router:
+        listens(router)
+        first = the_router(router)
+        os.kill(first, signal.SIGKILL)
+        listens(router, 2)
+        assert the_router(router) != first
+        assert "was ended by signal 9" in router.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
+    with watched_router(where, free_tls_endpoint()) as router:
+        listens(router)
+        inner = the_router(router)
+        router.signal(number)
+        assert router.ended(5.0) == (-number if number == signal.SIGKILL else 0)
+        until(lambda: gone(inner), 5.0, "nothing of it is left")
+
+
+def test_a_taken_address_is_told_and_tried_again(where: Path) -> None:
+    endpoint = free_tls_endpoint()
+    host, _, port = endpoint.removeprefix("tls/").rpartition(":")
+    with (
+        socket.create_server((host, int(port))) as other,
+        watched_router(where, endpoint) as router,
+    ):
+        until(lambda: "ended with 75" in router.stderr, 10.0, "it tells")
+        assert f"cannot listen on {endpoint}" in router.stderr
+        other.close()
+        listens(router)
+
+
+@pytest.mark.parametrize("text", ["{ mode", '{ mode: "peer" }'])
+def test_what_is_no_routers_file_is_refused_at_once(tmp_path: Path, text: str) -> None:
+    (tmp_path / "zenoh.json5").write_text(text)
+    done = finish(acsard("router", "zenoh.json5"), tmp_path)
+    assert done.code == 2
+    assert "zenoh.json5" in done.err
+    assert "Traceback" not in done.err

@@ -1,0 +1,119 @@
+"""What is true of the simulated robot, beside what the daemon believes, on a real bus."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Header, Imu, Quaternion, Vector3
+from acsard.ros.attachments import Attachment
+from acsard.ros.names import rmw_key
+from tests.system.harness import Bus, Daemon, Peer, seconds, until
+
+SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
+
+
+@pytest.fixture(scope="module")
+def skidding(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
+    """A client of a daemon whose simulated robot turns less than its wheels say."""
+    where = tmp_path_factory.mktemp("skidding")
+    with Daemon(where, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        yield bus
+
+
+def yaw(pose: Any) -> float:
+    turn = pose["orientation"]
+    return 2 * math.atan2(turn["z"], turn["w"])
+
+
+def test_the_truth_is_another_than_odometry_by_what_the_robot_truly_is(skidding: Bus) -> None:
+    with skidding.commanding(0.0, 1.0):
+        until(lambda: skidding.state()["yaw"] > 1.6, 10.0, "most of a quarter turn")
+    skidding.at_rest()
+    believed = yaw(skidding.get("odom")["pose"]["pose"])
+    assert yaw(skidding.get("sim/pose")["pose"]) == pytest.approx(believed / 1.6, rel=0.02)
+
+
+def test_the_truth_comes_a_hundred_times_a_second_with_the_time_of_each_look(
+    skidding: Bus,
+) -> None:
+    with skidding.follow("sim/pose") as poses:
+        until(lambda: len(poses.seen) > 50, 5.0, "half a second of looks")
+        stamps = [seconds(seen.value["header"]["stamp"]) for seen in list(poses.seen)]
+    apart = [b - a for a, b in itertools.pairwise(stamps)]
+    assert apart == pytest.approx([0.01] * len(apart), abs=1e-4)
+    assert {seen.value["header"]["frame_id"] for seen in list(poses.seen)} == {"sim"}
+
+
+def test_where_there_is_a_real_port_nobody_has_the_truth(tmp_path: Path, peer: Peer) -> None:
+    with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        assert bus.ask("sim/pose") == []
+        assert not [row for row in bus.get("topics")["topics"] if "sim" in row["key"]]
+
+
+# the gyro
+
+
+def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}
+    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["gyro"] == "used", 10.0, "the gyro is used")
+        with bus.follow("imu") as said, bus.commanding(0.0, 1.0):
+            until(lambda: bus.state()["yaw"] > 1.0, 10.0, "a turn")
+        bus.at_rest()
+        believed = yaw(bus.get("odom")["pose"]["pose"])
+        assert yaw(bus.get("sim/pose")["pose"]) == pytest.approx(believed, rel=0.03)
+        assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
+
+
+TURNING = {"angular_velocity": {"z": 0.0}}
+
+
+def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
+    tmp_path: Path, peer: Peer
+) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    with Daemon(tmp_path, port=peer.path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        assert bus.state()["gyro"] == "silent"
+
+        def used() -> bool:
+            bus.put("imu", TURNING)
+            return bool(bus.state()["gyro"] == "used")
+
+        until(used, 20.0, "the gyro is used")
+
+        def refused(value: object, reason: str) -> bool:
+            bus.put("imu", value)  # at most one a millisecond is let in
+            return bus.count(f"imu_{reason}") > 0
+
+        for value, reason in (
+            ({"angular_velocity": {"z": 51.0}}, "absurd"),
+            ({"linear_acceleration": {"z": 9.8}}, "wrong_shape"),
+        ):
+            until(lambda: refused(value, reason), 5.0, f"{reason} is counted")  # noqa: B023
+        assert [e for e in daemon.events("imu_refused") if e["level"] == "warning"]
+
+
+def test_a_gyro_of_ros_is_heard_on_either_transport(tmp_path: Path, peer: Peer) -> None:
+    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
+    sample = Imu(
+        Header(), Quaternion(), [0.0] * 9, Vector3(z=51.0), [0.0] * 9, Vector3(), [0.0] * 9
+    )
+    with Daemon(tmp_path, port=peer.path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        rmw = rmw_key(0, "/imu/data", "sensor_msgs/msg/Imu")
+        attachment = Attachment(1, 10**18, bytes(range(16))).pack()
+        bus.session.put("imu/data", encode(sample, "cdr"))
+        until(lambda: bus.count("imu_absurd") == 1, 5.0, "the bridge's is heard")
+        bus.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
+        until(lambda: bus.count("imu_absurd") == 2, 5.0, "rmw_zenoh's is heard")

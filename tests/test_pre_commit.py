@@ -1,0 +1,65 @@
+"""What git runs before a commit, once `pre-commit install` was typed: every check, by `.venv`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+CHECKS = ["ruff check .", "ruff format --check .", "mypy", "lint-imports"]
+
+TOOL = """\
+#!/bin/sh
+echo "${{0##*/}}${{*:+ $*}}" >>"{log}"
+"""
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A repository with the hooks and, in the place of the tools, what writes down its call."""
+    if shutil.which("git") is None:
+        pytest.skip("no git")
+    place = tmp_path / "clone"
+    (place / ".venv/bin").mkdir(parents=True)
+    for name in {check.split()[0] for check in CHECKS}:
+        tool = place / ".venv/bin" / name
+        tool.write_text(TOOL.format(log=tmp_path / "log"))
+        tool.chmod(0o755)
+    (place / ".gitignore").write_text(".venv/\n")
+    shutil.copy(ROOT / ".pre-commit-config.yaml", place)
+    run(place, "git", "init", "--quiet")
+    run(place, "git", "add", ".")
+    run(place, sys.executable, "-m", "pre_commit", "install")
+    return place
+
+
+def run(place: Path, *words: str) -> None:
+    """In an environment whose PATH has no tool of ours, by a git that knows nobody."""
+    env = {"PATH": os.defpath, "HOME": str(place.parent), "PRE_COMMIT_HOME": str(place.parent)}
+    for who in ("AUTHOR", "COMMITTER"):
+        env |= {f"GIT_{who}_NAME": "a", f"GIT_{who}_EMAIL": "a@example.org"}
+    done = subprocess.run(
+        words, cwd=place, env=env, capture_output=True, text=True, timeout=60.0, check=False
+    )
+    assert done.returncode == 0, done
+
+
+@pytest.mark.parametrize("name", ["acsard/new.py", "pyproject.toml"])
+def test_a_commit_of_code_or_of_the_contract_runs_every_check(clone: Path, name: str) -> None:
+    (clone / name).parent.mkdir(exist_ok=True)
+    (clone / name).write_text("")
+    run(clone, "git", "add", name)
+    run(clone, "git", "commit", "--message", "one")
+    assert (clone.parent / "log").read_text().splitlines() == CHECKS
+
+
+def test_these_are_the_checks_that_a_change_must_pass() -> None:
+    told = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert re.findall(r"^\.venv/bin/((?:ruff|mypy|lint-imports).*)$", told, re.M) == CHECKS

@@ -1,0 +1,143 @@
+"""Simulated skid-steer robots and the logs they leave: nothing here is of the code under test.
+
+The truth is integrated in steps of 5 ms. Wheels are reported at 100 Hz in two decimals, as means
+of their period; the gyro at its own rate, late, with bias and noise; positions at 5 Hz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+RADIUS, SEPARATION = 0.05, 0.30
+STEP = 0.005
+
+Plan = list[tuple[float, float, float]]
+"""(seconds, m/s, rad/s) as the wheels are told, for a robot that does not skid."""
+
+GUIDED: Plan = [
+    (3, 0, 0), (6, 0.4, 0), (1, 0, 0), (8, 0, 1.5), (1, 0, 0), (8, 0, -1.5), (1, 0, 0),
+    (6, -0.4, 0), (6, 0.3, 0.8), (6, 0.3, -0.8), (8, 0, 0.8), (8, 0, -0.8), (6, 0.4, 0),
+    (6, 0.4, 0.4), (6, 0.4, -0.4), (3, 0, 0),
+]  # fmt: skip
+"""83 s: what a person would be told to drive."""
+
+
+def wander(rng: np.random.Generator, seconds: float) -> Plan:
+    """A random drive with stops."""
+    plan: Plan = [(2.0, 0.0, 0.0)]
+    while sum(part[0] for part in plan) < seconds:
+        lasts = float(rng.uniform(1.0, 4.0))
+        v, w = float(rng.uniform(-0.3, 0.6)), float(rng.uniform(-1.6, 1.6))
+        plan.append((lasts, v, w) if rng.random() > 0.15 else (1.5, 0.0, 0.0))
+    return plan
+
+
+@dataclass
+class Robot:
+    """What is true of one robot and its sensors."""
+
+    chi: float = 1.6
+    """Effective track over wheel separation, when it turns slowly."""
+    rate: float = 0.08
+    """Its growth for each rad/s."""
+    left: float = 0.998
+    right: float = 1.002
+    bias: float = 0.01
+    gyro_noise: float = 0.01
+    gyro_hz: float = 100.0
+    late: float = 0.02
+    place_noise: float = 0.01
+    place_hz: float = 5.0
+    outliers: float = 0.02
+    lever: complex = 0.05 + 0.02j
+    slip: float = 0.01
+    """Standard deviation of what each wheel side loses, as a share, for a second or so."""
+    decimals: int = 2
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+
+@dataclass
+class Drive:
+    """A log, and what was true while it was made, at the wheels' times."""
+
+    t: Floats
+    left: Floats
+    right: Floats
+    gyro_t: Floats
+    gyro: Floats
+    place_t: Floats
+    place: npt.NDArray[np.complex128]
+    yaw: Floats
+    """True heading at the wheels' times, rad."""
+    where: npt.NDArray[np.complex128]
+
+    def csv(self, *, gyro: bool = True, places: bool = True, run: str = "") -> str:
+        """As a file: a row for each sample of each sensor, in order of time."""
+        rows = [(t, f"{t:.6f},{a:.2f},{b:.2f},,,") for t, a, b in
+                zip(self.t, self.left, self.right, strict=True)]  # fmt: skip
+        if gyro:
+            pairs = zip(self.gyro_t, self.gyro, strict=True)
+            rows += [(t, f"{t:.6f},,,{w:.6f},,") for t, w in pairs]
+        if places:
+            spots = zip(self.place_t, self.place, strict=True)
+            rows += [(t, f"{t:.6f},,,,{p.real:.4f},{p.imag:.4f}") for t, p in spots]
+        rows.sort()
+        return "t,left,right,yaw_rate,x,y,run\n" + "\n".join(f"{r},{run}" for _, r in rows) + "\n"
+
+
+def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
+    """The log of a plan."""
+    rng = robot.rng
+    v, w = _smooth(plan)
+    count = len(v)
+    left = (v - w * SEPARATION / 2) / RADIUS
+    right = (v + w * SEPARATION / 2) / RADIUS
+    slips = [_slow_noise(rng, count, robot.slip) for _ in range(2)]
+    fast = RADIUS * robot.left * left * (1 - slips[0])
+    quick = RADIUS * robot.right * right * (1 - slips[1])
+    turn = (quick - fast) / (SEPARATION * robot.chi)
+    for _ in range(5):
+        turn = (quick - fast) / (SEPARATION * robot.chi * (1 + robot.rate * np.abs(turn)))
+    yaw = np.concatenate(([0.0], np.cumsum(turn) * STEP))
+    ahead = np.exp(1j * (yaw[:-1] + turn * STEP / 2))
+    where = np.concatenate(([0.0 + 0.0j], np.cumsum((fast + quick) / 2 * ahead) * STEP))
+    times = np.arange(count + 1) * STEP
+    every = 2
+    ends = np.arange(every, count + 1, every)
+    shown_left, shown_right = (
+        np.round(side[: len(ends) * every].reshape(-1, every).mean(axis=1), robot.decimals)
+        for side in (left, right)
+    )
+    gyro_t = np.arange(0.003, times[-1], 1 / robot.gyro_hz)
+    gyro = np.interp(gyro_t - robot.late, times[:-1] + STEP / 2, turn) + robot.bias
+    gyro += rng.normal(0.0, robot.gyro_noise, len(gyro_t))
+    place_t = np.arange(0.1, times[-1], 1 / robot.place_hz)
+    seen = where + robot.lever * np.exp(1j * yaw)
+    place = np.interp(place_t - robot.late, times, seen)
+    place += rng.normal(0, robot.place_noise, (len(place_t), 2)) @ np.array([1, 1j])
+    wild = rng.random(len(place_t)) < robot.outliers
+    place[wild] += rng.normal(0, 2.0, (int(wild.sum()), 2)) @ np.array([1, 1j])
+    place = 12.0 - 7.0j + place * np.exp(0.7j)
+    return Drive(
+        np.asarray(times[ends] - every * STEP / 2 + start), shown_left, shown_right,
+        gyro_t + start, gyro, place_t + start, place, yaw[ends], where[ends],
+    )  # fmt: skip
+
+
+def _smooth(plan: Plan) -> tuple[Floats, Floats]:
+    """The plan with ramps of 0.3 s."""
+    v = np.concatenate([np.full(round(s / STEP), v) for s, v, _ in plan])
+    w = np.concatenate([np.full(round(s / STEP), w) for s, _, w in plan])
+    kernel = np.full(60, 1 / 60)
+    return np.convolve(v, kernel)[: len(v)], np.convolve(w, kernel)[: len(w)]
+
+
+def _slow_noise(rng: np.random.Generator, count: int, deviation: float) -> Floats:
+    knots = np.arange(0, count * STEP + 2, 1.0)
+    values = np.interp(np.arange(count) * STEP, knots, rng.normal(0, deviation, len(knots)))
+    return np.asarray(values)

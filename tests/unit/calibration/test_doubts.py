@@ -1,0 +1,79 @@
+"""What is wrong with a log is named: every sign, side and unit on whole logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acsard.calibration.doubts import RefusedError, in_range, remarks
+from tests.unit.calibration.cut import BASE, calibrated, usual
+
+DRIVE = usual()
+WRONG = {
+    "gyro": replace(DRIVE, gyro=-DRIVE.gyro),
+    "sides": replace(DRIVE, left=DRIVE.right, right=DRIVE.left),
+    "left": replace(DRIVE, left=-DRIVE.left),
+    "right": replace(DRIVE, right=-DRIVE.right),
+    "ahead": replace(DRIVE, left=-DRIVE.left, right=-DRIVE.right),
+    "mirror": replace(DRIVE, place=DRIVE.place.conj()),
+    "degrees": replace(DRIVE, gyro=np.degrees(DRIVE.gyro)),
+    "m/s": replace(DRIVE, left=DRIVE.left * 0.05, right=DRIVE.right * 0.05),
+    "rpm": replace(DRIVE, left=DRIVE.left * 9.55, right=DRIVE.right * 9.55),
+    "mm": replace(DRIVE, place=DRIVE.place * 1000),
+    "later": replace(DRIVE, gyro_t=DRIVE.gyro_t + 5.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("what", "gyro", "places", "words"),
+    [
+        ("gyro", True, False, "positive to the left"),
+        ("gyro", True, True, "yaw_rate has the wrong sign"),
+        ("sides", True, False, "left and right are swapped"),
+        ("sides", False, True, "left and right are swapped"),
+        ("sides", True, True, "left and right are swapped"),
+        ("ahead", True, True, "ahead is negative on both sides"),
+        ("left", True, False, "the left wheels turn backwards"),
+        ("left", False, True, "the left wheels turn backwards"),
+        ("right", True, False, "the right wheels turn backwards"),
+        ("right", False, True, "the right wheels turn backwards"),
+        ("mirror", True, True, "y is positive to the right"),
+        ("mirror", False, True, "y is positive to the right"),
+        ("degrees", True, False, "yaw_rate is in degrees"),
+        ("m/s", True, False, "wheel speeds are in m/s"),
+        ("m/s", False, True, "wheel speeds are in m/s"),
+        ("rpm", True, False, "rpm"),
+        ("rpm", False, True, "rpm"),
+        ("mm", False, True, "mm or cm"),
+        ("later", True, False, "does not follow what the wheels do"),
+    ],
+)
+def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: str) -> None:
+    with pytest.raises(RefusedError) as refused:
+        calibrated(WRONG[what].csv(gyro=gyro, places=places))
+    assert words in str(refused.value)
+
+
+def test_positions_of_another_drive_are_refused() -> None:
+    x, y = np.random.default_rng(1).normal(size=(2, len(DRIVE.place)))
+    still = replace(DRIVE, place=x + 1j * y)
+    with pytest.raises(RefusedError, match="positions"):
+        calibrated(still.csv(gyro=False))
+
+
+def test_multipliers_that_cannot_be_written_are_refused() -> None:
+    in_range(np.array([2.51, 1.0, 1.0]))
+    with pytest.raises(RefusedError, match=r"from 0\.1 to 10"):
+        in_range(np.array([12.0, 1.0, 1.0]))
+
+
+def test_what_is_unusual_is_told() -> None:
+    told = list(
+        remarks({"yaw_rate": 0.6}, 0.2, np.ones(5), np.array([5.0, 2, 2]), BASE, sized=True)
+    )
+    assert len(told) == 5
+    assert not list(
+        remarks({"x": 0.001}, 0.0, np.array([1.0, -1]), np.array([1.6, 1, 1]), BASE, sized=True)
+    )

@@ -1,0 +1,56 @@
+"""What improves is measured on what was left out of the fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.fit import fit
+from acsard.calibration.gain import constant, folds, gain, seen_by_places
+from acsard.calibration.multipliers import Rates
+from tests.unit.calibration.cut import BASE, ideal, ready
+
+RATE = Rates(0.5, 1.0)
+
+
+def test_every_block_is_left_out_once() -> None:
+    made = ready(ideal().csv(places=False))
+    fitted = fit(made.sources, made.start, places=False)
+    held = [one.blocks for one in folds(fitted, made.parts, RATE)]
+    assert len(held) == 5
+    assert np.sum(held, axis=0).tolist() == [1] * len(made.parts)
+
+
+def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
+    made = ready(ideal().csv())
+    fitted = fit(made.sources, made.start, places=True)
+    better = gain(
+        fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, made.spots, made.grids
+    )
+    assert better.turn.now == pytest.approx(0.6 * 360, rel=0.02)
+    assert better.turn.then is not None
+    assert better.turn.then < 1.0
+    assert better.place.now is not None
+    assert better.place.then is not None
+    assert better.place.then < better.place.now / 10
+
+
+def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
+    made = ready(ideal().csv(places=False))
+    fitted = fit(made.sources, made.start, places=False)
+    better = gain(
+        fitted, BASE, made.parts, RATE, made.rows, np.zeros_like(made.rows.turned), [], []
+    )
+    assert (better.turn.now, better.place.then) == (None, None)
+
+
+def test_positions_tell_how_far_it_turned() -> None:
+    made = ready(ideal().csv(gyro=False))
+    fitted = fit(made.sources, made.start, places=True)
+    seen, true = seen_by_places(fitted, made.rows, BASE), ready(ideal().csv()).rows.turned
+    assert np.abs(seen).sum() == pytest.approx(np.abs(true).sum(), rel=0.1)
+
+
+def test_one_track_for_all_rates_turns_as_far_at_the_mean_rate() -> None:
+    fixed = constant(np.array([1, 1, 0.6, 0.1, 0, 0, 0]), RATE)
+    assert fixed.tolist() == pytest.approx([1, 1, 0.6 * 0.95, 0, 0, 0, 0])

@@ -1,0 +1,76 @@
+"""The gyro's bias and time, and the rows that come of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acsard.calibration.heading import of_gyro, of_yaw, rows
+from acsard.calibration.paths import blocks, wheels
+from acsard.calibration.table import LogError
+from tests.unit.calibration.cut import log_of, usual
+from tests.unit.calibration.robots import GUIDED, Drive
+
+
+def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
+    runs = log_of(drive.csv(places=False)).runs
+    angles = [wheels(run) for run in runs]
+    return runs, angles, of_gyro(runs, angles)
+
+
+def test_the_bias_is_found_at_rest() -> None:
+    assert headings_of(usual())[2].bias == pytest.approx(0.01, abs=0.001)
+
+
+def test_without_a_rest_the_bias_is_left_to_the_fit() -> None:
+    moving = [part for part in GUIDED if part[1] or part[2]]
+    assert headings_of(usual(plan=moving))[2].drifts
+
+
+@pytest.mark.parametrize("late", [-0.7, 0.0, 0.05, 1.2])
+def test_the_time_offset_is_found(late: float) -> None:
+    drive = usual()
+    shifted = replace(drive, gyro_t=drive.gyro_t + late)
+    assert headings_of(shifted)[2].late == pytest.approx(late + 0.02, abs=0.005)
+
+
+def test_a_reversed_side_does_not_hide_the_time_offset() -> None:
+    drive = usual()
+    assert headings_of(replace(drive, left=-drive.left))[2].late == pytest.approx(0.02, abs=0.02)
+
+
+def test_a_gyro_that_says_the_same_always_is_refused() -> None:
+    drive = usual()
+    with pytest.raises(LogError, match="same in every row"):
+        headings_of(replace(drive, gyro=drive.gyro * 0))
+
+
+def test_rows_say_what_was_turned() -> None:
+    drive = usual()
+    runs, angles, headings = headings_of(drive)
+    found = rows(headings, runs, angles, blocks(runs, angles, 4.0))
+    assert np.abs(found.turned).sum() == pytest.approx(np.abs(np.diff(drive.yaw)).sum(), rel=0.03)
+
+
+def test_no_row_spans_a_gap_of_the_gyro() -> None:
+    drive = usual()
+    kept = (drive.gyro_t < 30) | (drive.gyro_t > 40)
+    runs, angles, headings = headings_of(
+        replace(drive, gyro_t=drive.gyro_t[kept], gyro=drive.gyro[kept])
+    )
+    found = rows(headings, runs, angles, blocks(runs, angles, 4.0))
+    assert 61 <= found.seconds.sum() <= 74
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_degrees_are_told_from_radians(wrapped: bool) -> None:
+    drive = usual()
+    yaw = np.degrees(drive.yaw)
+    yaw = (yaw + 180) % 360 - 180 if wrapped else yaw
+    lines = [f"{t:.3f},{a},{b},{w:.3f}"
+             for t, a, b, w in zip(drive.t, drive.left, drive.right, yaw, strict=True)]  # fmt: skip
+    runs = log_of("t,left,right,yaw\n" + "\n".join(lines)).runs
+    with pytest.raises(LogError, match="degrees"):
+        of_yaw(runs, [wheels(run) for run in runs], 0.05 / 0.3)

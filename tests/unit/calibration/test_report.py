@@ -1,0 +1,42 @@
+"""The three forms of a calibration agree."""
+
+from __future__ import annotations
+
+import msgspec
+
+from acsard.calibration.report import NAMES, keys, report, text
+from acsard.config.parsing import parse
+from acsard.config.settings import DriveConfig
+from acsard.config.writing import excerpt
+from tests.unit.calibration.cut import calibrated, usual
+
+FOUND = calibrated(usual().csv(places=False))
+REPORT = report("a.csv", FOUND, DriveConfig(), "")
+
+
+def test_the_object_has_every_parameter_with_its_deviation() -> None:
+    made = msgspec.to_builtins(REPORT)
+    for name, value, std in zip(NAMES, FOUND.found.values, FOUND.found.std, strict=True):
+        assert (made[name], made[f"{name}_std"]) == (value, std)
+    assert made["effective_track"] == made["wheel_separation_multiplier"] * 0.3
+    assert made["turn_error_before"] > 200 > 30 > made["turn_error_after"]
+    assert made["refused"] is None
+
+
+def test_the_lines_are_a_configuration_with_what_was_found() -> None:
+    made = parse("\n".join(excerpt(keys(FOUND))).encode())
+    assert made.drive.wheel_separation_multiplier == round(REPORT.wheel_separation_multiplier, 5)
+    for name, value in REPORT.odometry.items():
+        assert getattr(made.odometry, name) == value > 0.0
+
+
+def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
+    assert "distance_scale_std" not in REPORT.odometry
+
+
+def test_people_are_told_what_it_improves_and_what_remains() -> None:
+    told = text(REPORT, FOUND, "acsard.toml")
+    assert f"a turn of 360 deg ends {REPORT.turn_error_before:.0f} deg off now" in told
+    assert "what remains" in told
+    assert "--distance METRES" in told
+    assert all(len(line) <= 110 for line in told.splitlines())

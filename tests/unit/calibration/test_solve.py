@@ -1,0 +1,159 @@
+"""Robots each way: the heading improves, and the standard deviations cover the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.solve import Calibration
+from acsard.calibration.tape import Tape
+from tests.unit.calibration.cut import calibrated, usual
+from tests.unit.calibration.robots import (
+    GUIDED,
+    RADIUS,
+    SEPARATION,
+    Drive,
+    Floats,
+    Robot,
+    drive,
+    wander,
+)  # fmt: skip
+
+WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
+
+FEW, MANY = 4, 20
+
+each_way = pytest.mark.parametrize("way", WAYS)
+so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+
+
+@cache
+def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
+    """Each robot's calibration, and a random drive of five minutes that it never saw."""
+    gyro, places = WAYS[way]
+    made = []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        robot = Robot(rng=rng)
+        plan = GUIDED if seed % 2 else wander(rng, 80.0)
+        log = drive(robot, plan).csv(gyro=gyro, places=places)
+        made.append((calibrated(log), drive(robot, wander(rng, 300.0))))
+    return made
+
+
+def off(seen: Drive, values: Floats) -> float:
+    """rad rms by which the heading is off after 10 s."""
+    track, left, right = values
+    turns = (right * seen.right - left * seen.left) * RADIUS / (SEPARATION * track) * 0.01
+    ends = np.arange(0, len(turns), 1000)
+    error = np.diff(np.cumsum(turns)[ends]) - np.diff(seen.yaw[ends])
+    return float(np.sqrt(np.mean(error**2)))
+
+
+@so_many
+@each_way
+def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:
+    better = [off(d, np.ones(3)) / off(d, c.found.values) for c, d in robots(way, count)]
+    print(f"{way}: heading {min(better):.1f} to {max(better):.1f} times better")
+    assert min(better) >= 10
+
+
+@so_many
+@each_way
+def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
+    """The track from its slowest turn to a fast one; both radii, or left to right by a gyro."""
+    found = [c.found for c, _ in robots(way, count)]
+    z = [(f.values[0] - 1.6 * (1 + 0.08 * rate)) / f.std[0] for f in found for rate in (0, 0.5, 1)]
+    for index, true in ((1, 0.998), (2, 1.002)):
+        z += [(f.values[index] - true) / f.std[index] for f in found]
+    rms = np.sqrt(np.mean(np.square(z)))
+    print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
+    # Of the few one more than one in twenty may be chance.
+    assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
+
+
+@so_many
+@each_way
+def test_what_is_said_to_remain_is_what_remains(way: str, count: int) -> None:
+    for c, _ in robots(way, count):
+        assert c.gain.turn.now == pytest.approx(240, abs=25)
+        assert c.gain.turn.then is not None
+        assert c.gain.turn.then < 24
+
+
+@so_many
+def test_bias_and_time_offset_are_told(count: int) -> None:
+    for c, _ in robots("gyro", count):
+        assert c.bias == pytest.approx(0.01, abs=0.002)
+        assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
+
+
+def test_a_tape_measures_the_wheels() -> None:
+    robot = Robot(left=0.948, right=0.952, rng=np.random.default_rng(2))
+    straight = drive(robot, [(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
+    text = drive(robot, GUIDED).csv(places=False, run="turns")
+    text += straight.csv(places=False, run="straight").partition("\n")[2]
+    made = calibrated(text, Tape(abs(straight.where[-1])))
+    z = (made.found.values[1:] - [0.948, 0.952]) / made.found.std[1:]
+    assert np.all(np.abs(z) < 3)
+    assert made.found.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
+    assert made.scale == "distance"
+
+
+@each_way
+def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
+    gyro, places = WAYS[way]
+    rng = np.random.default_rng(5)
+    made = drive(Robot(slip=0.05, rng=rng), wander(rng, 120.0))
+    found = calibrated(made.csv(gyro=gyro, places=places)).found
+    assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
+
+
+def test_coarse_positions_are_compared_over_a_longer_time() -> None:
+    rng = np.random.default_rng(5)
+    made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
+    found = calibrated(made.csv(gyro=False)).found
+    assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
+
+
+def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
+    made = drive(Robot(rng=np.random.default_rng(4)), [(200, 0, 0), *GUIDED, (100, 0, 0)], 1.7e9)
+    head, *body = made.csv(places=False).splitlines()
+    mixed = list(np.random.default_rng(1).permutation(body + body[:500]))
+    plain = calibrated("\n".join([head, *body])).found
+    other = calibrated("\n".join([head, *mixed])).found
+    assert np.allclose(plain.values, other.values, atol=1e-9)
+
+
+def test_gaps_and_jumps_are_told_and_cost_little() -> None:
+    made = usual()
+    kept = np.sin(made.t / 7) > -0.6
+    jumped = made.place + np.where(made.place_t > 40, 30 - 20j, 0)
+    torn = replace(made, t=made.t[kept], left=made.left[kept], right=made.right[kept], place=jumped)
+    found = calibrated(torn.csv())
+    assert any("gaps" in note for note in found.notes)
+    assert any("jump" in note for note in found.notes)
+    assert found.found.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [[(3, 0, 0), (30, 0.3, 0)], [(3, 0, 0), (40, 0, 1)], [(3, 0, 0), (60, 0.3, 0.8)], [(60, 0, 0)]],
+)
+@each_way
+def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
+    gyro, places = WAYS[way]
+    with pytest.raises(RefusedError, match="drive 60 s"):
+        calibrated(drive(Robot(), plan).csv(gyro=gyro, places=places))  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_million_rows_are_calibrated_with() -> None:
+    rng = np.random.default_rng(1)
+    text = drive(Robot(rng=rng), wander(rng, 4900.0)).csv()
+    assert text.count("\n") > 1_000_000
+    assert calibrated(text).found.values[0] == pytest.approx(1.6 * 1.045, rel=0.02)

@@ -1,0 +1,38 @@
+"""A tape tells how large the wheels are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.multipliers import Multipliers
+from acsard.calibration.tape import TAPE_M, Tape, Way, scaled
+
+FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
+NAMES = ("turns", "straight")
+
+
+def follow(values: np.ndarray, number: int) -> Way:
+    """5 m for wheels as configured, or 9 m that end where they began."""
+    size = float(values[1:].mean())
+    return Way(5.0 * size, 5.0 * size) if number else Way(0.1 * size, 9.0 * size)
+
+
+def test_the_scale_is_the_tape_s_and_nothing_else_changes() -> None:
+    made, run = scaled(FOUND, Tape(5.1), NAMES, follow, known=False)
+    assert run == "straight"
+    assert made.values == pytest.approx(FOUND.values * 1.02, rel=1e-4)
+    assert made.std[1] / made.values[1] == pytest.approx(np.hypot(TAPE_M / 5.1, 7e-4), rel=0.2)
+
+
+def test_positions_that_know_better_give_way_little() -> None:
+    sure = Multipliers(FOUND.values, FOUND.covariance * 1e-6)
+    made, _ = scaled(sure, Tape(5.1), NAMES, follow, known=True)
+    assert made.values == pytest.approx(FOUND.values, rel=1e-3)
+
+
+@pytest.mark.parametrize(("run", "words"), [("turns", "from where it began"), ("no", "no run")])
+def test_a_run_that_gets_nowhere_is_refused(run: str, words: str) -> None:
+    with pytest.raises(RefusedError, match=words):
+        scaled(FOUND, Tape(5.0, run), NAMES, follow, known=False)

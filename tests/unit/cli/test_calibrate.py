@@ -1,0 +1,103 @@
+"""`acsard calibrate` in this process, on files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from acsard.cli import calibrate
+from acsard.config.parsing import parse
+from acsard.host.exits import Exit, ExitError
+from tests.unit.calibration.cut import usual
+
+GOOD = usual().csv(places=False)
+
+
+def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
+    """The exit code of `acsard calibrate --log drive.csv` with these words."""
+    (where / "acsard.toml").write_text(text)
+    (where / "drive.csv").write_text(log)
+    parser = argparse.ArgumentParser()
+    calibrate.add(parser.add_subparsers())
+    given = ["calibrate", "--log", str(where / "drive.csv"), "--config", str(where / "acsard.toml")]
+    args = parser.parse_args([*given, *words])
+    return int(args.main(args))
+
+
+def test_people_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(tmp_path, GOOD) == 0
+    out = capsys.readouterr().out
+    assert "wheel_separation_multiplier" in out
+    assert "a turn of 360 deg ends" in out
+    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
+
+
+def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(tmp_path, GOOD, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert 1.5 < found["wheel_separation_multiplier"] < 1.8
+    assert found["way"] == "yaw_rate"
+
+
+def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(tmp_path, GOOD, "--write", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    text = (tmp_path / "acsard.toml").read_text()
+    assert text.startswith("# mine\n")
+    config = parse(text.encode())
+    for name in ("wheel_separation", "left_wheel_radius", "right_wheel_radius"):
+        key = f"{name}_multiplier"
+        assert getattr(config.drive, key) == pytest.approx(found[key], abs=1e-5)
+        assert getattr(config.odometry, f"{key}_std") == found["odometry"][f"{key}_std"]
+    assert called(tmp_path, GOOD, "--json", text=text) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["turn_error_before"] < 12
+    assert again["wheel_separation_multiplier"] == pytest.approx(
+        found["wheel_separation_multiplier"], rel=1e-3
+    )
+
+
+def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
+    metres = 1.1 * abs(straight.where[-1])
+    log = usual().csv(places=False, run="turns")
+    log += straight.csv(places=False, run="straight").partition("\n")[2]
+    words = ["--distance", "straight=" + f"{metres:.3f}", "--write", "--json"]
+    assert called(tmp_path, log, *words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scale"] == "distance"
+    assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
+    written = parse((tmp_path / "acsard.toml").read_bytes())
+    assert written.drive.left_wheel_radius_multiplier == pytest.approx(1.1, rel=0.02)
+    # How sure the tape is of all distances is said apart: it makes no heading doubtful.
+    deviations = found["odometry"]
+    assert written.odometry.distance_scale_std == deviations["distance_scale_std"] > 0.0
+
+
+def test_a_refusal_ends_with_failure_and_an_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ExitError, match="column") as end:
+        called(tmp_path, "a,b\n1,2\n", "--json", "--write")
+    assert end.value.code == Exit.FAILURE
+    assert "column" in json.loads(capsys.readouterr().out)["refused"]
+    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
+
+
+def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    calibrate.add(parser.add_subparsers())
+    args = parser.parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
+    with pytest.raises(ExitError, match="correct --log"):
+        args.main(args)
+
+
+@pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])
+def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
+    with pytest.raises(SystemExit):
+        called(tmp_path, GOOD, f"--distance={word}")

@@ -1,0 +1,74 @@
+"""A usual screen of `acsard top`, as it is read and as it is sent to a terminal."""
+
+from __future__ import annotations
+
+import io
+
+from msgspec.structs import replace
+from rich.console import Console
+
+from acsard.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
+from acsard.runtime.figures import NAMES
+from acsard.top.seen import Seen
+from acsard.top.view import screen
+
+MEASURED = Figure(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
+UNMEASURED = Figure(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))
+
+STATE = RobotState(
+    stamp=Time(1000, 0),
+    mode="driving",
+    reason="driving: commanded by app",
+    x=1.25,
+    y=-0.5,
+    yaw=1.0,
+    linear=0.5,
+    angular=-0.6,
+    wheels=[8.0, 12.0, 12.5, -7.5],
+    link="up",
+    source="app",
+    sources=[
+        SourceState("teleop", 100, None, "a command"),
+        SourceState("app", 50, 0.02, ""),
+        SourceState("nav", 10, 3.0, "app has the higher priority: until it is silent"),
+    ],
+    refused="",
+    counters={"lines": 1300, "lines_sent": 1301, "commands": 220, "missed_periods": 3},
+    figures=dict.fromkeys(NAMES, MEASURED),
+)
+BEFORE = replace(
+    STATE,
+    stamp=Time(999, 0),
+    counters={"lines": 1200, "lines_sent": 1201, "commands": 200, "missed_periods": 3},
+)
+INFO = Info("acsar", "0.1.0", 7, "/dev/acsar", False, 100.0, [], [])
+SEEN = Seen("acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves")
+
+
+def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:
+    """The screen as it is read."""
+    console = Console(width=width, file=io.StringIO(), color_system=None)
+    with console.capture() as captured:
+        console.print(screen(seen, width, height))
+    return captured.get().rstrip("\n").split("\n")
+
+
+def painted(seen: Seen, width: int = 80, height: int | None = 24) -> str:
+    """The screen as it is sent to a terminal."""
+    console = Console(
+        width=width, file=io.StringIO(), force_terminal=True, color_system="256", _environ={}
+    )
+    with console.capture() as captured:
+        console.print(screen(seen, width, height))
+    return captured.get()
+
+
+def line_with(text: str, seen: Seen = SEEN, width: int = 80) -> str:
+    found = [line for line in lines_of(seen, width) if text in line]
+    assert len(found) == 1, (text, found)
+    return found[0]
+
+
+def of(**changes: object) -> Seen:
+    """The usual screen with another state."""
+    return replace(SEEN, state=replace(STATE, **changes))
