@@ -8,7 +8,10 @@ Whether the link can be trusted is `session.py`'s, by arrival alone.
 
 from __future__ import annotations
 
+from typing import Literal
+
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import PLAIN_BYTES, wire_ns
@@ -50,6 +53,20 @@ class Feedback(Struct, frozen=True):
     """When it was complete here, monotonic."""
 
 
+class Told(Struct, frozen=True):
+    """Where a line belongs by one of the clocks, ns of when it was due to be complete here."""
+
+    clock: Literal["slots", "prompts", "reads"]
+    due_ns: int
+    dt: float | None = None
+    """s since the last line by the same clock, None for its first."""
+    bridged: float = 0.0
+    """s of `dt` that no line reported."""
+    place: float = 0.0
+    """Its slot, of the clock found as the `found`th."""
+    found: int = 0
+
+
 class Timeline:
     """Puts one good line after the other; remembers the last one's time and counts.
 
@@ -65,14 +82,14 @@ class Timeline:
         self._counts = mcu.encoder_counts
         known = (mcu.reply_period,) if mcu.reply_period else ()
         self._slots = Slots((*known, 1 / rate_hz))
-        self._period_ns = NS_PER_S / rate_hz
+        self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
         self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
         self._habit = Habit(mcu.reply_period > 0)
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
-        self._unplaced = 0.0
-        """s of slots since the last good line, of lines that were none."""
+        self._told = Told("reads", 0)
+        """The last good line's."""
         self.leaps = 0
         """Readings whose counts no wheel can have made; the speeds stood in for them."""
         self.restarted = False
@@ -94,13 +111,12 @@ class Timeline:
         """So many lines come of a read of `size` bytes, `following` of them behind the last."""
         before = self._end_ns
         end_ns = self._end_ns = max(before, at.mono_ns - wire_ns(following, self._baud_rate))
-        self._at, self._lines, self._rest = at, lines, lines
-        self._share = (end_ns - before) / lines / NS_PER_S
+        self._at, self._rest = at, lines
+        self._share_ns = (end_ns - before) / lines
         habit, slots = self._habit, self._slots
         if habit.speaks is not False:
-            self._lost = slots.read(end_ns, lines, size < FULL_READ)
-        self._period = (slots.usual or self._period_ns) / NS_PER_S
-        habit.read(lines, self._share * lines / self._period)
+            slots.read(end_ns, lines, size < FULL_READ)
+        habit.read(lines, (end_ns - before) / self._usual_ns)
         if habit.speaks is False:
             slots.forget()
         self._prompts.read(end_ns, lines == 1)
@@ -110,7 +126,6 @@ class Timeline:
         self._rest -= 1
         if not self._habit.speaks:
             self._prompts.skip()
-        self._unplaced += self._slot()[0] if self._slots.period else self._share
 
     def place(
         self,
@@ -129,50 +144,67 @@ class Timeline:
         # Bytes that followed in the same read were on the wire after this line was complete.
         came_ns = max(self._at.mono_ns - wire_ns(following, self._baud_rate), self._heard_ns)
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
-        dt, bridged, due_ns = self._since_last(asked_ns)
-        first, at = self._last is None, self._sampled(came_ns, due_ns, length)
+        told = self._told_by(asked_ns, came_ns)
+        dt, bridged = self._since_last(told)
+        first, at = self._last is None, self._sampled(came_ns, told, length)
         turned, wheels = self._turned(reading, came_ns), None
-        known = due_ns is not None or not silent or dt * NS_PER_S <= self._quiet_ns
+        known = told.clock != "reads" or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
             wheels = self._codec.wheels(turned.motors)
         gap = 0.0
         if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
             gap = 0.0 if first else max(since, dt)
-            self._share = min(self._share, wire_ns(length, self._baud_rate) / NS_PER_S)
+            self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
+            self._told = self._told_by_reads() if told.clock == "reads" else told
             dt = bridged = since = 0.0
         self._forgotten = False
         since = 0.0 if silent else since
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
-    def _since_last(self, asked_ns: int | None) -> tuple[float, float, int | None]:
-        """How long after the last good line this one was made, how much of it no line reported, s,
-        and when it was due to be complete here, ns: None if only its read tells."""
-        unplaced, self._unplaced = self._unplaced, 0.0
-        speaks = self._habit.speaks
+    def _told_by(self, asked_ns: int | None, came_ns: int) -> Told:
+        """Where the next line belongs by the best clock there is."""
+        speaks, slots = self._habit.speaks, self._slots
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
-            ours = asked_ns is not None or speaks is False
-            if ours and answered is not None and answered.dt is not None:
-                return answered.dt, answered.bridged, answered.due_ns
-        if self._slots.period is not None:
-            dt, bridged = self._slot()
-            return unplaced + dt, unplaced + bridged, self._slots.time_ns(self._rest)
-        dt = unplaced + self._share
-        return dt, dt - self._period if dt > 1.5 * self._period else 0.0, None
+            ours = asked_ns is not None or speaks is False or self._prompts.thinks
+            if ours and answered is not None:
+                return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
+        if slots.period is None:
+            return self._told_by_reads()
+        place, due_ns = slots.place(self._rest), min(slots.time_ns(self._rest), came_ns)
+        last = self._told
+        if last.clock != "slots" or last.found != slots.found:
+            return Told("slots", due_ns, place=place, found=slots.found)
+        passed = max(0.0, place - last.place)
+        missing = max(0.0, passed - 1.0)
+        dt, bridged = passed * slots.period, missing * slots.period
+        return Told("slots", due_ns, dt, bridged, place, slots.found)
 
-    def _slot(self) -> tuple[float, float]:
-        """The next line's slot and its share of those that are missing; s, and s of these alone."""
-        period = self._slots.period or 0.0
-        if self._lost < 0:
-            self._lost = 0  # this one's was counted already, as a missing one
-            return 0.0, 0.0
-        missing = period * self._lost / self._lines
-        return period + missing, missing
+    def _told_by_reads(self) -> Told:
+        return Told("reads", int(self._end_ns - self._share_ns * self._rest))
 
-    def _sampled(self, came_ns: int, due_ns: int | None, length: int) -> Instant:
+    def _since_last(self, told: Told) -> tuple[float, float]:
+        """How long after the last good line this one was made, how much of it no line reported, s.
+
+        Where another clock tells than told the last one, by what both say of the host's time: so
+        no change of clocks adds up.
+        """
+        last = self._told
+        due_ns = max(told.due_ns, last.due_ns)
+        self._told = replace(told, due_ns=due_ns)
+        if told.dt is not None and told.clock == last.clock:
+            return told.dt, told.bridged
+        dt, period = (due_ns - last.due_ns) / NS_PER_S, self._usual_ns / NS_PER_S
+        return dt, dt - period if dt > 1.5 * period else 0.0
+
+    @property
+    def _usual_ns(self) -> float:
+        return self._slots.usual or self._period_ns
+
+    def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
         """When the sample of a line was made: its own bytes were on the wire after that."""
-        late = 0 if due_ns is None else max(0, came_ns - due_ns)
+        late = 0 if told.clock == "reads" else max(0, came_ns - told.due_ns)
         mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

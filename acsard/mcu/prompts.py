@@ -24,6 +24,12 @@ GAIN = 0.05
 JITTER_NS = 350_000
 """What USB and the scheduler make of a constant delay: its mean deviation."""
 
+THOUGHT_NS = 800_000
+"""A mean deviation that USB and the scheduler hardly make."""
+
+SEVERAL = 0.15
+"""Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
+
 BATCH_NS = 2_000_000
 """A mean deviation that no MCU makes: an adapter holds the lines back."""
 
@@ -60,6 +66,18 @@ class Prompts:
         self._lost = False
         """The last lone answer made us give up the line before its own."""
         self._at, self._alone = 0, False
+        self._several = 0.0
+        """Share of the reads that have several lines."""
+
+    @property
+    def thinks(self) -> bool:
+        """The answers' delay varies as no scheduler makes it, nor an adapter: it is the MCU's."""
+        return THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+
+    @property
+    def _batched(self) -> bool:
+        """An adapter holds answers back, so that several come in one read."""
+        return self._several > SEVERAL
 
     def left(self, made_ns: int) -> None:
         """A line has left that was made then."""
@@ -71,6 +89,7 @@ class Prompts:
         `alone` says that it has one line: that tells which line of ours that one answers.
         """
         self._at, self._alone = at_ns, alone
+        self._several += GAIN * ((not alone) - self._several)
 
     def answer(self, asked_ns: int | None = None) -> Answered | None:
         """The next reply's line; made `asked_ns` if the reply says so. None if no line waits."""
@@ -142,6 +161,6 @@ class Prompts:
             return 0  # a stall
         self._delay = delay + GAIN * error
         self._spread += GAIN * (abs(error) - spread)
-        if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
+        if self._batched or not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
             return 0
         return int(error * (1 - (JITTER_NS / spread) ** 2))

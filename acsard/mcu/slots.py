@@ -65,6 +65,10 @@ class Slots:
         self._known = known
         self.usual = 0.0
         """T in ns as last found, 0 before."""
+        self.found = 0
+        """Which of all clocks it is that is known."""
+        self._stretch = 1.0
+        """Slots that each line of the last read has, its share of the missing ones with it."""
         self._before = 0
         self._first, self._slot = 0.0, 0
         """c in ns, and k of the last line."""
@@ -81,6 +85,7 @@ class Slots:
 
     def forget(self) -> None:
         """The clock is another one now, or none."""
+        self.found += 1
         self.period: float | None = None
         """T in s as the MCU means it: it divides its counts by that, whatever its clock does."""
         self._reads: list[Read] = []
@@ -90,6 +95,7 @@ class Slots:
 
         `at_ns` is when that line was complete, `drained` that no more lay in the kernel.
         """
+        self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
         if self.period is None:
             self._seek(at_ns, lines)
@@ -101,6 +107,7 @@ class Slots:
             self.forget()  # no line comes before its time, or ever later: it is not this clock's
             return 0
         self._slot += lost
+        self._stretch = 1.0 + lost / lines
         self._given += lost
         self._passed += lines + lost
         self._lossy += lost > 0
@@ -119,6 +126,10 @@ class Slots:
     def time_ns(self, behind: int) -> int:
         """When the line was complete that lies so many lines before the read's last one."""
         return int(self._first + (self._slot - behind) * self.usual)
+
+    def place(self, behind: int) -> float:
+        """The slot of that line; those that are missing are spread over the lines of the read."""
+        return self._slot - behind * self._stretch
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
         """How many slots are missing, as far as this read can tell, `since` slots after the last.

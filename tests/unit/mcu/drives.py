@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.config.settings import DriveConfig, McuConfig, OdometryConfig
+from acsard.drive import path as way
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import Odometry
 from acsard.mcu.feedback import Feedback
@@ -129,7 +130,8 @@ class Host:
         self.rng = rng = np.random.default_rng(seed)
         self.path = Path(rng, seconds)
         self.session = McuSession(McuConfig(), RATE)
-        self.found, self.floor, self.by_arrival = _odometry(), _odometry(), _odometry()
+        self.found = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+        self.floor, self.by_arrival = Arcs(), Arcs()
         """The session's; with each line's true time; with the time between their arrivals, each
         line's speed since the last."""
         self.lines: list[Line] = []
@@ -156,7 +158,7 @@ class Host:
         line = Line(at, self._reported, speeds, _encode(speeds))
         self._reported = at
         self.lines.append(line)
-        self.floor.fold(Feedback(Instant(0, 0), speeds, dt))
+        self.floor.roll(left * dt, right * dt)
         return line
 
     # the way to the host
@@ -209,7 +211,8 @@ class Host:
             self.found.fold(feedback)
             since = (feedback.heard_ns - (self._heard_ns or feedback.heard_ns)) / NS_PER_S
             self._heard_ns = feedback.heard_ns
-            self.by_arrival.fold(Feedback(feedback.at, feedback.speeds, since))
+            speeds = feedback.speeds
+            self.by_arrival.roll(speeds.front_left * since, speeds.front_right * since)
 
     # the end
 
@@ -224,18 +227,26 @@ class Host:
         return np.array(rows)
 
     def _truth(self) -> Pose:
-        truth, before = _odometry(), (0.0, 0.0)
+        truth, (left, right) = Arcs(), (0.0, 0.0)
         end = self.lines[-1].at
         for at in (*np.arange(0.005, end, 0.005).tolist(), end):
-            now = self.path.angles(at)
-            left, right = now[0] - before[0], now[1] - before[1]
-            truth.fold(Feedback(Instant(0, 0), WheelSpeeds(right, left, left, right), 1.0))
-            before = now
+            (was_left, was_right), (left, right) = (left, right), self.path.angles(at)
+            truth.roll(left - was_left, right - was_right)
         return truth.pose
 
 
-def _odometry() -> Odometry:
-    return Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+class Arcs:
+    """Where a robot of the default size gets by the angles its sides roll, rad."""
+
+    def __init__(self) -> None:
+        self._path = way.Path()
+
+    def roll(self, left: float, right: float) -> None:
+        self._path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
+
+    @property
+    def pose(self) -> Pose:
+        return self._path.pose
 
 
 def _instant(at: float) -> Instant:
