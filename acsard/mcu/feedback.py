@@ -119,7 +119,7 @@ class Timeline:
         habit.read(lines, (end_ns - before) / self._usual_ns)
         if habit.speaks is False:
             slots.forget()
-        self._prompts.read(end_ns, lines == 1)
+        self._prompts.read(end_ns, lines)
 
     def spoilt(self) -> None:
         """The read's next line is none; where the MCU made it, it was one."""
@@ -148,7 +148,9 @@ class Timeline:
         dt, bridged = self._since_last(told)
         first, at = self._last is None, self._sampled(came_ns, told, length)
         turned, wheels = self._turned(reading, came_ns), None
-        known = told.clock != "reads" or not silent or dt * NS_PER_S <= self._quiet_ns
+        # Who answers makes no line that we do not ask for: none is missing for that we were silent.
+        clocked = told.clock != "reads" or self._prompts.lost
+        known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
             wheels = self._codec.wheels(turned.motors)
@@ -167,7 +169,9 @@ class Timeline:
         speaks, slots = self._habit.speaks, self._slots
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
-            ours = asked_ns is not None or speaks is False or self._prompts.thinks
+            prompts = self._prompts
+            plain = (speaks is False or prompts.thinks) and not prompts.lost
+            ours = asked_ns is not None or plain
             if ours and answered is not None:
                 return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
         if slots.period is None:
@@ -196,7 +200,8 @@ class Timeline:
         if told.dt is not None and told.clock == last.clock:
             return told.dt, told.bridged
         dt, period = (due_ns - last.due_ns) / NS_PER_S, self._usual_ns / NS_PER_S
-        return dt, dt - period if dt > 1.5 * period else 0.0
+        missing = dt > 1.5 * period and self._habit.speaks is not False
+        return dt, dt - period if missing else 0.0
 
     @property
     def _usual_ns(self) -> float:

@@ -27,6 +27,12 @@ JITTER_NS = 350_000
 THOUGHT_NS = 800_000
 """A mean deviation that USB and the scheduler hardly make."""
 
+RISE_NS = 20_000
+"""By which a batched link's least delay is forgotten, read by read."""
+
+MOST_LOST = 0.03
+"""Share of answers lost on a batched link, from which on nobody can tell whose one is."""
+
 SEVERAL = 0.15
 """Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
 
@@ -66,6 +72,8 @@ class Prompts:
         self._lost = False
         """The last lone answer made us give up the line before its own."""
         self._at, self._alone = 0, False
+        self._base, self._batch, self._losses = 0.0, 2e7, 0.0
+        """Of a batched link: the least delay, ns, between two reads, and the share of the lost."""
         self._several = 0.0
         """Share of the reads that have several lines."""
 
@@ -73,6 +81,11 @@ class Prompts:
     def thinks(self) -> bool:
         """The answers' delay varies as no scheduler makes it, nor an adapter: it is the MCU's."""
         return THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+
+    @property
+    def lost(self) -> bool:
+        """Answers get lost on a batched link: which line one belongs to cannot be told."""
+        return self._batched and self._losses > MOST_LOST
 
     @property
     def _batched(self) -> bool:
@@ -83,13 +96,19 @@ class Prompts:
         """A line has left that was made then."""
         self._left.append(made_ns)
 
-    def read(self, at_ns: int, alone: bool) -> None:
-        """A read whose last line was complete then.
+    def read(self, at_ns: int, lines: int) -> None:
+        """A read of so many lines, the last of them complete then.
 
-        `alone` says that it has one line: that tells which line of ours that one answers.
+        A lone one tells which line of ours it answers; so do several, where an adapter holds
+        them back and that one came later than it ever does.
         """
+        alone, since = lines == 1, at_ns - self._at
         self._at, self._alone = at_ns, alone
         self._several += GAIN * ((not alone) - self._several)
+        if self._batched:
+            self._weigh(lines, since)
+        elif self._delay is not None:
+            self._base, self._losses = self._delay, 0.0
 
     def answer(self, asked_ns: int | None = None) -> Answered | None:
         """The next reply's line; made `asked_ns` if the reply says so. None if no line waits."""
@@ -102,7 +121,7 @@ class Prompts:
             return self._answered(asked_ns)
         if self._delay is None:
             self._begin()
-        elif self._alone and self._given_up_too_early(self._delay):
+        elif self._alone and not self._batched and self._given_up_too_early(self._delay):
             return self._answered(self._passed)
         if not left:
             self._last = None
@@ -134,6 +153,24 @@ class Prompts:
         if left:
             self._delay = float(self._at - left[0])
 
+    def _weigh(self, lines: int, since: int) -> None:
+        """Give up lines that a batch's last answer is too late for, `since` the read before."""
+        left, at = self._left, self._at
+        if since < 1.5 * self._batch:
+            self._batch += GAIN * (since - self._batch)
+        if len(left) < lines or self._delay is None:
+            return
+        lost = 0
+        while len(left) > lines:
+            late = at - left[lines - 1] - self._base
+            if late <= self._batch + 2 * JITTER_NS or at - left[lines] < self._soonest:
+                break
+            self._passed, lost = left.popleft(), lost + 1
+        self._losses += GAIN * (lost / (lines + lost) - self._losses)
+        # A line that is given up too late makes an answer later, none makes it earlier.
+        self._base = min(self._base + RISE_NS, at - left[lines - 1])
+        self._delay = self._base
+
     def _given_up_too_early(self, delay: float) -> bool:
         """The line that was given up last was not lost; else gives up those that are now."""
         left, at, wide = self._left, self._at, 4 * self._spread
@@ -154,13 +191,13 @@ class Prompts:
         of one that an adapter makes neither.
         """
         delay, spread = self._delay, self._spread
-        if delay is None:
+        if delay is None or self._batched:
             return 0
         error = self._at - line - delay
         if abs(error) >= max(delay, 4 * spread):
             return 0  # a stall
         self._delay = delay + GAIN * error
         self._spread += GAIN * (abs(error) - spread)
-        if self._batched or not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
+        if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
             return 0
         return int(error * (1 - (JITTER_NS / spread) ** 2))

@@ -25,7 +25,7 @@ class Bench:
 
     def reply(self, ms: float, lines: int = 1, asked_ms: float | None = None) -> list[float]:
         """A read of so many replies; each one's dt, and what of it is bridged, in ms."""
-        self.prompts.read(int(ms * MS), lines == 1)
+        self.prompts.read(int(ms * MS), lines)
         said = []
         for _ in range(lines):
             asked = None if asked_ms is None else int(asked_ms * MS)
@@ -44,7 +44,7 @@ class Bench:
 
 def test_a_reply_that_no_line_waits_for_has_no_line() -> None:
     prompts = Prompts(0)
-    prompts.read(10 * MS, True)
+    prompts.read(10 * MS, 1)
     assert prompts.answer() is None
 
 
@@ -78,7 +78,7 @@ def test_a_lost_reply_leaves_its_line_without_one() -> None:
 def test_a_damaged_reply_leaves_its_line_without_one() -> None:
     bench = Bench().talk()
     bench.leave(200.0)
-    bench.prompts.read(int((200.0 + DELAY_MS) * MS), True)
+    bench.prompts.read(int((200.0 + DELAY_MS) * MS), 1)
     bench.prompts.skip()
     bench.leave(210.0)
     assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
