@@ -17,7 +17,7 @@ from tests.unit.mcu.drives import PERIOD, Case, drive
 FOUND, FLOOR, ARRIVAL = range(3)
 
 FULL = pytest.param(600.0, 20, marks=[pytest.mark.soak, pytest.mark.timeout(3000)], id="450 m")
-SHORT = pytest.param(60.0, 3, id="45 m")
+SHORT = pytest.param(30.0, 1, id="20 m")
 EFFORT = pytest.mark.parametrize(("seconds", "seeds"), [SHORT, FULL])
 
 
@@ -49,8 +49,12 @@ SLACK = np.array([0.02, 0.05])
 
 
 @EFFORT
-def test_an_adapter_that_holds_lines_back_costs_nothing(seconds: float, seeds: int) -> None:
-    found = errors("FTDI 16 ms, 12 stalls", Case("ftdi", stall=0.15), seconds, seeds)
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+def test_an_adapter_that_holds_lines_back_costs_nothing(
+    prompted: bool, seconds: float, seeds: int
+) -> None:
+    case = Case("ftdi", prompted, stall=0.15)
+    found = errors(f"FTDI 16 ms, 12 stalls, prompted {prompted}", case, seconds, seeds)
     assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + SLACK)
 
 
@@ -68,12 +72,16 @@ def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, s
     assert np.all(found[FOUND] <= found[ARRIVAL] / 2)
 
 
-@pytest.mark.parametrize(("seconds", "seeds"), [pytest.param(60.0, 12, id="45 m"), FULL])
+SLOW = pytest.param(60.0, 12, marks=pytest.mark.slow, id="45 m")
+
+
+@pytest.mark.parametrize(("seconds", "seeds"), [SLOW, FULL])
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
 def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
-    seconds: float, seeds: int
+    prompted: bool, seconds: float, seeds: int
 ) -> None:
-    case = Case("ftdi", lost=0.2, stall=0.15, stall_every=60.0)
-    found = errors("FTDI 16 ms, 20 % lost", case, seconds, seeds)
+    case = Case("ftdi", prompted, lost=0.2, stall=0.15, stall_every=60.0)
+    found = errors(f"FTDI 16 ms, 20 % lost, prompted {prompted}", case, seconds, seeds)
     assert np.all(found[FOUND] <= found[ARRIVAL])
 
 
