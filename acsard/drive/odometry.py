@@ -106,7 +106,7 @@ class Odometry:
         if not at_rest or max(map(abs, turned)) > self._unsettled:
             rolled, turned = turned, NOWHERE
         self._lost_turned = turned
-        between = _between(self.speeds, speeds, bridged)
+        between = _between(self.speeds, speeds, bridged) if bridged else NOWHERE
         self._move((rolled, between, _times(speeds.as_tuple(), moved_dt - bridged)), gyro)
         if bridged > 0.0:
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))

@@ -53,7 +53,7 @@ class Feedback(Struct, frozen=True):
     """When it was complete here, monotonic."""
 
 
-class Told(Struct, frozen=True):
+class Told(Struct, frozen=True, gc=False):
     """Where a line belongs by one of the clocks, ns of when it was due to be complete here."""
 
     clock: Literal["slots", "prompts", "reads"]
@@ -195,8 +195,10 @@ class Timeline:
         no change of clocks adds up.
         """
         last = self._told
-        due_ns = max(told.due_ns, last.due_ns)
-        self._told = replace(told, due_ns=due_ns)
+        due_ns = told.due_ns
+        if due_ns < last.due_ns:
+            due_ns, told = last.due_ns, replace(told, due_ns=last.due_ns)
+        self._told = told
         if told.dt is not None and told.clock == last.clock:
             return told.dt, told.bridged
         dt, period = (due_ns - last.due_ns) / NS_PER_S, self._usual_ns / NS_PER_S

@@ -160,6 +160,9 @@ class Prompts:
             self._batch += GAIN * (since - self._batch)
         if len(left) < lines or self._delay is None:
             return
+        if at - left[lines - 1] < self._soonest:  # no answer is so soon: it is the one before's
+            left.appendleft(self._passed)
+            self._base = float(at - left[lines - 1])
         lost = 0
         while len(left) > lines:
             late = at - left[lines - 1] - self._base

@@ -273,3 +273,17 @@ def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
         found = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
         assert found.asked_ns == 10**9 + ms * MS
         assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
+
+
+def test_a_change_of_clocks_adds_up_to_no_time() -> None:
+    bench = Bench(counts=0)
+    began = bench.now_ns + 10 * MS
+    total = 0.0
+    for number in range(400):
+        late = number % 4  # ms by which its read is late
+        bench.timeline.left(bench.now_ns)
+        total += bench.line(ms=10 + late).dt
+        bench.now_ns -= late * MS
+        if number % 100 == 70:
+            bench.timeline._slots.forget()
+    assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)

@@ -131,3 +131,61 @@ def test_a_new_session_begins_without_a_past() -> None:
     bench.prompts.forget()
     bench.leave(500.0)
     assert bench.reply(500.0 + DELAY_MS) == [0.0, 0.0]
+
+
+# an adapter that holds answers back
+
+
+def batched(bench: Bench, seed: int, lines: int, lost: tuple[int, ...] = ()) -> float:
+    """Lines every 10 ms, answers handed over every 16 ms; ms from the first to the last of them
+    after a second."""
+    chance, told = random.Random(seed), 0.0
+    answers, leaves = [i for i in range(lines) if i not in lost], list(range(lines))
+    for batch in range(1, lines * 10 // 16 + 3):
+        at = batch * 16.0 + chance.uniform(0.0, 0.5)
+        while leaves and leaves[0] * 10 < at:
+            bench.leave(leaves.pop(0) * 10)
+        ready = [i for i in answers if i * 10 + DELAY_MS <= batch * 16]
+        answers = answers[len(ready) :]
+        if ready:
+            bench.prompts.read(int(at * MS), len(ready))
+        for number in ready:
+            answered = bench.prompts.answer()
+            if number > 100 and answered is not None:
+                told += 1000 * (answered.dt or 0.0)
+    return told
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_of_a_batched_link_each_answer_has_its_line(seed: int) -> None:
+    bench = Bench()
+    assert batched(bench, seed, 300) == pytest.approx(1990.0, abs=0.1)
+    assert not bench.prompts.lost
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_answer_lost_on_a_batched_link_is_noticed_soon(seed: int) -> None:
+    bench = Bench()
+    assert batched(bench, seed, 300, lost=(150,)) == pytest.approx(1990.0, abs=0.1)
+
+
+def test_where_a_fifth_of_a_batched_link_is_lost_nobody_can_tell_whose_an_answer_is() -> None:
+    bench = Bench()
+    batched(bench, 1, 300, lost=tuple(range(100, 300, 5)))
+    assert bench.prompts.lost
+
+
+def test_of_answers_that_take_1_to_5_ms_the_mcu_is_held_to_think() -> None:
+    bench, chance = Bench(), random.Random(1)
+    for number in range(300):
+        bench.leave(number * 10)
+        bench.reply(number * 10 + 7.0 + chance.uniform(0.0, 4.0))
+    assert bench.prompts.thinks
+
+
+def test_what_usb_makes_of_a_delay_is_no_thinking() -> None:
+    bench, chance = Bench(), random.Random(1)
+    for number in range(300):
+        bench.leave(number * 10)
+        bench.reply(number * 10 + 8.0 + chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3))
+    assert not bench.prompts.thinks
