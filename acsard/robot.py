@@ -211,7 +211,7 @@ class Robot:
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now_ns, events)
             return None
-        fault = self._sanity.watch(self._speeds, line.speeds, line.dt)
+        fault = self._sanity.watch(self._speeds, line.speeds, line.since)
         if fault:
             self._fault(fault, now_ns, events)
         if self._sanity.turned:

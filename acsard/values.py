@@ -193,6 +193,8 @@ class Estimate(Struct, frozen=True):
     speeds: WheelSpeeds
     asked_ns: int | None = None
     """When the line it answers was made, monotonic; None where a reply does not tell which."""
+    heard_ns: int = 0
+    """When the line was complete here, monotonic."""
 
 
 class Wait(Struct, frozen=True):

@@ -15,7 +15,7 @@ from acsard.bench.matching import Summary
 POINTS = {
     "command_to_wire": "command put here -> first byte of its line at the port's far end",
     "feedback_to_odometry": "feedback line's last byte handed over -> its odometry here",
-    "read_to_odometry": "feedback line read by the daemon (its stamp) -> its odometry here",
+    "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
 """What is measured from outside, and between which points; "here" is another process."""
 

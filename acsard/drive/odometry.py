@@ -113,7 +113,8 @@ class Odometry:
         if not at_rest or max(map(abs, turned)) > self._unsettled:
             rolled, turned = turned, NOWHERE
         self._lost_turned = turned
-        self._move((rolled, _times(speeds.as_tuple(), moved_dt)), gyro)
+        between = _between(self.speeds, speeds, bridged) if bridged else NOWHERE
+        self._move((rolled, between, _times(speeds.as_tuple(), moved_dt - bridged)), gyro)
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -136,6 +137,7 @@ class Odometry:
             self._positions,
             speeds,
             feedback.asked_ns,
+            feedback.heard_ns,
         )
 
     def _move(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> None:
@@ -177,3 +179,8 @@ def _sum(a: Motors, b: Motors) -> Motors:
 
 def _times(a: Motors, dt: float) -> Motors:
     return a[0] * dt, a[1] * dt, a[2] * dt, a[3] * dt
+
+
+def _between(before: WheelSpeeds, after: WheelSpeeds, dt: float) -> Motors:
+    """Wheel angles over a time that no line reported: linear from one report to the next."""
+    return _times(_sum(before.as_tuple(), after.as_tuple()), dt / 2)

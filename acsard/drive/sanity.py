@@ -115,7 +115,7 @@ class Sanity:
         A slew is judged against the last possible line and the time since, so that a real step
         is believed as soon as it could have happened.
         """
-        self._since += feedback.dt
+        self._since += max(feedback.dt, feedback.since)
         if feedback.gap:
             self._last = None
         why = self._objection(feedback.speeds)

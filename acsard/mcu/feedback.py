@@ -1,22 +1,37 @@
-"""A good line -> feedback: when it was complete, and what the wheels did since the one before.
+"""A good line -> feedback: when its sample was made, and what the wheels did since the one before.
 
-Knows the wire's pace and the encoders' counts; whether the link can be trusted is `session.py`'s.
+Whose clock says how far two lines are apart: the MCU's own where it sends it with its counts; the
+lines that left where each is answered (`prompts.py`); the period of an MCU that reports by itself
+(`slots.py`, and which of the two it is: `habit.py`); else the reads, evenly over the lines of one.
+Whether the link can be trusted is `session.py`'s, by arrival alone.
 """
 
 from __future__ import annotations
 
+from typing import Literal
+
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.config.settings import McuConfig
-from acsard.config.wire_time import wire_ns
+from acsard.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.mcu.check import Reading
 from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.frames import Codec, Motors
+from acsard.mcu.habit import Habit
+from acsard.mcu.prompts import Prompts
+from acsard.mcu.slots import Slots
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
+
+BRIDGED_S = 1.0
+"""s; what is missing for longer is not guessed: the MCU may have been reset."""
+
+FULL_READ = 1024
+"""Bytes that the port reads at once: behind so many there may be more."""
 
 
 class Feedback(Struct, frozen=True):
-    """One good line: complete at `at`, `dt` s after the previous one.
+    """One good line: its sample was made at `at`, `dt` s after the previous one's.
 
     After a gap `dt` is 0 (how the robot moved in it is unknown) and `gap` is its length in s.
     `turned` is how far the wheels turned since the previous line by their encoders' counts, in rad
@@ -29,58 +44,181 @@ class Feedback(Struct, frozen=True):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """s of `dt` that no line reported; the speeds of its neighbours stand in for them."""
+    """s: the first part of `dt`, that no line reported: the speeds of its neighbours stand in."""
     asked_ns: int | None = None
     """When the line it answers was made, monotonic, where the reply tells which one that is."""
+    since: float = 0.0
+    """s since the previous line came, 0 after a silence: what it is judged by."""
+    heard_ns: int = 0
+    """When it was complete here, monotonic."""
+
+
+class Told(Struct, frozen=True, gc=False):
+    """Where a line belongs by one of the clocks, ns of when it was due to be complete here."""
+
+    clock: Literal["slots", "prompts", "reads"]
+    due_ns: int
+    dt: float | None = None
+    """s since the last line by the same clock, None for its first."""
+    bridged: float = 0.0
+    """s of `dt` that no line reported."""
+    place: float = 0.0
+    """Its slot, of the clock found as the `found`th."""
+    found: int = 0
 
 
 class Timeline:
-    """Puts one good line after the other; remembers the last one's time and counts."""
+    """Puts one good line after the other; remembers the last one's time and counts.
 
-    def __init__(self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int) -> None:
+    `read` for each read, then for each of its lines `place` or, if it is none, `spoilt`.
+    """
+
+    def __init__(
+        self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
+    ) -> None:
         """`wheel_speed` rad/s is the fastest a wheel can turn; `quiet_ns` makes a link stale."""
-        self._codec, self._baud_rate = codec, mcu.baud_rate
+        self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
         self._counts = mcu.encoder_counts
+        known = (mcu.reply_period,) if mcu.reply_period else ()
+        self._slots = Slots((*known, 1 / rate_hz))
+        self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
+        self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
+        self._habit = Habit(mcu.reply_period > 0)
         self._last: Instant | None = None
+        self._heard_ns = self._end_ns = 0
+        self._forgotten = True
+        self._told = Told("reads", 0)
+        """The last good line's."""
         self.leaps = 0
         """Readings whose counts no wheel can have made; the speeds stood in for them."""
         self.restarted = False
         """The last line's clock says that the MCU has started again."""
 
     def forget(self) -> None:
-        """The next line's counts have nothing to do with the last one's."""
+        """A new session: the next line has nothing to do with the last one."""
         self._encoders.forget()
+        self._slots.forget()
+        self._prompts.forget()
+        self._forgotten = True
+
+    def left(self, made_ns: int) -> None:
+        """A line of ours has left that was made then."""
+        self._prompts.left(made_ns)
+        self._habit.left()
+
+    def read(self, at: Instant, size: int, lines: int, following: int) -> None:
+        """So many lines come of a read of `size` bytes, `following` of them behind the last."""
+        before = self._end_ns
+        end_ns = self._end_ns = max(before, at.mono_ns - wire_ns(following, self._baud_rate))
+        self._at, self._rest = at, lines
+        self._share_ns = (end_ns - before) / lines
+        habit, slots = self._habit, self._slots
+        if habit.speaks is not False:
+            slots.read(end_ns, lines, size < FULL_READ)
+        habit.read(lines, (end_ns - before) / self._usual_ns)
+        if habit.speaks is False:
+            slots.forget()
+        self._prompts.read(end_ns, lines)
+
+    def spoilt(self) -> None:
+        """The read's next line is none; where the MCU made it, it was one."""
+        self._rest -= 1
+        if not self._habit.speaks:
+            self._prompts.skip()
 
     def place(
         self,
         speeds: WheelSpeeds,
         reading: Reading | None,
-        read_at: Instant,
         following: int,
-        gap: bool,
+        length: int,
+        silent: bool,
+        asked_ns: int | None = None,
     ) -> Feedback:
-        """The feedback of a line; `following` bytes came behind it in the same read.
+        """The feedback of the read's next line, of `length` bytes; `following` came behind it.
 
-        `gap` says that the link was silent before it.
+        `silent` says that the link was so before it, `asked_ns` when the line it answers was made.
         """
+        self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
-        age = wire_ns(following, self._baud_rate)
-        at = Instant(read_at.mono_ns - age, read_at.wall_ns - age)
-        last = self._last
-        if last is not None and at.mono_ns < last.mono_ns:
-            at = Instant(last.mono_ns, max(at.wall_ns, last.wall_ns))
-        self._last = at
-        turned = self._turned(reading, at.mono_ns)
-        if last is None:
-            return Feedback(at, speeds, 0.0)
-        wheels = None
+        came_ns = max(self._at.mono_ns - wire_ns(following, self._baud_rate), self._heard_ns)
+        since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
+        told = self._told_by(asked_ns, came_ns)
+        dt, bridged = self._since_last(told)
+        first, at = self._last is None, self._sampled(came_ns, told, length)
+        turned, wheels = self._turned(reading, came_ns), None
+        # Who answers makes no line that we do not ask for: none is missing for that we were silent.
+        clocked = told.clock != "reads" or self._prompts.lost
+        known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
+            dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
             wheels = self._codec.wheels(turned.motors)
-        since = (at.mono_ns - last.mono_ns) / NS_PER_S
-        if gap or self.restarted:
-            return Feedback(at, speeds, 0.0, gap=since, turned=wheels)
-        return Feedback(at, speeds, since if turned is None else turned.dt, turned=wheels)
+        gap = 0.0
+        if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
+            gap = 0.0 if first else max(since, dt)
+            self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
+            self._told = self._told_by_reads() if told.clock == "reads" else told
+            dt = bridged = since = 0.0
+        self._forgotten = False
+        since = 0.0 if silent else since
+        return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
+
+    def _told_by(self, asked_ns: int | None, came_ns: int) -> Told:
+        """Where the next line belongs by the best clock there is."""
+        speaks, slots = self._habit.speaks, self._slots
+        if asked_ns is not None or not speaks:
+            answered = self._prompts.answer(asked_ns)
+            prompts = self._prompts
+            plain = (speaks is False or prompts.thinks) and not prompts.lost
+            ours = asked_ns is not None or plain
+            if ours and answered is not None:
+                return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
+        if slots.period is None:
+            return self._told_by_reads()
+        place, due_ns = slots.place(self._rest), min(slots.time_ns(self._rest), came_ns)
+        last = self._told
+        if last.clock != "slots" or last.found != slots.found:
+            return Told("slots", due_ns, place=place, found=slots.found)
+        passed = max(0.0, place - last.place)
+        missing = max(0.0, passed - 1.0)
+        dt, bridged = passed * slots.period, missing * slots.period
+        return Told("slots", due_ns, dt, bridged, place, slots.found)
+
+    def _told_by_reads(self) -> Told:
+        return Told("reads", int(self._end_ns - self._share_ns * self._rest))
+
+    def _since_last(self, told: Told) -> tuple[float, float]:
+        """How long after the last good line this one was made, how much of it no line reported, s.
+
+        Where another clock tells than told the last one, by what both say of the host's time: so
+        no change of clocks adds up.
+        """
+        last = self._told
+        due_ns = told.due_ns
+        if due_ns < last.due_ns:
+            due_ns, told = last.due_ns, replace(told, due_ns=last.due_ns)
+        self._told = told
+        if told.dt is not None and told.clock == last.clock:
+            return told.dt, told.bridged
+        dt, period = (due_ns - last.due_ns) / NS_PER_S, self._usual_ns / NS_PER_S
+        missing = dt > 1.5 * period and self._habit.speaks is not False
+        return dt, dt - period if missing else 0.0
+
+    @property
+    def _usual_ns(self) -> float:
+        return self._slots.usual or self._period_ns
+
+    def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
+        """When the sample of a line was made: its own bytes were on the wire after that."""
+        late = 0 if told.clock == "reads" else max(0, came_ns - told.due_ns)
+        mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
+        last, read = self._last, self._at
+        wall_ns = read.wall_ns - read.mono_ns + mono_ns
+        if last is not None and mono_ns < last.mono_ns:
+            mono_ns, wall_ns = last.mono_ns, max(wall_ns, last.wall_ns)
+        self._last = Instant(mono_ns, wall_ns)
+        return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
         """How far the motors turned since the line before, if its counts tell."""

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-from msgspec.structs import replace
-
 from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
@@ -50,7 +48,7 @@ class McuSession:
         """Silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
-        self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns)
+        self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self._wants_samples = mcu.wants_samples
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
@@ -63,6 +61,8 @@ class McuSession:
         self._announced: tuple[LinkState, str, bool] = ("down", self.negotiation.in_force, False)
         self._opened = 0
         self._blind = Throttle()
+        self._made_ns: int | None = None
+        """When the line just made was; what became of it is not known yet."""
 
     @property
     def link(self) -> LinkState:
@@ -84,15 +84,15 @@ class McuSession:
         """
         self.restarted, self._starting_over, self.events = False, False, []
         self.negotiation.settle(went=not unsent)
+        if self._made_ns is not None and not unsent:
+            self._timeline.left(self._made_ns)
+        self._made_ns = None
         feedback = []
         if not port_open or opened != self._opened:
             self._begin(port_open, opened)
         if port_open:
             for piece in received:
-                for line, following in self._lines.feed(piece.data):
-                    got = self._line(line, piece.at, following)
-                    if got is not None:
-                        feedback.append(got)
+                feedback += self._read(piece)
             more = self._lines.too_long - self.rejects["too_long"]
             if more > 0:
                 self._reject("too_long", more)
@@ -107,6 +107,11 @@ class McuSession:
         To an MCU that does not answer, and while the check is asked for, only stops leave: the
         first one at once, for it may be doing what it was told last.
         """
+        line = self._next_line(now_ns, speeds)
+        self._made_ns = None if line is None else now_ns
+        return line
+
+    def _next_line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         if self.negotiation.asking:
             return self.negotiation.question(now_ns)
         if self.silent(now_ns):
@@ -210,6 +215,19 @@ class McuSession:
 
     # lines
 
+    def _read(self, piece: Received) -> list[Feedback]:
+        """The good lines of one read; of each line the timeline hears."""
+        lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
+        if lines:
+            timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
+        for line, following in lines:
+            got = self._line(line, piece.at, following)
+            if got is None:
+                timeline.spoilt()
+            else:
+                feedback.append(got)
+        return feedback
+
     def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
         if line.startswith(IDENTITY):
             self._restart(f"has started: {line.decode('ascii', 'replace')}")
@@ -219,32 +237,38 @@ class McuSession:
             self._reject("echo")
             self._link.missed()
             return None
+        reading, asked_ns = None, None
         try:
             if check.checked or (check.asking and b"#" in line):
                 reply = unseal(line)
-                speeds = self.codec.decode(reply.plain)
+                speeds, reading = self.codec.decode(reply.plain), reply.reading
                 asked_ns = check.answered(reply, read_at.mono_ns)
-                feedback = self._good(speeds, reply.reading, read_at, following)
-                return replace(feedback, asked_ns=asked_ns)
-            speeds = self.codec.decode(line)
+            else:
+                speeds = self.codec.decode(line)
         except FrameError as error:
             self._reject(error.reason, text=f"{line[:60]!r}")
             self._bad()
             return None
-        if check.asking:
+        if asked_ns is None and check.asking:
             check.heard_plain()
             return None
-        return self._good(speeds, None, read_at, following)
+        return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
 
     def _good(
-        self, speeds: WheelSpeeds, reading: Reading | None, read_at: Instant, following: int
+        self,
+        speeds: WheelSpeeds,
+        reading: Reading | None,
+        read_at: Instant,
+        size: tuple[int, int],
+        asked_ns: int | None,
     ) -> Feedback:
+        """`size` are the bytes behind the line and its own."""
         self.good_lines += 1
         since_ns = self._link.good(read_at.mono_ns)
         if since_ns is not None and since_ns >= LONG_GAP_NS:
             self.restarted = True
-        gap = since_ns is None or since_ns > self.quiet_ns
-        feedback = self._timeline.place(speeds, reading, read_at, following, gap)
+        silent = since_ns is None or since_ns > self.quiet_ns
+        feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
         more = self._timeline.leaps - self.rejects["count_leap"]
         if more > 0:
             self._reject("count_leap", more)

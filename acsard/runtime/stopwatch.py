@@ -31,7 +31,7 @@ class Stopwatch:
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """A feedback line was folded, and told to the bus at `told_ns` if anybody listens."""
-        at_ns, asked_ns = estimate.at.mono_ns, estimate.asked_ns
+        at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self._figures.add("mcu_round_trip", at_ns, at_ns - asked_ns)
         if told_ns is not None:

@@ -203,8 +203,10 @@ def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
     bench = Bench().linked()
     bench.reply = bench.codec.encode(ROLLING) * 2
     first, second = bench.step(tick=False).estimates
-    assert second.at == bench.now
-    assert first.at.mono_ns == bench.now_ns - 33 * 10 * NS_PER_S // 115200
+    wire_ns = 33 * 10 * NS_PER_S // 115200
+    assert (first.heard_ns, second.heard_ns) == (bench.now_ns - wire_ns, bench.now_ns)
+    assert first.at.mono_ns == bench.now_ns - 2 * wire_ns
+    assert second.at.mono_ns == bench.now_ns - wire_ns
     assert first.speeds == second.speeds == ROLLING
 
 

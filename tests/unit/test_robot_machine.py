@@ -32,6 +32,7 @@ from acsard.config.settings import (
 )
 from acsard.drive.words import waiting
 from acsard.guard import Guard
+from acsard.mcu.feedback import BRIDGED_S
 from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,
@@ -179,6 +180,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.before: Outputs | None = None
         self.told_link, self.was_open, self.last_opened = "down", False, 0
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
+        self.fastest = 0.0
         self.lates = 0
         self.clocks_become_known()
         self.step(tick=False)
@@ -515,15 +517,20 @@ class RobotMachine(RuleBasedStateMachine):
             assert outputs.linked
 
     def check_odometry(self, outputs: Outputs) -> None:
-        """No step is longer than its fastest wheel can make it, nor made up for long silences."""
+        """No step is longer than the fastest wheel of its two ends can make it in the time since.
+
+        Nor is it made up for long silences. A line has the time of its slot: that may be some
+        periods from its stamp, which is never later than the line.
+        """
         drive, feedback = self.config.drive, self.config.feedback
         for estimate in outputs.estimates:
             fastest = max(map(abs, estimate.speeds.as_tuple())) * drive.wheel_radius
             assert fastest <= feedback.wheel_speed * drive.wheel_radius
             dt = (estimate.at.mono_ns - self.sampled_ns) / NS_PER_S
             assert dt >= 0.0
-            # What impossible lines cost may be made up for, but not more than `quiet` of it.
-            dt = min(dt, 2 * self.quiet_ns / NS_PER_S)
+            # What lines are missing is made up for, but not more than a second of it.
+            dt = min(dt, BRIDGED_S) + 2 * self.period_ms / 1000
+            fastest, self.fastest = max(fastest, self.fastest), fastest
             x, y = estimate.pose.x - self.pose.x, estimate.pose.y - self.pose.y
             slack = 1e-9 * (1 + abs(self.pose.x) + abs(self.pose.y))
             assert math.hypot(x, y) <= fastest * dt + slack

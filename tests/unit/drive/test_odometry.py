@@ -516,6 +516,14 @@ def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
     assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)
 
 
+def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.01))
+    before = robot.pose.x
+    robot.fold(Feedback(AT, WheelSpeeds(20.0, 20.0, 20.0, 20.0), 0.03, bridged=0.02))
+    assert robot.pose.x - before == pytest.approx((15.0 * 0.02 + 20.0 * 0.01) * 0.05)
+
+
 # the turn of a gyro
 
 

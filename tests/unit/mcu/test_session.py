@@ -252,18 +252,26 @@ def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
 # the time of a line
 
 
-def test_a_line_that_ends_its_read_was_complete_when_it_was_read() -> None:
+def sampled(bench: Bench, age_ns: int) -> Instant:
+    """The time of a line that was complete so long ago, as long as its bytes before that."""
+    made_ns = bench.now_ns - age_ns - wire_ns(len(GOOD), 115200)
+    return Instant(made_ns, made_ns + WALL_NS)
+
+
+def test_a_line_that_ends_its_read_was_complete_then_and_made_its_own_bytes_earlier() -> None:
     bench = Bench().open()
     (feedback,) = bench.wait(10, GOOD)
-    assert feedback == Feedback(bench.now, WheelSpeeds(*SEED_MOTORS), 0.0)
+    assert feedback.heard_ns == bench.now_ns
+    assert feedback.at == sampled(bench, 0)
+    assert (feedback.speeds, feedback.dt) == (WheelSpeeds(*SEED_MOTORS), 0.0)
 
 
 def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
     bench = Bench(McuConfig(baud_rate=9600)).open()
     first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
-    # 45 bytes at 9600 baud: 46.875 ms; 12 bytes: 12.5 ms
-    assert bench.now_ns - first.at.mono_ns == 46_875_000
-    assert bench.now_ns - second.at.mono_ns == 12_500_000
+    # 45 bytes at 9600 baud: 46.875 ms; 12 bytes: 12.5 ms; 33 of its own: 34.375 ms
+    assert bench.now_ns - first.at.mono_ns == 46_875_000 + 34_375_000
+    assert bench.now_ns - second.at.mono_ns == 12_500_000 + 34_375_000
     assert first.at.wall_ns - first.at.mono_ns == WALL_NS
     assert second.at.wall_ns - second.at.mono_ns == WALL_NS
 
@@ -275,10 +283,10 @@ def test_dt_is_the_time_since_the_line_before() -> None:
     assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
 
 
-def test_lines_read_together_are_a_line_of_wire_apart() -> None:
+def test_lines_read_together_share_the_time_since_the_read_before() -> None:
     bench = Bench().up()
-    _, second, third = bench.wait(10, GOOD * 3)
-    assert second.dt == third.dt == pytest.approx(33 * 10 / 115200, abs=1e-8)
+    first, second, third = bench.wait(15, GOOD * 3)
+    assert first.dt == second.dt == third.dt == pytest.approx(0.005)
 
 
 def test_a_line_is_never_older_than_the_one_before_it() -> None:
@@ -314,7 +322,7 @@ def test_a_line_cut_over_two_reads_is_as_old_as_the_second() -> None:
     bench = Bench().up()
     bench.wait(5, GOOD[:20])
     (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
-    assert bench.now_ns - feedback.at.mono_ns == wire_ns(3, 115200)
+    assert feedback.at == sampled(bench, wire_ns(3, 115200))
 
 
 def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
@@ -323,7 +331,8 @@ def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
         now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
         (feedback,) = session.update(now, True, 1, (Received(now, GOOD),))
         assert feedback.dt == (0.01 if step > 1 else 0.0)
-        assert feedback.at == now
+        late_ns = now.mono_ns - feedback.at.mono_ns
+        assert late_ns == now.wall_ns - feedback.at.wall_ns == wire_ns(len(GOOD), 115200)
 
 
 # gaps

@@ -1,0 +1,69 @@
+"""What the host's delays and lost lines cost the pose, from the simulated wheels to `state`."""
+
+from __future__ import annotations
+
+import math
+import random
+from contextlib import ExitStack, nullcontext
+
+import pytest
+
+from acsard.config.settings import Config, McuConfig, SimConfig
+from tests.scenarios.world import World
+
+FINE = SimConfig(encoder_counts=20_000)
+"""So that the two decimals of a line are what limits it."""
+
+COUNTS = 3200
+
+
+class Drive:
+    """8 s of driving at random; after each of eight legs something happens to lines or host."""
+
+    def __init__(self, made: World, reports: bool) -> None:
+        self.world, self.faults = made, ExitStack()
+        if reports:
+            self.faults.enter_context(made.mcu.unprompted(0.01))
+        made.run(1.5)
+        made.drive(0.0, 0.0, 0.2)
+
+    def error(self, stall: float = 0.0, lost: float = 0.0) -> float:
+        """m by which the pose is off in the end, with stalls or bursts of lost lines of s."""
+        made, chance = self.world, random.Random(4)
+        with self.faults:
+            for _ in range(8):
+                linear, angular = chance.uniform(0.2, 0.8), chance.uniform(-1.5, 1.5)
+                made.hold(linear, angular, 0.5)
+                with made.mcu.lost_replies(1) if lost else nullcontext():
+                    made.run(lost)
+                made.stall(stall)
+                made.hold(linear, angular, 0.5)
+            made.hold(0.0, 0.0, 1.0)
+        told, true = made.state, made.mcu.vehicle.pose
+        error = math.dist((told.x, told.y), (true.x, true.y))
+        print(f"{1000 * error:.1f} mm off after {made.loop.robot.travelled:.1f} m")
+        assert made.loop.robot.travelled > 1.5
+        return error
+
+
+REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "reporting"])
+
+
+@REPORTS
+@pytest.mark.parametrize("stall", [0.09, 0.25])
+def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> None:
+    assert Drive(World(Config(sim=FINE)), reports).error(stall) < 0.005
+
+
+@REPORTS
+def test_an_adapter_that_batches_and_stalls_costs_no_distance(reports: bool) -> None:
+    drive = Drive(World(Config(sim=FINE)), reports)
+    drive.faults.enter_context(drive.world.mcu.ftdi())
+    drive.faults.enter_context(drive.world.mcu.stalls(2.0, 0.09))
+    assert drive.error() < 0.02
+
+
+def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:
+    mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
+    world = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))
+    assert Drive(world, reports=False).error(lost=0.3) < 0.01

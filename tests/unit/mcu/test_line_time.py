@@ -1,0 +1,127 @@
+"""Drives of 450 m through the session: what the host's delays and lost lines cost the pose.
+
+Each is compared with the floor of the same drive: every line with its true time. `pytest -m soak
+-s` drives all of it and prints the figures.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from acsard.values import Instant
+from tests.unit.mcu.drives import PERIOD, Case, drive
+
+FOUND, FLOOR, ARRIVAL = range(3)
+
+FULL = pytest.param(600.0, 20, marks=[pytest.mark.soak, pytest.mark.timeout(3000)], id="450 m")
+SHORT = pytest.param(30.0, 1, id="20 m")
+EFFORT = pytest.mark.parametrize(("seconds", "seeds"), [SHORT, FULL])
+
+
+def errors(name: str, case: Case, seconds: float, seeds: int) -> np.ndarray:
+    """Means of m and deg: of the session, of the floor, of arrival times."""
+    found = np.mean([drive(case, seed, seconds).errors() for seed in range(seeds)], axis=0)
+    rows = zip(("found", "floor", "by arrival"), found.tolist(), strict=True)
+    print(f"\n{name}:", ", ".join(f"{what} {m:.3f} m {deg:.3f} deg" for what, (m, deg) in rows))
+    return np.asarray(found)
+
+
+@EFFORT
+@pytest.mark.parametrize("stall", [0.05, 0.09, 0.15, 0.25])
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+def test_stalls_of_the_host_cost_nothing(
+    prompted: bool, stall: float, seconds: float, seeds: int
+) -> None:
+    found = errors(
+        f"stalls of {stall} s, prompted {prompted}",
+        Case(stall=stall, prompted=prompted),
+        seconds,
+        seeds,
+    )
+    assert np.all(found[FOUND] <= 1.1 * found[FLOOR] + SLACK)
+
+
+SLACK = np.array([0.02, 0.05])
+"""m and deg: what a drive that happens to end where it should leaves of the ratio."""
+
+
+@EFFORT
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+def test_an_adapter_that_holds_lines_back_costs_nothing(
+    prompted: bool, seconds: float, seeds: int
+) -> None:
+    case = Case("ftdi", prompted, stall=0.15)
+    found = errors(f"FTDI 16 ms, 12 stalls, prompted {prompted}", case, seconds, seeds)
+    assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + SLACK)
+
+
+@EFFORT
+def test_a_fifth_of_the_lines_lost_costs_little(seconds: float, seeds: int) -> None:
+    found = errors("20 % lost", Case(lost=0.2, stall=0.15, stall_every=60.0), seconds, seeds)
+    assert found[FOUND, 0] <= 0.45
+
+
+@EFFORT
+def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, seeds: int) -> None:
+    """What the host cannot tell from its own delays is left: arrival times have that too."""
+    case = Case(prompted=True, thinking=0.004, stall=0.09)
+    found = errors("stalls of 0.09 s, answers 1 to 5 ms late", case, seconds, seeds)
+    assert np.all(found[FOUND] <= found[ARRIVAL] / 2)
+
+
+SLOW = pytest.param(60.0, 12, marks=pytest.mark.slow, id="45 m")
+
+
+@pytest.mark.parametrize(("seconds", "seeds"), [SLOW, FULL])
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
+    prompted: bool, seconds: float, seeds: int
+) -> None:
+    case = Case("ftdi", prompted, lost=0.2, stall=0.15, stall_every=60.0)
+    found = errors(f"FTDI 16 ms, 20 % lost, prompted {prompted}", case, seconds, seeds)
+    assert np.all(found[FOUND] <= found[ARRIVAL])
+
+
+@EFFORT
+def test_bursts_of_lost_lines_are_bridged(seconds: float, seeds: int) -> None:
+    found = errors("bursts of 0.1 to 0.5 s", Case(burst_every=30.0), seconds, seeds)
+    assert found[FOUND, 0] <= 7.5
+
+
+def test_every_slot_of_a_drive_is_counted_once() -> None:
+    host = drive(Case(stall=0.25, stall_every=2.0), 1, 30.0)
+    clocked = [feedback.dt for feedback in host.heard[100:]]
+    assert len(host.heard) == len(host.lines)
+    assert set(clocked) == {PERIOD}
+    assert all(feedback.bridged == feedback.gap == 0.0 for feedback in host.heard)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case(stall=0.25, stall_every=2.0),
+        Case("ftdi", lost=0.1, stall=0.09),
+        Case(prompted=True, stall=0.15, lost=0.1),
+        Case(burst_every=5.0, lost=0.3),
+    ],
+)
+def test_time_never_goes_back(case: Case) -> None:
+    heard = drive(case, 2, 30.0).heard
+    assert all(f.dt >= f.bridged >= 0.0 and f.since >= 0.0 for f in heard)
+    assert all(a.at.mono_ns <= b.at.mono_ns for a, b in pairwise(heard))
+    assert all(f.at.mono_ns <= f.heard_ns for f in heard)
+
+
+@pytest.mark.parametrize("adapter", ["acm", "ftdi"])
+def test_a_stamp_is_when_the_sample_was_made(adapter: str) -> None:
+    host = drive(Case("ftdi" if adapter == "ftdi" else "acm", stall=0.15), 3, 40.0)
+    late, came = [], []
+    for line, feedback in list(zip(host.lines, host.heard, strict=True))[1000:]:
+        late.append(feedback.at.mono_ns / 1e9 - 1000 - line.at)
+        came.append(feedback.heard_ns / 1e9 - 1000 - line.at)
+    assert np.std(late) < np.std(came) / 8
+    assert abs(np.mean(late)) < 0.002
+    assert isinstance(host.heard[0].at, Instant)

@@ -1,0 +1,191 @@
+"""Which line of ours a reply answers, told by order and delay."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.mcu.prompts import Prompts
+
+MS = 1_000_000
+DELAY_MS = 9.0
+
+
+class Bench:
+    """Lines that leave, and replies that are read."""
+
+    def __init__(self) -> None:
+        self.prompts = Prompts(soonest_ns=6 * MS)
+
+    def leave(self, ms: float) -> None:
+        self.prompts.left(int(ms * MS))
+
+    def reply(self, ms: float, lines: int = 1, asked_ms: float | None = None) -> list[float]:
+        """A read of so many replies; each one's dt, and what of it is bridged, in ms."""
+        self.prompts.read(int(ms * MS), lines)
+        said = []
+        for _ in range(lines):
+            asked = None if asked_ms is None else int(asked_ms * MS)
+            answered = self.prompts.answer(asked)
+            assert answered is not None
+            said += [round((answered.dt or 0.0) * 1000, 3), round(answered.bridged * 1000, 3)]
+        return said
+
+    def talk(self, count: int = 20) -> Bench:
+        """A line every 10 ms, each answered; the last left at (count - 1) x 10."""
+        for number in range(count):
+            self.leave(number * 10)
+            self.reply(number * 10 + DELAY_MS)
+        return self
+
+
+def test_a_reply_that_no_line_waits_for_has_no_line() -> None:
+    prompts = Prompts(0)
+    prompts.read(10 * MS, 1)
+    assert prompts.answer() is None
+
+
+def test_replies_are_as_far_apart_as_their_lines() -> None:
+    bench = Bench().talk()
+    bench.leave(203.0)
+    assert bench.reply(203.0 + DELAY_MS) == [13.0, 0.0]
+
+
+def test_where_no_line_left_nothing_is_missing() -> None:
+    bench = Bench().talk()
+    bench.leave(440.0)
+    assert bench.reply(440.0 + DELAY_MS) == [250.0, 0.0]
+
+
+def test_a_stall_of_the_read_changes_nothing() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.leave(410.0)
+    assert bench.reply(410.5) == [10.0, 0.0]
+    assert bench.reply(410.0 + DELAY_MS) == [210.0, 0.0]
+
+
+def test_a_lost_reply_leaves_its_line_without_one() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.leave(210.0)
+    assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
+
+
+def test_a_damaged_reply_leaves_its_line_without_one() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.prompts.read(int((200.0 + DELAY_MS) * MS), 1)
+    bench.prompts.skip()
+    bench.leave(210.0)
+    assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
+
+
+def test_a_line_given_up_too_early_gets_its_reply_back() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.leave(210.0)
+    assert bench.reply(210.0 + DELAY_MS - 1)[0] == 20.0  # the first one's, read late
+    assert bench.reply(210.0 + DELAY_MS) == [0.0, 0.0]
+    bench.leave(220.0)
+    assert bench.reply(220.0 + DELAY_MS) == [10.0, 0.0]
+
+
+def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.leave(210.0)
+    bench.leave(220.0)
+    assert bench.reply(500.0, asked_ms=210.0) == [20.0, 10.0]
+    assert bench.reply(500.0, asked_ms=220.0) == [10.0, 0.0]
+
+
+def test_the_first_reply_answers_the_newest_line_that_it_can() -> None:
+    bench = Bench()
+    for number in range(10):
+        bench.leave(number * 10)
+    bench.reply(97.0)
+    bench.leave(100.0)
+    assert bench.reply(107.0) == [10.0, 0.0]
+
+
+@given(seed=st.integers(0, 10_000))
+def test_without_loss_the_dts_add_up_to_the_time_between_the_lines(seed: int) -> None:
+    chance = random.Random(seed)
+    bench = Bench().talk()
+    at = total = 190.0
+    for _ in range(200):
+        at += chance.choice([10.0, 10.0, 10.0, 4.0, 90.0])
+        bench.leave(at)
+        dt, _ = bench.reply(at + DELAY_MS)
+        assert dt >= 0.0
+        total += dt
+    assert total == pytest.approx(at, abs=0.1)
+
+
+def test_a_new_session_begins_without_a_past() -> None:
+    bench = Bench().talk()
+    bench.prompts.forget()
+    bench.leave(500.0)
+    assert bench.reply(500.0 + DELAY_MS) == [0.0, 0.0]
+
+
+# an adapter that holds answers back
+
+
+def batched(bench: Bench, seed: int, lines: int, lost: tuple[int, ...] = ()) -> float:
+    """Lines every 10 ms, answers handed over every 16 ms; ms from the first to the last of them
+    after a second."""
+    chance, told = random.Random(seed), 0.0
+    answers, leaves = [i for i in range(lines) if i not in lost], list(range(lines))
+    for batch in range(1, lines * 10 // 16 + 3):
+        at = batch * 16.0 + chance.uniform(0.0, 0.5)
+        while leaves and leaves[0] * 10 < at:
+            bench.leave(leaves.pop(0) * 10)
+        ready = [i for i in answers if i * 10 + DELAY_MS <= batch * 16]
+        answers = answers[len(ready) :]
+        if ready:
+            bench.prompts.read(int(at * MS), len(ready))
+        for number in ready:
+            answered = bench.prompts.answer()
+            if number > 100 and answered is not None:
+                told += 1000 * (answered.dt or 0.0)
+    return told
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_of_a_batched_link_each_answer_has_its_line(seed: int) -> None:
+    bench = Bench()
+    assert batched(bench, seed, 300) == pytest.approx(1990.0, abs=0.1)
+    assert not bench.prompts.lost
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_answer_lost_on_a_batched_link_is_noticed_soon(seed: int) -> None:
+    bench = Bench()
+    assert batched(bench, seed, 300, lost=(150,)) == pytest.approx(1990.0, abs=0.1)
+
+
+def test_where_a_fifth_of_a_batched_link_is_lost_nobody_can_tell_whose_an_answer_is() -> None:
+    bench = Bench()
+    batched(bench, 1, 300, lost=tuple(range(100, 300, 5)))
+    assert bench.prompts.lost
+
+
+def test_of_answers_that_take_1_to_5_ms_the_mcu_is_held_to_think() -> None:
+    bench, chance = Bench(), random.Random(1)
+    for number in range(300):
+        bench.leave(number * 10)
+        bench.reply(number * 10 + 7.0 + chance.uniform(0.0, 4.0))
+    assert bench.prompts.thinks
+
+
+def test_what_usb_makes_of_a_delay_is_no_thinking() -> None:
+    bench, chance = Bench(), random.Random(1)
+    for number in range(300):
+        bench.leave(number * 10)
+        bench.reply(number * 10 + 8.0 + chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3))
+    assert not bench.prompts.thinks
