@@ -19,6 +19,7 @@ PROMISED = [
     (errors.InUseError, OSError, 75),
     (errors.NotPermittedError, PermissionError, 77),
     (errors.CertificateError, ValueError, 78),
+    (errors.RouterFileError, ValueError, 78),
 ]
 """DESIGN section 6."""
 
