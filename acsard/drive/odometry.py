@@ -97,7 +97,8 @@ class Odometry:
         moved_dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
         turned, bridged = self._lost_turned, 0.0
         if feedback.turned is None:
-            moved_dt, unknown, bridged = moved_dt + dt, unknown + feedback.gap, feedback.bridged
+            unknown, bridged = unknown + feedback.gap, feedback.bridged
+            moved_dt += dt if feedback.counted is None else bridged
         else:
             turned = _sum(turned, feedback.turned)
         if unknown > 0.0:
@@ -106,7 +107,8 @@ class Odometry:
         if not at_rest or max(map(abs, turned)) > self._unsettled:
             rolled, turned = turned, NOWHERE
         self._lost_turned = turned
-        self._move((rolled, _times(speeds.as_tuple(), moved_dt)), gyro)
+        counted = feedback.counted or NOWHERE
+        self._move((rolled, counted, _times(speeds.as_tuple(), moved_dt)), gyro)
         if bridged > 0.0:
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
         elif feedback.gap:

@@ -15,8 +15,11 @@ fault: the zero that is being sent is all that a fault could say.
 
 from __future__ import annotations
 
+import math
+
 from acsard.config.settings import FeedbackConfig
 from acsard.mcu.feedback import Feedback
+from acsard.mcu.frames import Motors
 from acsard.values import WHEELS, WheelSpeeds
 
 REPEATED = 3
@@ -24,6 +27,9 @@ REPEATED = 3
 
 SLACK = 2.0
 """rad/s; below this coarse encoders and a robot at rest look like anything."""
+
+STEPS = 2
+"""Counts by which two reports may differ beside what the wheel did: either may hold one more."""
 
 LEAST = 0.005
 """rad/s; a line says less as zero."""
@@ -118,22 +124,25 @@ class Sanity:
         self._since += feedback.dt
         if feedback.gap:
             self._last = None
-        why = self._objection(feedback.speeds)
+        why = self._objection(feedback.speeds, feedback.steps)
         if why:
             self._impossible += 1
             return why
         self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
         return ""
 
-    def _objection(self, speeds: WheelSpeeds) -> str:
+    def _objection(self, speeds: WheelSpeeds, steps: Motors) -> str:
         settings = self._settings
         before = speeds if self._last is None else self._last
         most = settings.wheel_acceleration * self._since + SLACK
-        for name, now, then in zip(WHEELS, speeds.as_tuple(), before.as_tuple(), strict=True):
-            if abs(now) > settings.wheel_speed:
+        rows = zip(WHEELS, speeds.as_tuple(), before.as_tuple(), steps, strict=True)
+        for name, now, then, step in rows:
+            if abs(now) > settings.wheel_speed + (step if step < math.inf else 0.0):
                 return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
-            if abs(now - then) > most:
-                return f"{name} from {then:.2f} to {now:.2f} rad/s is over its acceleration"
+            if abs(now - then) > most + STEPS * step:
+                return (
+                    f"{name} from {then:.2f} to {now:.2f} rad/s is over feedback.wheel_acceleration"
+                )
         return ""
 
     def watch(self, sent: WheelSpeeds, seen: WheelSpeeds, dt: float) -> str:

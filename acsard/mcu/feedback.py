@@ -32,6 +32,11 @@ class Feedback(Struct, frozen=True):
     """s of `dt` that no line reported; the speeds of its neighbours stand in for them."""
     asked_ns: int | None = None
     """When the line it answers was made, monotonic, where the reply tells which one that is."""
+    counted: Motors | None = None
+    """rad in `WHEELS` order that the wheels turned in all of `dt` but `bridged`, where the speeds
+    show whole counts (`snapping.py`)."""
+    steps: Motors = (0.0, 0.0, 0.0, 0.0)
+    """rad/s by which each wheel's speed steps for its encoder's sake; `math.inf` is not known."""
 
 
 class Timeline:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -255,7 +256,7 @@ def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
 def test_a_line_that_ends_its_read_was_complete_when_it_was_read() -> None:
     bench = Bench().open()
     (feedback,) = bench.wait(10, GOOD)
-    assert feedback == Feedback(bench.now, WheelSpeeds(*SEED_MOTORS), 0.0)
+    assert feedback == Feedback(bench.now, WheelSpeeds(*SEED_MOTORS), 0.0, steps=(math.inf,) * 4)
 
 
 def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
