@@ -54,7 +54,7 @@ class Lattice(Struct, frozen=True):
     def counts(self, period: float) -> int:
         """Counts per turn by which a firmware divides `period` s; 0 if that is no whole number."""
         exact = math.tau / (self.quantum * period)
-        doubt = max(LEAST_DOUBT, 4 * exact * self.deviation / self.quantum)
+        doubt = max(LEAST_DOUBT, 3 * exact * self.deviation / self.quantum)
         near = doubt <= NOT_ONE_OF_THEM and abs(exact - round(exact)) <= doubt
         return round(exact) if near else 0
 
@@ -112,18 +112,19 @@ def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> 
             points.add(whole)
     if not squares:
         return None
-    quantum = products / squares
+    quantum, deviation = products / squares, DEVIATION / math.sqrt(squares)
     if quantum < FINEST:
         return None
-    off = (n for speed, n in seen.items() if not on(speed, quantum))
+    # A multiple is off by as many times what the quantum is.
+    off = (n for speed, n in seen.items() if not on(speed, quantum, 4 * deviation / quantum))
     if sum(off) > spare:
         return None
     by_chance = tries * (FINEST / quantum) ** (len(points) - 1)
     if quantum < STEEP and by_chance > BY_CHANCE:
         return None
-    return Lattice(quantum, DEVIATION / math.sqrt(squares))
+    return Lattice(quantum, deviation)
 
 
-def on(speed: float, quantum: float) -> bool:
-    """A speed in two decimals is a multiple of `quantum`."""
-    return abs(speed - quantum * round(speed / quantum)) <= ROUNDING
+def on(speed: float, quantum: float, doubt: float = 0.0) -> bool:
+    """A speed in two decimals is a multiple of `quantum`, of which a share of `doubt` is unsure."""
+    return abs(speed - quantum * round(speed / quantum)) <= ROUNDING + doubt * abs(speed)

@@ -79,26 +79,20 @@ class Snapping:
         self._lines, self._time = self._lines + 1, self._time + own
         if not self._lines % LOOK and not self._take_a_look():
             return None
+        if self._wheels[self._lines % len(self._wheels)].go_on():
+            self._settle()
         wheels, period = self._wheels, self._period
-        wheels[self._lines % len(wheels)].go_on()
         if not period:
             for wheel, speed in zip(wheels, speeds, strict=True):
                 wheel.learn(speed)
             return None
-        apart = self._apart = self._apart * KEPT + own - period
-        if abs(apart) > max(APART_S, MOST_APART * period):
-            self.forget()
+        missing = self._missing(own)
+        if missing is None:
             # What the counts have said too much or too little is settled by the lines' times.
-            a, b, c, d = (speed * (apart + period) for speed in speeds)
-            return a, b, c, d
-        missing = 0.0
-        if apart < self._least:
-            self._least = apart
-        if not self._lines % GLANCE:
-            least, self._least = self._least, apart
-            if least > MISSING * period:
-                missing = round(least / period) * period
-                self._apart -= missing
+            settled = self._apart + period
+            self.forget()
+            front_right, front_left, rear_left, rear_right = (s * settled for s in speeds)
+            return front_right, front_left, rear_left, rear_right
         a, b, c, d = wheels
         counted = (
             a.turned(speeds[0], own, missing),
@@ -108,6 +102,22 @@ class Snapping:
         )
         return self._made_good(counted) if self._owing else counted
 
+    def _missing(self, own: float) -> float | None:
+        """s of lines that nobody has bridged, which are missing before this one; None: the lines'
+        times say otherwise than the counts."""
+        period = self._period
+        apart = self._apart = self._apart * KEPT + own - period
+        if abs(apart) > max(APART_S, MOST_APART * period):
+            return None
+        if apart < self._least:
+            self._least = apart
+        if self._lines % GLANCE:
+            return 0.0
+        least, self._least = self._least, apart
+        missing = round(least / period) * period if least > MISSING * period else 0.0
+        self._apart -= missing
+        return missing
+
     def _made_good(self, counted: Motors) -> Motors:
         """These angles and what one wheel is owed: one a line, so that none takes long."""
         wheel, angles = self._owing.pop(), list(counted)
@@ -116,26 +126,28 @@ class Snapping:
         return a, b, c, d
 
     def _take_a_look(self) -> bool:
-        """Whether the wheels still report as they did; what has been found meanwhile counts."""
-        wheels, before = self._wheels, self.counts
+        """Whether the wheels still report as they did."""
+        wheels = self._wheels
         if any(wheel.off > STRAYS for wheel in wheels):
             self.forget()
             return False
-        found = [wheel for wheel in wheels if wheel.lattice and not wheel.counts]
-        if found and not self._period:
-            mean = self._time / self._lines
-            for period in _round(mean):
-                if any(wheel.show(period) for wheel in found):
-                    self._period = period
-                    break
-        for wheel in found if self._period else ():
-            wheel.show(self._period)
-        if self._lines >= LONG * LOOK:
-            self._time, self._lines = 0.0, 0
         for wheel in wheels:
             wheel.off = max(0, wheel.off - 1)
-        self._owing += [i for i, wheel in enumerate(wheels) if wheel.counts and not before[i]]
+        self._settle()
+        if self._lines >= LONG * LOOK:
+            self._time, self._lines = 0.0, 0
         return True
+
+    def _settle(self) -> None:
+        """Find what counts, and what period, the lattices are made of."""
+        found = [i for i, w in enumerate(self._wheels) if w.lattice and not w.counts]
+        periods = [self._period] if self._period else _round(self._time / self._lines)
+        for period in periods if found and self._lines >= LOOK else ():
+            shown = [i for i in found if self._wheels[i].show(period)]
+            self._owing += shown
+            if shown:
+                self._period = period
+                return
 
 
 def _round(mean: float) -> list[float]:

@@ -47,6 +47,11 @@ class WheelCounter:
         """rad/s by which it steps for its encoder's sake; `math.inf` while unknown."""
         return self.quantum or self.steps.size
 
+    @property
+    def searches(self) -> bool:
+        """It is being looked for a lattice."""
+        return self._search is not None
+
     def learn(self, speed: float) -> None:
         """The next report of a wheel whose counts are unknown."""
         if speed and self._told is not None:
@@ -57,16 +62,17 @@ class WheelCounter:
         if self._search is None and abs(speed - self._last) >= FLICKER:
             self._last, size = speed, abs(speed)
             self._missing -= 1
-            fresh = self._missing < LEARNED_FROM and size >= FINEST
-            if fresh and (size in self._seen or len(self._seen) < MOST_SEEN):
+            fresh = self._missing < LEARNED_FROM or self.lattice is not None
+            room = size in self._seen or len(self._seen) < MOST_SEEN
+            if fresh and room and size >= FINEST:
                 self._seen[size] = self._seen.get(size, 0) + 1
             if self._missing <= 0 and self._seen:
                 self._search = search(self._seen)
 
-    def go_on(self) -> None:
-        """Search a little further, if it does."""
+    def go_on(self) -> bool:
+        """Search a little further, if it does; whether it has just found a lattice."""
         if self._search is None:
-            return
+            return False
         try:
             next(self._search)
         except StopIteration as end:
@@ -75,6 +81,8 @@ class WheelCounter:
                 self._seen = {}
             self._missing = self._patience
             self._patience = min(2 * self._patience, LONGEST_WAIT)
+            return self.lattice is not None
+        return False
 
     def turned(self, speed: float, own: float, missing: float) -> float:
         """rad in the `own` s of this line; `missing` s more went by that no line reported."""
