@@ -339,5 +339,5 @@ class Snapshot(Struct, frozen=True):
     gyro: GyroStatus = GyroStatus()
     check: str = "plain"
     """Which check the serial lines have, in words."""
-    encoders: tuple[int, ...] = (0, 0, 0, 0)
+    encoders: tuple[int, ...] = ()
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""

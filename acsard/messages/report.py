@@ -283,8 +283,8 @@ class Report:
 
 def _found(encoders: tuple[int, ...]) -> dict[str, str]:
     """What the serial link's row says of the encoders: nothing, where nothing was found."""
-    counts = {name: str(n) for name, n in zip(WHEELS, encoders, strict=True) if n}
-    return {f"counts_{name}": n for name, n in counts.items()}
+    named = zip(WHEELS, encoders, strict=False)
+    return {f"counts_{name}": str(counts) for name, counts in named if counts}
 
 
 def _spread(spread: Measurements) -> Spread:

@@ -603,3 +603,32 @@ def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
     count = 0.05 * math.tau / 20
     assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
     assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+
+
+# whole counts of this line alone
+
+
+def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float = 0.0) -> Feedback:
+    speeds = WheelSpeeds(speed, speed, speed, speed)
+    return Feedback(AT, speeds, dt, bridged=bridged, counted=(turned,) * 4)
+
+
+def test_what_a_line_counted_is_how_far_it_went_whatever_its_speed_and_time_say() -> None:
+    robot = odometry()
+    for dt in (0.01, 0.003, 0.017):
+        robot.fold(snapped(0.1, dt))
+    assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
+
+
+def test_what_was_bridged_comes_on_top_of_what_a_line_counted() -> None:
+    robot = odometry()
+    robot.fold(snapped(0.1, dt=0.02, speed=10.0))
+    robot.fold(snapped(0.1, dt=0.03, speed=10.0, bridged=0.02))
+    assert robot.pose.x == pytest.approx((0.1 + 0.2 + 0.1) * 0.05)
+
+
+def test_a_line_that_was_dropped_is_made_up_for_by_the_next_ones_speed() -> None:
+    robot = odometry()
+    robot.skip(snapped(5.0, speed=99.0))
+    robot.fold(snapped(0.1, speed=10.0))
+    assert robot.pose.x == pytest.approx((0.1 + 0.1) * 0.05)

@@ -1,14 +1,14 @@
 """Drives as coarse encoders report them, and what becomes of the pose: the raw counter beside it.
 
-450 m of random driving: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the wheels' true
-angles at each report; the raw counter folds the exact differences of their whole counts instead.
-Written in numpy from the equations, and shares no code with what it judges.
+450 m of random driving: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the wheels'
+true angles at each report; the raw counter folds the exact differences of their whole counts
+instead. Written in numpy from the equations, and shares no code with what it judges.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,14 +102,7 @@ class Host:
                 self.odometry.fold(feedback)
 
 
-Firmware = Callable[[Array], Iterator[bytes]]
-
-
-def by_nominal(counts: int, period: float = PERIOD) -> Firmware:
-    """Counts of a period, divided by what the period should be."""
-
-    def lines(wheels: Array) -> Iterator[bytes]:
-        for row in counted(wheels, counts) * (math.tau / counts / period):
-            yield text(row)
-
-    return lines
+def lines(wheels: Array, counts: int) -> Iterator[bytes]:
+    """What a firmware sends that divides counts by what its period should be."""
+    for row in counted(wheels, counts) * (math.tau / counts / PERIOD):
+        yield text(row)

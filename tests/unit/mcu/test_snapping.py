@@ -29,8 +29,8 @@ def drive(seconds: float = 30.0, seed: int = 1) -> Array:
 
 def speeds(counts: int | list[int], wheels: Array | None = None, period: float = PERIOD) -> Array:
     """What a firmware reports of them, in two decimals."""
-    every = np.array(counts) * np.ones(4)
-    return np.round(whole(counts, wheels) * math.tau / every / period, 2)
+    told: Array = np.round(whole(counts, wheels) * math.tau / np.array(counts) / period, 2)
+    return told
 
 
 def whole(counts: int | list[int], wheels: Array | None = None) -> Array:
@@ -49,7 +49,7 @@ def look(
 
 def total(lines: list[Feedback]) -> Array:
     """rad that odometry makes of them, by wheel."""
-    return np.sum([folded(line) for line in lines], axis=0)
+    return np.array([folded(line) for line in lines]).sum(axis=0, dtype=np.float64)
 
 
 def folded(line: Feedback) -> Four:
