@@ -49,7 +49,8 @@ def look(
 
 def total(lines: list[Feedback]) -> Array:
     """rad that odometry makes of them, by wheel."""
-    return np.array([folded(line) for line in lines]).sum(axis=0, dtype=np.float64)
+    turned: Array = np.array([folded(line) for line in lines]).sum(axis=0)
+    return turned
 
 
 def folded(line: Feedback) -> Four:
