@@ -116,7 +116,10 @@ class Odometry:
         else:
             self._gaps.follow(twist, dt)
         spread = self._twist_uncertainty
-        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt)
+        step = 0.0
+        if feedback.counted is not None:
+            step = max([one for one in feedback.steps if one < math.inf], default=0.0)
+        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt, step)
         if gyro is not None and dt > 0.0:
             twist = Twist(twist.linear, gyro.rate)
             variances = spread.with_gyro(variances, gyro.rate_variance)

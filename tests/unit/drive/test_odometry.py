@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -632,3 +633,17 @@ def test_a_line_that_was_dropped_is_made_up_for_by_the_next_ones_speed() -> None
     robot.skip(snapped(5.0, speed=99.0))
     robot.fold(snapped(0.1, speed=10.0))
     assert robot.pose.x == pytest.approx((0.1 + 0.1) * 0.05)
+
+
+def test_the_twist_of_a_line_is_as_uncertain_as_its_counts_are_coarse() -> None:
+    coarse, fine = (
+        odometry().fold(msgspec.structs.replace(snapped(0.1), steps=(step,) * 4))
+        for step in (31.4, 0.3)
+    )
+    assert coarse.twist_variances.angular > 100 * fine.twist_variances.angular
+
+
+def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> None:
+    robot, steps = odometry(), (math.inf, 31.4, 31.4, math.inf)
+    some = robot.fold(msgspec.structs.replace(snapped(0.1), steps=steps))
+    assert math.isfinite(some.twist_variances.linear)
