@@ -141,8 +141,9 @@ class Snapping:
     def _settle(self) -> None:
         """Find what counts, and what period, the lattices are made of."""
         found = [i for i, w in enumerate(self._wheels) if w.lattice and not w.counts]
-        periods = [self._period] if self._period else _round(self._time / self._lines)
-        for period in periods if found and self._lines >= LOOK else ():
+        if not found or self._lines < LOOK:
+            return
+        for period in [self._period] if self._period else _round(self._time / self._lines):
             shown = [i for i in found if self._wheels[i].show(period)]
             self._owing += shown
             if shown:

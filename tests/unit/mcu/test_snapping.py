@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.snapping import Snapping
+from acsard.mcu.snapping import LONG, LOOK, Snapping
 from acsard.values import Instant, WheelSpeeds
 from tests.unit.mcu.counted import PERIOD, Array, angles, counted
 
@@ -249,3 +249,13 @@ def test_no_single_line_has_to_wait_for_the_search(counts: int) -> None:
     print(f"\n{counts}: {np.median(each):.0f} lines of Python a report, {max(each)} at most")
     assert np.median(each) < 250
     assert max(each) < 3000
+
+
+def test_counts_are_found_whenever_the_wheels_begin_to_turn() -> None:
+    whole_block = LOOK * LONG
+    toggling = np.array([[0.0] * 4, [31.42] * 4] * 150)
+    for standing in range(whole_block - 120, whole_block - 95):
+        snapping = Snapping()
+        look(snapping, np.zeros((standing, 4)))
+        look(snapping, toggling)
+        assert snapping.counts == (20,) * 4
