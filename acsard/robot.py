@@ -12,6 +12,7 @@ from collections import Counter
 
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
+from acsard.drive.dropped import Dropped
 from acsard.drive.gyro import Gyro, Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
@@ -83,6 +84,7 @@ class Robot:
         adds what it alone sees (lines that were superseded, the bus)."""
         self._refused = ""
         self._sanity = Sanity(config.feedback)
+        self._dropped = Dropped()
         self._tally = Tally()
         self._asked: tuple[str, str, int | None] = ("", "", None)
         """The request before; a stop comes twice, ahead of its query and with it."""
@@ -106,6 +108,7 @@ class Robot:
             refused=self._refused,
             gyro=GyroStatus() if self._gyro is None else self._gyro.status,
             check=session.negotiation.in_force,
+            encoders=session.snapping.counts,
         )
 
     @property
@@ -204,6 +207,9 @@ class Robot:
     def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Estimate | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
+        told = self._dropped.line(why)
+        if told is not None:
+            events.append(told)
         if why:
             self.counters["line_impossible"] += 1
             events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))

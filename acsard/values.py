@@ -153,7 +153,8 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "wheels_turned", "gyro", "imu_refused", "bus_stuck", "missed_periods",
+    "lines_rejected", "lines_dropped", "wheels_turned", "gyro", "imu_refused", "bus_stuck",
+    "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
@@ -341,3 +342,5 @@ class Snapshot(Struct, frozen=True):
     gyro: GyroStatus = GyroStatus()
     check: str = "plain"
     """Which check the serial lines have, in words."""
+    encoders: tuple[int, ...] = ()
+    """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""

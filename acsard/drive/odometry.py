@@ -104,7 +104,8 @@ class Odometry:
         moved_dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
         turned, bridged = self._lost_turned, 0.0
         if feedback.turned is None:
-            moved_dt, unknown, bridged = moved_dt + dt, unknown + feedback.gap, feedback.bridged
+            unknown, bridged = unknown + feedback.gap, feedback.bridged
+            moved_dt += dt if feedback.counted is None else bridged
         else:
             turned = _sum(turned, feedback.turned)
         if unknown > 0.0:
@@ -114,7 +115,9 @@ class Odometry:
             rolled, turned = turned, NOWHERE
         self._lost_turned = turned
         between = _between(self.speeds, speeds, bridged) if bridged else NOWHERE
-        self._move((rolled, between, _times(speeds.as_tuple(), moved_dt - bridged)), gyro)
+        counted = feedback.counted or NOWHERE
+        uncounted = _times(speeds.as_tuple(), moved_dt - bridged)
+        self._move((rolled, between, counted, uncounted), gyro)
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -123,7 +126,10 @@ class Odometry:
         else:
             self._gaps.follow(twist, dt)
         spread = self._twist_uncertainty
-        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt)
+        step = 0.0
+        if feedback.counted is not None:
+            step = max([one for one in feedback.steps if one < math.inf], default=0.0)
+        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt, step)
         if gyro is not None and dt > 0.0:
             twist = Twist(twist.linear, gyro.rate)
             variances = spread.with_gyro(variances, gyro.rate_variance)

@@ -15,6 +15,8 @@ fault: the zero that is being sent is all that a fault could say.
 
 from __future__ import annotations
 
+import math
+
 from acsard.config.settings import FeedbackConfig
 from acsard.mcu.feedback import Feedback
 from acsard.values import WHEELS, WheelSpeeds
@@ -24,6 +26,9 @@ REPEATED = 3
 
 SLACK = 2.0
 """rad/s; below this coarse encoders and a robot at rest look like anything."""
+
+STEPS = 2
+"""Counts by which two reports may differ beside what the wheel did: either may hold one more."""
 
 LEAST = 0.005
 """rad/s; a line says less as zero."""
@@ -118,22 +123,26 @@ class Sanity:
         self._since += max(feedback.dt, feedback.since)
         if feedback.gap:
             self._last = None
-        why = self._objection(feedback.speeds)
+        why = self._objection(feedback)
         if why:
             self._impossible += 1
             return why
         self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
         return ""
 
-    def _objection(self, speeds: WheelSpeeds) -> str:
-        settings = self._settings
+    def _objection(self, line: Feedback) -> str:
+        settings, speeds = self._settings, line.speeds
         before = speeds if self._last is None else self._last
         most = settings.wheel_acceleration * self._since + SLACK
-        for name, now, then in zip(WHEELS, speeds.as_tuple(), before.as_tuple(), strict=True):
-            if abs(now) > settings.wheel_speed:
+        rows = zip(WHEELS, speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
+        for name, now, then, step in rows:
+            # Of steps that are not proven counts a lying encoder may make as many as it likes.
+            room = 0.0 if line.counted is None or step == math.inf else step
+            if abs(now) > settings.wheel_speed + room:
                 return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
-            if abs(now - then) > most:
-                return f"{name} from {then:.2f} to {now:.2f} rad/s is over its acceleration"
+            if abs(now - then) > most + STEPS * step:
+                leap = f"{name} from {then:.2f} to {now:.2f} rad/s"
+                return f"{leap} is over feedback.wheel_acceleration"
         return ""
 
     def watch(self, sent: WheelSpeeds, seen: WheelSpeeds, dt: float) -> str:

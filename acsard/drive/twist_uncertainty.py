@@ -50,12 +50,15 @@ class TwistUncertainty:
         self._to_angular = kinematics.radius**2 / kinematics.track**2 / 12
         self._period = PERIOD
 
-    def of(self, twist: Twist, dt: float) -> TwistVariances:
-        """Of a report that came `dt` s after the one before; 0 if that is unknown."""
+    def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
+        """Of a report that came `dt` s after the one before; 0 if that is unknown.
+
+        `step` is what one count more makes of a wheel's speed, rad/s, where the lines show it.
+        """
         if dt > 0.0:
             self._period += SMOOTHED * (dt - self._period)
         period, linear, angular = self._period, twist.linear, twist.angular
-        quantum = max(DECIMAL, self._count / period) ** 2
+        quantum = max(DECIMAL, self._count / period, step) ** 2
         along, yaw, _ = self._noise.of(linear, angular, abs(angular))
         along, yaw = along / period, yaw / period
         for to_along, by_turn, to_yaw, of_turn in self._effects:

@@ -51,6 +51,11 @@ class Feedback(Struct, frozen=True):
     """s since the previous line came, 0 after a silence: what it is judged by."""
     heard_ns: int = 0
     """When it was complete here, monotonic."""
+    counted: Motors | None = None
+    """rad in `WHEELS` order that the wheels turned in all of `dt` but `bridged`, where the speeds
+    show whole counts (`snapping.py`)."""
+    steps: Motors = (0.0, 0.0, 0.0, 0.0)
+    """rad/s by which each wheel's speed steps for its encoder's sake; `math.inf` is not known."""
 
 
 class Told(Struct, frozen=True, gc=False):

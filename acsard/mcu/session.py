@@ -17,6 +17,7 @@ from acsard.mcu.lines import LineReader
 from acsard.mcu.link import WORDS, Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
+from acsard.mcu.snapping import Snapping
 from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
@@ -49,6 +50,7 @@ class McuSession:
         self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
+        self.snapping = Snapping()
         self._wants_samples = mcu.wants_samples
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
@@ -161,6 +163,7 @@ class McuSession:
         self._opened = opened
         self._lines.clear()
         self._timeline.forget()
+        self.snapping.forget()
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
@@ -170,6 +173,7 @@ class McuSession:
         self._link.sign("restarted")
         self.restarted = self._starting_over = True
         self._timeline.forget()
+        self.snapping.forget()
         self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
@@ -274,4 +278,4 @@ class McuSession:
             self._reject("count_leap", more)
         if self._timeline.restarted:
             self._restart("has started again: its clock went back")
-        return feedback
+        return self.snapping.look(feedback)

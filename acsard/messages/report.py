@@ -40,7 +40,7 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S, Estimate, GyroStatus, Instant, Outputs, Snapshot
+from acsard.values import NS_PER_S, WHEELS, Estimate, GyroStatus, Instant, Outputs, Snapshot
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
 
@@ -205,6 +205,7 @@ class Report:
                 for name, one in snapshot.figures.items()
             },
             gyro=snapshot.gyro.does,
+            encoders=list(snapshot.encoders),
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -242,6 +243,7 @@ class Report:
                 ok if outputs.link == "up" else error,
                 outputs.link,
                 {"port": config.mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
+                | _found(snapshot.encoders)
                 | {k: str(v) for k, v in counters.items() if k.startswith("line")},
             ),
             (
@@ -279,6 +281,12 @@ class Report:
                 for name, level, message, values in statuses
             ],
         )
+
+
+def _found(encoders: tuple[int, ...]) -> dict[str, str]:
+    """What the serial link's row says of the encoders: nothing, where nothing was found."""
+    named = zip(WHEELS, encoders, strict=False)
+    return {f"counts_{name}": str(counts) for name, counts in named if counts}
 
 
 def _spread(spread: Measurements) -> Spread:

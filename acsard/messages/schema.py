@@ -216,6 +216,8 @@ class RobotState(Message, frozen=True):
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
     gyro: str = "off"
     """What the gyro does for odometry: `values.GyroDoes`."""
+    encoders: list[int] = []
+    """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
 
 
 class DoorState(Message, frozen=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import Counter
 from itertools import pairwise
 
 import pytest
@@ -747,6 +748,15 @@ def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> No
     lines = [event for event in told if event.name == "port_lost"]
     assert len(lines) <= 15
     assert sum(event.count for event in lines) > 900
+
+
+def test_over_one_line_in_a_hundred_that_cannot_be_true_is_told_with_what_to_do() -> None:
+    bench, told = Bench().linked(), Counter[str]()
+    for i in range(2000):
+        bench.reply = bench.codec.encode(WheelSpeeds(99.0, 0.0, 0.0, 0.0) if i % 50 == 0 else STILL)
+        told.update(names(bench.step()))
+    assert told["lines_dropped"] == 2
+    assert bench.out.mode == "ready"
 
 
 def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:

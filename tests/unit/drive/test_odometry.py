@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -622,3 +623,46 @@ def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
     odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
     odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
     assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
+
+
+# whole counts of this line alone
+
+
+def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float = 0.0) -> Feedback:
+    speeds = WheelSpeeds(speed, speed, speed, speed)
+    return Feedback(AT, speeds, dt, bridged=bridged, counted=(turned,) * 4)
+
+
+def test_what_a_line_counted_is_how_far_it_went_whatever_its_speed_and_time_say() -> None:
+    robot = odometry()
+    for dt in (0.01, 0.003, 0.017):
+        robot.fold(snapped(0.1, dt))
+    assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
+
+
+def test_what_was_bridged_comes_on_top_of_what_a_line_counted() -> None:
+    robot = odometry()
+    robot.fold(snapped(0.1, dt=0.02, speed=10.0))
+    robot.fold(snapped(0.1, dt=0.03, speed=10.0, bridged=0.02))
+    assert robot.pose.x == pytest.approx((0.1 + 0.2 + 0.1) * 0.05)
+
+
+def test_a_line_that_was_dropped_is_made_up_for_by_the_next_ones_speed() -> None:
+    robot = odometry()
+    robot.skip(snapped(5.0, speed=99.0))
+    robot.fold(snapped(0.1, speed=10.0))
+    assert robot.pose.x == pytest.approx((0.1 + 0.1) * 0.05)
+
+
+def test_the_twist_of_a_line_is_as_uncertain_as_its_counts_are_coarse() -> None:
+    coarse, fine = (
+        odometry().fold(msgspec.structs.replace(snapped(0.1), steps=(step,) * 4))
+        for step in (31.4, 0.3)
+    )
+    assert coarse.twist_variances.angular > 100 * fine.twist_variances.angular
+
+
+def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> None:
+    robot, steps = odometry(), (math.inf, 31.4, 31.4, math.inf)
+    some = robot.fold(msgspec.structs.replace(snapped(0.1), steps=steps))
+    assert math.isfinite(some.twist_variances.linear)

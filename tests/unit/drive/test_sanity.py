@@ -144,6 +144,40 @@ def test_forgetting_drops_the_evidence_against_every_wheel() -> None:
         sanity.forget()
 
 
+# coarse encoders
+
+
+def stepping(speeds: WheelSpeeds, step: float, proven: bool = False) -> Feedback:
+    counted = (0.0,) * 4 if proven else None
+    return Feedback(AT, speeds, DT, steps=(step,) * 4, counted=counted)
+
+
+def test_a_count_more_or_less_at_each_end_is_no_change_of_speed() -> None:
+    # 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 31.4 rad/s
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    assert sanity.impossible(stepping(STILL, 31.4)) == ""
+    assert sanity.impossible(stepping(only(0, 65.7), 31.4)) == ""
+    assert "front_right" in sanity.impossible(stepping(only(0, -0.2), 31.4))
+
+
+def test_a_proven_count_more_is_not_too_fast() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
+    assert sanity.impossible(stepping(only(2, 80.0), 31.4, proven=True)) == ""
+    assert "wheel_speed" in sanity.impossible(stepping(only(2, 81.5), 31.4, proven=True))
+
+
+def test_a_step_that_may_be_a_lie_leaves_no_speed_too_fast_unsaid() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
+    assert "feedback.wheel_speed" in sanity.impossible(stepping(only(2, 50.1), 31.4))
+
+
+def test_while_an_encoder_is_unknown_any_change_may_be_a_count_but_no_speed_too_fast() -> None:
+    sanity = Sanity(FeedbackConfig())
+    assert sanity.impossible(stepping(STILL, math.inf)) == ""
+    assert sanity.impossible(stepping(only(1, 79.9), math.inf)) == ""
+    assert "front_left" in sanity.impossible(stepping(only(1, 80.1), math.inf))
+
+
 # contradictions
 
 

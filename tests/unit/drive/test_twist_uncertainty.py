@@ -32,6 +32,13 @@ def test_counts_are_coarser_than_decimals() -> None:
     assert variances.angular == pytest.approx(0.05**2 * 1.570796**2 / 12 / 0.09)
 
 
+def test_counts_that_the_lines_show_are_as_coarse_as_those_that_are_configured() -> None:
+    shown = uncertainty().of(Twist(0.5, 0.0), 0.01, step=1.570796)
+    configured = uncertainty(counts=400).of(Twist(0.5, 0.0), 0.01)
+    assert shown.linear == pytest.approx(configured.linear)
+    assert shown.angular == pytest.approx(configured.angular)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_noise_is_that_of_a_period_over_its_square(sign: float) -> None:
     # 1e-4 m2/m x 0.5 m/s / 0.01 s, and 1e-4 rad2/m x 0.5 m/s / 0.01 s

@@ -17,8 +17,9 @@ import pytest
 from acsard.config.settings import FeedbackConfig, WheelMap
 from acsard.drive.sanity import Sanity
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.frames import Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
+from acsard.mcu.snapping import Snapping
 from acsard.values import STILL, Instant, WheelSpeeds
 
 KINDS = ("bit flipped", "byte lost", "byte doubled", "lines merged", "noise")
@@ -99,14 +100,50 @@ def test_damage_raises_nothing_and_is_accepted_as_rarely_as_a_plain_line_allows(
     assert believed[0] < wrong[0]
 
 
-def plausible(sanity: Sanity, before: WheelSpeeds, speeds: WheelSpeeds) -> bool:
-    """The slew check lets these speeds pass one period after those."""
+def plausible(
+    sanity: Sanity, before: WheelSpeeds, speeds: WheelSpeeds, steps: Motors = (0.0,) * 4
+) -> bool:
+    """The slew check lets these speeds pass one period after those; `steps` are the encoders'."""
     sanity.forget()
     sanity.impossible(Feedback(AT, before, 0.01))
-    return not sanity.impossible(Feedback(AT, speeds, 0.01))
+    return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps))
 
 
 def test_the_slew_check_itself_tells_a_leap_from_a_step() -> None:
     sanity = Sanity(FeedbackConfig())
     assert plausible(sanity, STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert not plausible(sanity, STILL, WheelSpeeds(0.0, 40.0, 0.0, 0.0))
+
+
+def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
+    """One bit of one in so many lines is flipped, and the steps are learned from all that come: how
+    many say something wrong, how many of these pass, and how many would had nothing been learned.
+    """
+    rng, codec, snapping = random.Random(5), Codec(WheelMap()), Snapping()
+    sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL
+    for i, line in enumerate(lines):
+        truth, speeds = codec.decode(line[:-2]), None
+        sent = hurt(0, line, line, rng.random(), rng.randrange(31)) if i % every == 0 else line
+        try:
+            speeds = codec.decode(sent[:-2])
+        except FrameError:
+            continue
+        steps = snapping.look(Feedback(AT, speeds, 0.01)).steps
+        if speeds != truth and i > len(lines) // 10:
+            wrong += 1
+            believed[0] += plausible(sanity, before, speeds, steps)
+            believed[1] += plausible(sanity, before, speeds)
+        before = truth
+    return wrong, believed[0], believed[1]
+
+
+@pytest.mark.parametrize("every", [50, 1000])
+def test_what_is_learned_of_fine_encoders_lets_hardly_more_damage_pass(every: int) -> None:
+    lines = drive(random.Random(6), 20_000)
+    wrong = passed = would = 0
+    for start in range(1 if every == 50 else 4):
+        more = live(lines[start:], every)
+        wrong, passed, would = wrong + more[0], passed + more[1], would + more[2]
+    print(f"\none line in {every}: {wrong} wrong, {passed} pass, {would} with nothing learned")
+    assert wrong > 10
+    assert passed <= 1.15 * would

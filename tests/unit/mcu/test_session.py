@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -264,6 +265,7 @@ def test_a_line_that_ends_its_read_was_complete_then_and_made_its_own_bytes_earl
     assert feedback.heard_ns == bench.now_ns
     assert feedback.at == sampled(bench, 0)
     assert (feedback.speeds, feedback.dt) == (WheelSpeeds(*SEED_MOTORS), 0.0)
+    assert feedback.steps == (math.inf,) * 4
 
 
 def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
@@ -674,3 +676,33 @@ def test_the_link_is_seen_to_go_when_the_mcu_restarts_within_one_read() -> None:
     assert bench.link() == "booting"
     bench.wait(10, GOOD)
     assert bench.link() == "up"
+
+
+def counts_after(bench: Bench, counts: int) -> tuple[int, ...]:
+    """What is found of an encoder that tells one count more or less from line to line."""
+    speed = math.tau / counts / 0.01
+    for i in range(400):
+        line = ",".join(f"{motor}p{speed * (i % 2):05.2f}" for motor in "abcd")
+        bench.wait(10, line.encode() + b"\r\n")
+    return bench.session.snapping.counts
+
+
+def test_the_counts_of_an_encoder_are_found_in_its_lines() -> None:
+    assert counts_after(Bench().up(), 20) == (20,) * 4
+
+
+@pytest.mark.parametrize("counts", [20, 40])
+def test_behind_a_port_opened_again_the_encoders_are_unknown(counts: int) -> None:
+    bench = Bench().up()
+    counts_after(bench, 20)
+    bench.close().wait(10)
+    bench.open().wait(10)
+    assert bench.session.snapping.counts == (0,) * 4
+    assert counts_after(bench, counts) == (counts,) * 4
+
+
+def test_an_mcu_that_has_started_again_may_be_another() -> None:
+    bench = Bench().up()
+    counts_after(bench, 20)
+    bench.wait(10, BOOTED)
+    assert bench.session.snapping.counts == (0,) * 4

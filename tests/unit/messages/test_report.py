@@ -387,6 +387,22 @@ def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> Non
     }
 
 
+def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, set(), never))
+
+    def seen() -> Snapshot:
+        return replace(SNAPSHOT, encoders=(20, 0, 0, 400))
+
+    state, array = report.current("state", seen), report.current("diagnostics", seen)
+    assert isinstance(state, RobotState)
+    assert isinstance(array, DiagnosticArray)
+    assert state.encoders == [20, 0, 0, 400]
+    (row,) = (one for one in array.status if one.name == "acsard: serial link")
+    shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
+    assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
+
+
 @pytest.mark.parametrize(("missed", "level"), [(0, 0), (10, 0), (11, 1)])
 def test_more_than_one_missed_period_in_a_hundred_is_a_warning(missed: int, level: int) -> None:
     one = status("control loop", counters={"missed_periods": missed})

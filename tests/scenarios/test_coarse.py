@@ -1,0 +1,51 @@
+"""A robot with coarse encoders drives about, and the daemon says what it found of them."""
+
+from __future__ import annotations
+
+import math
+import random
+from contextlib import nullcontext
+
+import pytest
+
+from acsard.config.settings import Config, SimConfig
+from tests.scenarios.world import World
+
+
+def driven(counts: int, reporting: bool) -> World:
+    """Ten seconds of driving about, and at rest again; reporting by its own clock or asked."""
+    world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
+    world.bus.wanted = set()
+    with world.mcu.unprompted(0.01) if reporting else nullcontext():
+        world.run(0.5)
+        for _ in range(4):
+            world.drive(dice.choice((-1, 1)) * dice.uniform(0.3, 0.9), dice.uniform(-1, 1), 2.5)
+        world.send(0.0)
+        world.run(2.0)
+    return world
+
+
+def off(world: World) -> float:
+    """m from where it truly is."""
+    state, true = world.state, world.mcu.vehicle.pose
+    return math.hypot(state.x - true.x, state.y - true.y)
+
+
+@pytest.mark.parametrize(
+    "counts", [20, *(pytest.param(counts, marks=pytest.mark.slow) for counts in (16, 96, 400))]
+)
+def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -> None:
+    world = driven(counts, reporting=True)
+    assert world.state.encoders == [counts] * 4
+    assert "line_impossible" not in world.state.counters
+    assert not [event for event in world.events if event.name in ("fault", "lines_dropped")]
+    # a count of each wheel at either end, twice that by the heading, and the shape of the arcs
+    assert off(world) < 0.005 + 3 * math.tau / counts * 0.05
+
+
+@pytest.mark.parametrize("counts", [20, pytest.param(40, marks=pytest.mark.slow)])
+def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int) -> None:
+    world = driven(counts, reporting=False)
+    assert "line_impossible" not in world.state.counters
+    assert not [event for event in world.events if event.name == "fault"]
+    assert world.state.encoders == [0] * 4

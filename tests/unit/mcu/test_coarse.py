@@ -1,0 +1,106 @@
+"""Coarse encoders from bytes to pose: no true line dropped, and the error is the raw counter's.
+
+pytest -m slow -s tests/unit/mcu/test_coarse.py
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from msgspec import Struct
+
+from acsard.config.settings import FeedbackConfig
+from tests.unit.mcu.counted import PERIOD, Array, Host, angles, counted, end, lines, text
+
+COUNTS = (16, 20, 40, 96, 400)
+FINER = (1000, 2000, 4000)
+
+
+class Driven(Struct, frozen=True):
+    """How far from the truth a drive ended, m: by counts, by reports as they stand, by us."""
+
+    raw: float
+    plain: float
+    ours: float
+    lines: int
+    dropped: int
+
+
+def drive(counts: int, seed: int, seconds: float) -> Driven:
+    wheels = angles(np.random.default_rng(seed), seconds)
+    host = Host()
+    for line in lines(wheels, counts):
+        host.hear(line)
+    assert host.session.snapping.counts == (counts,) * 4
+    pose, true = host.odometry.pose, end(np.diff(wheels, axis=0))
+    exact = counted(wheels, counts) * math.tau / counts
+    plain = np.round(exact / PERIOD, 2) * PERIOD
+    return Driven(
+        math.dist(end(exact), true),
+        math.dist(end(plain), true),
+        math.dist((pose.x, pose.y), true),
+        host.lines,
+        host.dropped,
+    )
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_counter_says(counts: int) -> None:
+    one = drive(counts, 1, 25.0)
+    assert one.dropped == 0
+    assert one.ours == pytest.approx(one.raw, abs=0.004)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("counts", COUNTS + FINER)
+def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int) -> None:
+    drives = [drive(counts, seed, 600.0) for seed in range(20)]
+    raw, plain, ours = (
+        float(np.mean([getattr(one, what) for one in drives])) for what in ("raw", "plain", "ours")
+    )
+    dropped = sum(one.dropped for one in drives)
+    print(
+        f"\n{counts}: raw counter {raw * 1e3:.1f} mm, reports {plain * 1e3:.1f} mm, "
+        f"ours {ours * 1e3:.1f} mm ({ours / raw:.3f}), {dropped} lines dropped"
+    )
+    assert dropped == 0
+    assert ours <= 1.05 * raw or counts in FINER
+    assert ours < 0.2 * plain or counts not in FINER
+
+
+# what else there may be to coarse encoders: nobody's counts are found, and no line is dropped
+
+
+def heard(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
+    host = Host(feedback)
+    for row in rows:
+        host.hear(text(row))
+    return host
+
+
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+@pytest.mark.parametrize("acceleration", [100.0, 1500.0])
+def test_no_line_is_dropped_of_a_firmware_that_divides_by_the_time_it_measured(
+    counts: int, acceleration: float
+) -> None:
+    wheels, dice = angles(np.random.default_rng(2), 25.0), np.random.default_rng(1)
+    read = np.concatenate([[0.0], np.cumsum(dice.uniform(0.7, 1.3, len(wheels) - 100))])
+    at = [np.interp(read, np.arange(len(wheels)), wheel) for wheel in wheels.T]
+    rows = counted(np.array(at).T, counts) * math.tau / counts / PERIOD / np.diff(read)[:, None]
+    host = heard(np.round(rows, 2), FeedbackConfig(wheel_acceleration=acceleration))
+    assert (host.dropped, host.why) == (0, "")
+
+
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7, 0.9])
+def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float) -> None:
+    wheels, speed, rows = angles(np.random.default_rng(3), 25.0), np.zeros(4), []
+    for row in counted(wheels, counts) * math.tau / counts / PERIOD:
+        speed = speed + share * (row - speed)
+        rows.append(speed)
+    host = heard(np.round(np.array(rows), 2))
+    assert (host.dropped, host.why) == (0, "")
+    assert host.session.snapping.counts == (0,) * 4
