@@ -153,7 +153,7 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "wheels_turned", "gyro", "imu_refused", "bus_stuck", "missed_periods",
+    "lines_rejected", "wheels_turned", "wheels_doubted", "gyro", "imu_refused", "bus_stuck", "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
@@ -213,6 +213,19 @@ class SourceStatus(Struct, frozen=True):
     priority: int
     age_s: float | None
     waits_for: Wait
+
+
+class WheelsStatus(Struct, frozen=True):
+    """What front and rear of each side say of each other; all empty while they agree."""
+
+    text: str = ""
+    """What is wrong, in words."""
+    left_out: tuple[str, ...] = ()
+    """The wheels that the pose goes without."""
+    slipping: tuple[str, ...] = ()
+    """`left`, `right`: now, or half a second ago."""
+    differ: tuple[float, float] = (0.0, 0.0)
+    """By which share the front wheel turns more than the rear one, left and right, always."""
 
 
 class GyroSample(Struct, frozen=True):
@@ -336,5 +349,6 @@ class Snapshot(Struct, frozen=True):
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `runtime/figures.py`."""
     gyro: GyroStatus = GyroStatus()
+    doubt: WheelsStatus = WheelsStatus()
     check: str = "plain"
     """Which check the serial lines have, in words."""

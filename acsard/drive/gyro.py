@@ -73,6 +73,10 @@ class Turn(Struct, frozen=True):
     rate: float
     """rad/s, what it says now, and its variance: the angle may hold what came late."""
     rate_variance: float
+    wheels: float | None = None
+    """rad the wheels would tell for this turn, skidding as they do."""
+    slips: bool = False
+    """The wheels do: they told another turn of late."""
 
 
 class Gyro:
@@ -141,7 +145,9 @@ class Gyro:
         hole, self._hole = self._hole, False
         if hole or self._does not in ("used", "disagrees"):
             return None
-        return Turn(angle, variance, self._rate, self._noise + self._bias.variance)
+        variances = variance, self._noise + self._bias.variance
+        skids, slips = max(PROPORTIONS[0], self._match.ratio), self._does == "disagrees"
+        return Turn(angle, variances[0], self._rate, variances[1], angle / skids, slips)
 
     # samples
 
