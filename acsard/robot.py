@@ -223,6 +223,7 @@ class Robot:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
         estimate = self._odometry.fold(line, self._turn(line, events), self._speeds)
+        self.counters["wheels_doubted"] += len(self._odometry.events)
         events += self._odometry.events
         return estimate
 

@@ -153,7 +153,8 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "wheels_turned", "wheels_doubted", "gyro", "imu_refused", "bus_stuck", "missed_periods",
+    "lines_rejected", "wheels_turned", "wheels_doubted", "gyro", "imu_refused", "bus_stuck",
+    "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
     "mode", "commander", "command_refused", "fault",
@@ -242,7 +243,10 @@ class GyroSample(Struct, frozen=True):
     variance: float = 0.0
 
 
-GyroDoes = Literal["off", "waiting for rest", "used", "silent", "disagrees", "not believed"]
+GyroDoes = Literal[
+    "off", "waiting for rest", "used", "silent", "disagrees",
+    "reversed", "in degrees", "dead", "not believed",
+]  # fmt: skip
 """Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
 
 

@@ -22,7 +22,7 @@ MEMORY_S = 0.14
 SHARE = 0.05
 """Of the way: half of the slip of 10 % that is to be found."""
 
-COUNTS = 1.5
+COUNTS = 1.2
 """Counts; two wheels that stand anywhere within one are seldom further apart."""
 
 LAG_S = 0.03

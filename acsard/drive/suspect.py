@@ -15,14 +15,14 @@ from typing import Literal
 from msgspec import Struct
 
 LIE_S, LIE_LINES = 0.025, 2
-"""s and lines for which it has to lie: three lines at 100 Hz, so that one spoilt reading is none."""
+"""s and lines for which it has to lie: three at 100 Hz, so that one spoilt reading is none."""
 
 LIE_COUNTS, LIE_ANGLE = 3.5, 0.05
 """Counts and rad by which the other wheel must have turned on meanwhile."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 1.5, 0.01
-"""Counts and rad that its command has gone on beyond what it was: a wheel that has not heard of it
-at all, while the other one has, is stuck."""
+"""Counts and rad by which even a slow wheel has left its speed: one that turns by its command
+cannot have said one and the same all the time, and if the other one has followed, it is stuck."""
 
 VOTE = 1 / 3
 """Share of what is between the two wheels by which it must be further off than the other one."""
@@ -32,6 +32,10 @@ HAND_S = 0.3
 
 DEAD, REVERSED = 0.1, 0.3
 """Shares of the other wheel's turn: less is none, and so close to its opposite is that."""
+
+STUCK = 0.3
+"""Share of the faster wheel's turn by which one is off that says the same: less is slip beside a
+wheel that goes at a steady speed."""
 
 Lie = Literal["dead", "reversed", "stuck"]
 
@@ -77,6 +81,11 @@ class _Ballot:
         """From 1, that all of it is the suspect's, to -1, that it is the other one's."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
+    @property
+    def share(self) -> float:
+        """What is between the two of what the faster one turned."""
+        return self.apart / (max(abs(self._own), abs(self._other)) or 1.0)
+
     def _off(self, turned: float) -> float:
         return max(self._low - turned, turned - self._high, 0.0)
 
@@ -94,7 +103,7 @@ class Suspect:
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._first: float | None = None
-        """rad/s of the command when it was first looked at, and rad that it has gone since beyond
+        """rad/s of a slow wheel when it was first looked at, and rad that it went since beyond
         that."""
         self._followed = 0.0
 
@@ -127,9 +136,9 @@ class Suspect:
         if known.commanded:
             low, high = min(known.slow, known.command), max(known.slow, known.command)
             self._command.add(own, other, low, high)
-            command = known.command / dt
-            self._first = command if self._first is None else self._first
-            self._followed += (command - self._first) * dt
+            slow = known.slow / dt
+            self._first = slow if self._first is None else self._first
+            self._followed += (slow - self._first) * dt
         if known.gyro is not None:
             self._gyro.add(own, other, known.gyro, known.gyro)
 
@@ -139,13 +148,17 @@ class Suspect:
         if self._lines < LIE_LINES or self._seconds < LIE_S or abs(self._apart) < enough:
             return False
         if self._gyro.apart >= enough and abs(self._gyro.vote) >= VOTE:
-            return self._gyro.vote > 0.0
+            return self._gyro.vote > 0.0 and self._plain(self._gyro)
         if self.lie == "stuck" and self._ignores(count):
             return True
         if self._command.apart >= enough:
-            return self._command.vote >= VOTE
+            return self._command.vote >= VOTE and self._plain(self._command)
         nothing = self._first is None
         return self.lie == "stuck" and nothing and self._seconds >= HAND_S
+
+    def _plain(self, ballot: _Ballot) -> bool:
+        """They are so far apart that who goes at a steady speed cannot just have another tyre."""
+        return self.lie != "stuck" or ballot.share >= STUCK
 
     def _ignores(self, count: float) -> bool:
         """The command has changed, and the other wheel went that way."""

@@ -8,7 +8,8 @@ of a side's two wheels halves; s are the parameters' relative standard deviation
 T is the period a report is the mean of, and var(d) and var(dyaw) are the noise of one period
 (`noise.py`), k |v| / T in all. Whoever integrates reports gets the noise of the pose back.
 
-Of wheels that slip all of it is `SLIPPING` times as much. A robot at rest is known to be: only what an encoder could not have noticed in that time is left.
+Of wheels that slip all of it is `SLIPPING` times as much. A robot at rest is known to be: only what
+an encoder could not have noticed in that time is left.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Which wheel lies, and what slips: front and rear of a side watch each other, line by line.
 
 Where they contradict each other (`residual.py`) and one of them has the sign of a lying encoder and
-is denied from elsewhere (`suspect.py`), that one is left out of the pose: the other one stands in. It counts again when both have agreed for a while. All other contradiction is slip, and so is a lie
-until it is told. A side is never left without a wheel. A wheel that is blocked or dragged looks like
-one with a dead encoder, and is left out too: the other one is what is driven.
+is denied from elsewhere (`suspect.py`), that one is left out of the pose: the other one stands in.
+It counts again when both have agreed for a while. All other contradiction is slip, and so is a lie
+until it is told. A side is never left without a wheel. A wheel that is blocked or dragged looks
+like one with a dead encoder, and is left out too: the other one is what is driven.
 """
 
 from __future__ import annotations

@@ -216,6 +216,8 @@ class RobotState(Message, frozen=True):
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
     gyro: str = "off"
     """What the gyro does for odometry: `values.GyroDoes`."""
+    doubt: str = ""
+    """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
 
 
 class DoorState(Message, frozen=True):

@@ -43,7 +43,7 @@ class Robot(Struct, frozen=True):
 def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> Array:
     """(lines, 4): what the wheels are told, rad/s, on a drive at random within the limits."""
     v = w = 0.0
-    rows = []
+    rows: list[list[float]] = []
     while len(rows) * PERIOD < seconds:
         stop = rng.random() < stops
         linear = 0.0 if stop else rng.uniform(-0.6, 1.0)

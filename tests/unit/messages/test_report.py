@@ -600,7 +600,16 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
 
 @pytest.mark.parametrize(
     ("does", "level"),
-    [("waiting for rest", 0), ("used", 0), ("silent", 1), ("disagrees", 1), ("not believed", 1)],
+    [
+        ("waiting for rest", 0),
+        ("used", 0),
+        ("silent", 1),
+        ("disagrees", 1),
+        ("reversed", 1),
+        ("in degrees", 1),
+        ("dead", 1),
+        ("not believed", 1),
+    ],
 )
 def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
