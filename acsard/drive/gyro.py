@@ -224,10 +224,10 @@ class Gyro:
         match, before, verdict = self._match, self._does, self._trial.verdict
         least, most = PROPORTIONS
         wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
-        if silent:
-            self._does = "silent"
-        elif verdict != "none yet" and verdict != "good":
+        if verdict != "none yet" and verdict != "good":
             self._does = verdict
+        elif silent:
+            self._does = "silent"
         elif not self._bias.known:
             self._does = "waiting for rest"
         elif wrong or self._slipped_s > MOST_SLIP_S:
