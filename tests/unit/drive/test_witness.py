@@ -277,8 +277,10 @@ def test_until_the_fault_a_lie_costs_less_than_a_twentieth(kind: str, count: int
         f"out within 50 ms {soon:.1%}"
     )
     assert not sum(fall.wrong for fall in falls)
-    assert max(mine / plain) < 0.05 if count >= 50 else mine[1] < 0.05 * plain[1]
-    assert soon > (0.75 if kind == "stuck" else 0.95) or count < 50
+    assert mine[1] < 0.05 * plain[1]
+    # A stuck one is right until the speed changes: it has to be told from what a slow wheel says.
+    assert mine[0] < (0.08 if kind == "stuck" else 0.05) * plain[0]
+    assert soon > (0.5 if kind == "stuck" else 0.95) or count < 50
 
 
 def healthy(seed: int, seconds: float, counts: int) -> tuple[int, bool]:
