@@ -63,7 +63,12 @@ class Robot:
     def __init__(self, config: Config) -> None:
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
-        self._odometry = Odometry(config.odometry, self._kinematics, config.mcu.encoder_counts)
+        self._odometry = Odometry(
+            config.odometry,
+            self._kinematics,
+            config.mcu.encoder_counts,
+            config.feedback.response_time,
+        )
         self._gyro = Gyro() if config.odometry.gyro else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
@@ -107,6 +112,7 @@ class Robot:
             counters=counters | self.counters,
             refused=self._refused,
             gyro=GyroStatus() if self._gyro is None else self._gyro.status,
+            doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
             encoders=session.snapping.counts,
         )
@@ -223,17 +229,22 @@ class Robot:
         if self._sanity.turned:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
-        return self._odometry.fold(line, self._turn(line, events))
+        estimate = self._odometry.fold(line, self._turn(line, events), self._speeds)
+        self.counters["wheels_doubted"] += len(self._odometry.events)
+        events += self._odometry.events
+        return estimate
 
     def _turn(self, line: Feedback, events: list[Event]) -> Turn | None:
         """What the gyro says of the turn since the line before; None where it says nothing."""
         gyro = self._gyro
         if gyro is None:
             return None
-        wheels = self._kinematics.twist(line.speeds).angular * line.dt
+        speeds = self._odometry.believed(line.speeds)
+        wheels = self._kinematics.twist(speeds).angular * line.dt
         if line.turned is not None:
-            wheels = self._kinematics.twist(WheelSpeeds(*line.turned)).angular
-        turn = gyro.turn(line.at.mono_ns, line.dt, wheels, line.speeds == STILL)
+            turned = self._odometry.believed(WheelSpeeds(*line.turned))
+            wheels = self._kinematics.twist(turned).angular
+        turn = gyro.turn(line.at.mono_ns, line.dt, wheels, speeds == STILL)
         events += gyro.events
         return turn
 

@@ -153,7 +153,8 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "lines_dropped", "wheels_turned", "gyro", "imu_refused", "bus_stuck",
+    "lines_rejected", "lines_dropped", "wheels_turned", "wheels_doubted", "gyro", "imu_refused",
+    "bus_stuck",
     "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
@@ -219,6 +220,19 @@ class SourceStatus(Struct, frozen=True):
     waits_for: Wait
 
 
+class WheelsStatus(Struct, frozen=True):
+    """What front and rear of each side say of each other; all empty while they agree."""
+
+    text: str = ""
+    """What is wrong, in words."""
+    left_out: tuple[str, ...] = ()
+    """The wheels that the pose goes without."""
+    slipping: tuple[str, ...] = ()
+    """`left`, `right`: now, or half a second ago."""
+    differ: tuple[float, float] = (0.0, 0.0)
+    """By which share the front wheel turns more than the rear one, left and right, always."""
+
+
 class GyroSample(Struct, frozen=True):
     """What a gyro said: `rate` rad/s about base_link's z, left is +, and its `variance`, rad2/s2.
 
@@ -233,7 +247,10 @@ class GyroSample(Struct, frozen=True):
     variance: float = 0.0
 
 
-GyroDoes = Literal["off", "waiting for rest", "used", "silent", "disagrees", "not believed"]
+GyroDoes = Literal[
+    "off", "waiting for rest", "used", "silent", "disagrees",
+    "reversed", "in degrees", "dead", "not believed",
+]  # fmt: skip
 """Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
 
 
@@ -340,6 +357,7 @@ class Snapshot(Struct, frozen=True):
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `runtime/figures.py`."""
     gyro: GyroStatus = GyroStatus()
+    doubt: WheelsStatus = WheelsStatus()
     check: str = "plain"
     """Which check the serial lines have, in words."""
     encoders: tuple[int, ...] = ()

@@ -3,8 +3,9 @@
 Gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
 odometry in mobile robots, 1996): a gyro knows nothing of skidding wheels, wheels nothing of its
 bias. The bias is what it says at rest (`gyro_bias.py`), its delay and the track it implies come
-from comparing both (`gyro_match.py`). Silent, or out of all proportion to the wheels, it leaves
-them alone.
+from comparing both (`gyro_match.py`). Its first turn is the wheels' until
+both agree, and then made up for: a gyro that says the opposite, degrees or nothing is named and not
+used (`gyro_trial.py`). Silent, or out of all proportion to the wheels, it leaves them alone.
 
 What has been handed out is remembered and not the time: whatever came late or was held over for a
 moment is in the next line's turn, and no error of that kind adds up.
@@ -17,8 +18,9 @@ from collections import deque
 
 from msgspec import Struct
 
-from acsard.drive.gyro_bias import Bias
+from acsard.drive.gyro_bias import KNOWN_S, Bias
 from acsard.drive.gyro_match import WINDOW_S, Match
+from acsard.drive.gyro_trial import PROPORTIONS, Trial
 from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
@@ -49,18 +51,19 @@ SLIP_S = 0.5
 MOST_SLIP_S = 5.0
 """s that wheels slip in one go; a gyro that contradicts them for longer is stuck, or no gyro."""
 
-PROPORTIONS = (0.25, 2.5)
-"""Between these a robot turns per turn of its wheels, whatever it skids."""
-
 ENOUGH_BLOCKS = 20.0
 """Blocks of turning after which the proportion is believed."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
-    "waiting for rest": "the gyro's bias is not known yet: the robot must stand for a second",
+    "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
+    f"{REST_S + KNOWN_S:.1f} s",
     "used": "the heading is the gyro's",
     "silent": "the gyro is silent: the heading is the wheels' alone",
     "disagrees": "the wheels slip: the gyro says another turn than they do",
+    "reversed": "not used: the gyro turns the other way than the wheels: check its mounting",
+    "in degrees": "not used: the gyro reads 57 times too much: degrees per second, not radians",
+    "dead": "not used: the gyro says no rate while the wheels turn the robot",
     "not believed": "the gyro turns out of all proportion to the wheels: does its z point up?",
 }
 
@@ -73,13 +76,17 @@ class Turn(Struct, frozen=True):
     rate: float
     """rad/s, what it says now, and its variance: the angle may hold what came late."""
     rate_variance: float
+    wheels: float | None = None
+    """rad the wheels would tell for this turn, skidding as they do."""
+    slips: bool = False
+    """The wheels do: they told another turn of late."""
 
 
 class Gyro:
     """One gyro beside the wheels: `hear` its samples, then ask each line's `turn`."""
 
     def __init__(self) -> None:
-        self._bias, self._match = Bias(), Match()
+        self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples of times that no line has reached yet."""
         self._promptest = Promptest(DRIFT)
@@ -95,6 +102,8 @@ class Gyro:
         self._rest_s = self._since_rest_s = self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the last sample."""
+        self._owed = self._owed_variance = 0.0
+        """rad by which it told more than the wheels while it was on trial: owed if it is proved."""
         self._hole = False
         """Since the last line some of the turn was not heard."""
         self._does: GyroDoes = "silent"
@@ -133,15 +142,20 @@ class Gyro:
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
         variance += SCALE_VARIANCE * abs(angle)
-        if not silent and self._bias.known and dt > 0.0:
+        tried = not silent and dt > 0.0 and self._try(wheels, angle, variance, dt)
+        if not silent and self._bias.known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
         if resting:
             self._shift()
         self._judge(silent)
         hole, self._hole = self._hole, False
-        if hole or self._does not in ("used", "disagrees"):
+        if hole or tried or self._does not in ("used", "disagrees"):
             return None
-        return Turn(angle, variance, self._rate, self._noise + self._bias.variance)
+        rolled = angle / max(PROPORTIONS[0], self._match.ratio)
+        angle, variance = angle + self._owed, variance + self._owed_variance
+        self._owed = self._owed_variance = 0.0
+        noise = self._noise + self._bias.variance
+        return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     # samples
 
@@ -177,6 +191,18 @@ class Gyro:
 
     # beside the wheels
 
+    def _try(self, wheels: float, angle: float, variance: float, dt: float) -> bool:
+        """Until a turn has proved it: whether this line is one that the wheels tell."""
+        trial, known = self._trial, self._bias.known
+        if not trial.open or not trial.add(wheels, angle, dt, known) or not trial.open:
+            return False
+        if known and trial.verdict == "none yet":
+            self._owed += angle - wheels
+            self._owed_variance += variance
+        else:
+            self._owed = self._owed_variance = 0.0
+        return True
+
     def _compare(self, wheels: float, angle: float, dt: float) -> None:
         self._match.add(wheels, angle, dt, self._slip_s > 0.0)
         noise = 2.0 * self._bias.variance * WINDOW_S * WINDOW_S + self._bias.noise * WINDOW_S * dt
@@ -195,10 +221,12 @@ class Gyro:
             self._delay_ns = min(max(earliest, shifted), latest)
 
     def _judge(self, silent: bool) -> None:
-        match, before = self._match, self._does
+        match, before, verdict = self._match, self._does, self._trial.verdict
         least, most = PROPORTIONS
         wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
-        if silent:
+        if verdict != "none yet" and verdict != "good":
+            self._does = verdict
+        elif silent:
             self._does = "silent"
         elif not self._bias.known:
             self._does = "waiting for rest"

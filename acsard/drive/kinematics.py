@@ -51,6 +51,15 @@ class Kinematics:
         right = self._right_radius * (speeds.front_right + speeds.rear_right) / 2
         return Twist((right + left) / 2, (right - left) / self.track)
 
+    def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
+        """How far the left wheels turn with `right` rad, and the right ones with `left` rad, if the
+        base turns by `turn` rad: equation (3) solved for either side."""
+        across = turn * self.track
+        return (
+            (self._right_radius * right - across) / self._left_radius,
+            (self._left_radius * left + across) / self._right_radius,
+        )
+
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
         """The twist scaled down until no wheel exceeds `wheel_speed` rad/s; curvature is kept."""
         speeds = self.wheel_speeds(twist)

@@ -26,6 +26,10 @@ Column = tuple[float, float, float, float]
 distance and turn."""
 
 
+SLIPPING = 100.0
+"""By which every variance that the wheels tell is larger while they slip."""
+
+
 class Noise:
     """Variances of one step in base_link."""
 

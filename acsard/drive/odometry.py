@@ -15,17 +15,30 @@ agree as dyaw -> 0. How far that may be off is `uncertainty.py`'s, for the pose,
 from __future__ import annotations
 
 import math
+from collections import deque
+from itertools import takewhile
 
-from acsard.config.settings import OdometryConfig
+from acsard.config.settings import FeedbackConfig, OdometryConfig
 from acsard.drive.gaps import Gaps
 from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
+from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.values import REST, STILL, Estimate, Pose, Twist, WheelSpeeds
+from acsard.values import (
+    REST,
+    STILL,
+    Estimate,
+    Event,
+    Pose,
+    Twist,
+    TwistVariances,
+    WheelSpeeds,
+    WheelsStatus,
+)
 
 MAX_LOST_S = 0.05
 """s of lines that could not be true, up to which the robot is held to have gone on as it did."""
@@ -33,16 +46,26 @@ MAX_LOST_S = 0.05
 REST_S = 0.2
 """s of four wheels that report 0.00, after which the robot is at rest."""
 
+TAKEN_BACK = 128
+"""Lines at most that are taken back of a lie that was believed."""
+
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
+
+Step = tuple[Pose, tuple[Motors, ...], Turn | None, WheelSpeeds]
+"""Where it was, how its wheels turned from there, by a gyro too, and the speeds they said."""
 
 
 class Odometry:
     """Integrates feedback; its state is pose, covariance and the wheel angles."""
 
     def __init__(
-        self, odometry: OdometryConfig, kinematics: Kinematics, encoder_counts: int = 0
+        self,
+        odometry: OdometryConfig,
+        kinematics: Kinematics,
+        encoder_counts: int = 0,
+        response_time: float = FeedbackConfig().response_time,
     ) -> None:
-        """`encoder_counts` per wheel turn, 0 if unknown."""
+        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel."""
         self._kinematics = kinematics
         self._positions = NOWHERE
         self._lost_dt, self._lost_turned = 0.0, NOWHERE
@@ -50,6 +73,9 @@ class Odometry:
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
         self._gaps = Gaps()
+        self._witness = Witness(kinematics, encoder_counts, response_time)
+        self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
+        """Of the last lines."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
         """rad that no wheel turns between the edges of one count."""
         self._still = 0.0
@@ -66,6 +92,7 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
         self._path.set(pose)
+        self._steps.clear()
         self._uncertainty.set(pose.yaw)
 
     @property
@@ -78,6 +105,20 @@ class Odometry:
         ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
+    @property
+    def doubt(self) -> WheelsStatus:
+        """Which wheels the pose goes without, and which slip."""
+        return self._witness.status
+
+    @property
+    def events(self) -> list[Event]:
+        """What the last line had to tell of wheels that are doubted."""
+        return self._witness.events
+
+    def believed(self, wheels: WheelSpeeds) -> WheelSpeeds:
+        """What four wheels say, rad or rad/s, with others in place of those that are left out."""
+        return self._witness.believed(wheels)
+
     def skip(self, feedback: Feedback) -> None:
         """Pass over a line that cannot be true: what it should have told is left to the next one.
 
@@ -88,36 +129,47 @@ class Odometry:
         else:
             self._lost_turned = _sum(self._lost_turned, feedback.turned)
 
-    def fold(self, feedback: Feedback, gyro: Turn | None = None) -> Estimate:
+    def fold(
+        self, feedback: Feedback, gyro: Turn | None = None, told: WheelSpeeds | None = None
+    ) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count to
         and fro is left to the line that tells where it went. Where a gyro tells the turn since the
-        line before, the wheels tell the distance only.
+        line before, the wheels tell the distance only. `told` is what the wheels are to do, by
+        which one that lies is found: then its side's other wheel stands in, and what it made of the
+        lines until then is taken back.
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
-        twist = self._kinematics.twist(speeds)
-        self._still = self._still + dt if speeds == STILL else 0.0
-        at_rest = self._still > REST_S
         lost_dt, self._lost_dt = self._lost_dt, 0.0
         # Of lost lines without counts: it went on at about this speed, or too long to guess.
         moved_dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
-        turned, bridged = self._lost_turned, 0.0
+        turned, bridged, passed = self._lost_turned, 0.0, moved_dt + dt
+        between = counted = NOWHERE
         if feedback.turned is None:
             unknown, bridged = unknown + feedback.gap, feedback.bridged
-            moved_dt += dt if feedback.counted is None else bridged
+            if bridged:
+                between = _between(self.speeds, speeds, bridged)
+            if feedback.counted is None:
+                moved_dt += dt - bridged
+            else:
+                counted = feedback.counted
         else:
             turned = _sum(turned, feedback.turned)
+        said = _times(speeds.as_tuple(), moved_dt)
+        now = feedback.turned or _sum(_sum(between, counted), said)
+        self._watch(now, speeds, dt if feedback.turned else passed, told, gyro)
+        believed = self._witness.believed(speeds)
+        twist = self._kinematics.twist(believed)
+        self._still = self._still + dt if believed == STILL else 0.0
+        at_rest = self._still > REST_S
         if unknown > 0.0:
             self._stand(unknown, before, twist)
         rolled = NOWHERE
         if not at_rest or max(map(abs, turned)) > self._unsettled:
             rolled, turned = turned, NOWHERE
         self._lost_turned = turned
-        between = _between(self.speeds, speeds, bridged) if bridged else NOWHERE
-        counted = feedback.counted or NOWHERE
-        uncounted = _times(speeds.as_tuple(), moved_dt - bridged)
-        self._move((rolled, between, counted, uncounted), gyro)
+        self._move((rolled, between, counted, said), gyro, speeds)
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -125,14 +177,9 @@ class Odometry:
             self._gaps.interrupt(twist)
         else:
             self._gaps.follow(twist, dt)
-        spread = self._twist_uncertainty
-        step = 0.0
-        if feedback.counted is not None:
-            step = max([one for one in feedback.steps if one < math.inf], default=0.0)
-        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, dt, step)
+        variances = self._twist_variances(twist, feedback, at_rest, gyro)
         if gyro is not None and dt > 0.0:
             twist = Twist(twist.linear, gyro.rate)
-            variances = spread.with_gyro(variances, gyro.rate_variance)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
@@ -146,26 +193,68 @@ class Odometry:
             feedback.heard_ns,
         )
 
-    def _move(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> None:
-        """Advance by wheel angles in rad, an arc for each piece: (4) to (7) are linear.
+    def _watch(
+        self, turned: Motors, speeds: WheelSpeeds, dt: float, told: WheelSpeeds | None,
+        gyro: Turn | None,
+    ) -> None:  # fmt: skip
+        """Let front and rear judge a line; take back what a wheel made of the last ones that lied.
+
+        The steps since are gone through anew without it, so that the pose leaps by what was wrong.
+        """
+        turn = None if gyro is None else gyro.wheels
+        if not self._witness.hear(turned, speeds, dt, told, turn):
+            return
+        lies = list(takewhile(lambda step: self._witness.lied(step[3]), reversed(self._steps)))
+        if not lies:
+            return
+        self._path.set(lies[-1][0])
+        for step in reversed(lies):
+            for distance, angle in self._arcs(step[1], step[2]):
+                self._path.advance(distance, angle)
+        self._steps.clear()
+
+    def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
+        """m and rad for each of so many wheel angles: (4) to (7) are linear.
 
         A gyro tells one turn for all of them.
         """
-        rolled = [piece for piece in pieces if piece != NOWHERE]
-        moved = [self._kinematics.twist(WheelSpeeds(*piece)) for piece in rolled]
-        for piece in rolled:
-            self._positions = _sum(self._positions, piece)
+        rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces if one != NOWHERE]
+        moved = [self._kinematics.twist(one) for one in rolled]
         if gyro is not None:
-            distance = sum(one.linear for one in moved)
-            self._advance(distance, gyro.angle, gyro.variance)
-            return
-        for one in moved:
-            self._advance(one.linear, one.angular)
+            return [(sum(one.linear for one in moved), gyro.angle)]
+        return [(one.linear, one.angular) for one in moved]
 
-    def _advance(self, distance: float, turn: float, variance: float | None = None) -> None:
+    def _move(self, pieces: tuple[Motors, ...], gyro: Turn | None, speeds: WheelSpeeds) -> None:
+        """Advance by wheel angles in rad, an arc for each piece, of a line with these speeds."""
+        self._steps.append((self._path.pose, pieces, gyro, speeds))
+        for piece in pieces:
+            if piece != NOWHERE:
+                self._positions = _sum(self._positions, piece)
+        for distance, turn in self._arcs(pieces, gyro):
+            self._advance(distance, turn, gyro)
+
+    def _slips(self, gyro: Turn | None) -> bool:
+        """Front and rear of a side contradict each other, or the gyro all of them."""
+        return self._witness.slips or (gyro is not None and gyro.slips)
+
+    def _twist_variances(
+        self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None
+    ) -> TwistVariances:
+        spread, step = self._twist_uncertainty, 0.0
+        if feedback.counted is not None:
+            step = max([one for one in feedback.steps if one < math.inf], default=0.0)
+        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, feedback.dt, step)
+        if self._slips(gyro):
+            variances = spread.slipping(variances)
+        if gyro is not None and feedback.dt > 0.0:
+            variances = spread.with_gyro(variances, gyro.rate_variance)
+        return variances
+
+    def _advance(self, distance: float, turn: float, gyro: Turn | None) -> None:
         self.travelled += abs(distance)
         dx, dy, heading = self._path.advance(distance, turn)
-        self._uncertainty.advance(distance, turn, dx, dy, heading, variance)
+        variance = None if gyro is None else gyro.variance
+        self._uncertainty.advance(distance, turn, dx, dy, heading, variance, self._slips(gyro))
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
         """What the robot did in so many seconds between two twists is unknown: it has not moved."""

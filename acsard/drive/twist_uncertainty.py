@@ -8,7 +8,8 @@ of a side's two wheels halves; s are the parameters' relative standard deviation
 T is the period a report is the mean of, and var(d) and var(dyaw) are the noise of one period
 (`noise.py`), k |v| / T in all. Whoever integrates reports gets the noise of the pose back.
 
-A robot at rest is known to be: only what an encoder could not have noticed in that time is left.
+Of wheels that slip all of it is `SLIPPING` times as much. A robot at rest is known to be: only what
+an encoder could not have noticed in that time is left.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import math
 
 from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.noise import Noise, columns
+from acsard.drive.noise import SLIPPING, Noise, columns
 from acsard.values import Twist, TwistVariances
 
 DECIMAL = 0.01
@@ -77,6 +78,14 @@ class TwistUncertainty:
             max(LEAST, self._to_linear * quantum),
             LEAST,
             max(LEAST, self._to_angular * quantum),
+        )
+
+    def slipping(self, variances: TwistVariances) -> TwistVariances:
+        """Of wheels that slip: aside too, which is where a robot skids."""
+        return TwistVariances(
+            min(SLIPPING * variances.linear, MOST),
+            min(SLIPPING * variances.lateral, MOST),
+            min(SLIPPING * variances.angular, MOST),
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:

@@ -22,7 +22,7 @@ import math
 
 from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.noise import Column, Noise, columns
+from acsard.drive.noise import SLIPPING, Column, Noise, columns
 from acsard.drive.se2 import (
     ORIGIN,
     Vector,
@@ -89,18 +89,21 @@ class PoseUncertainty:
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None,
+        variance: float | None = None, slips: bool = False,
     ) -> None:  # fmt: skip
         """An arc of `distance` m through `turn` rad has moved the robot by `dx`, `dy` m in odom.
 
         `heading` is that of its chord. `variance` is that of the turn, rad2, where it is not the
-        wheels that tell it: then their parameters bend the distance only.
+        wheels that tell it: then their parameters bend the distance only. `slips` says that the
+        wheels do.
         """
         if self._lost:
             self._forget_where(distance, turn)
             return
         c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
         along, yaw, both = self._noise.of(distance, turn, self._beyond_play(turn))
+        if slips:
+            along, yaw, both = SLIPPING * along, SLIPPING * yaw, SLIPPING * both
         if variance is not None:
             yaw, both = variance, 0.0
         self._p = added(carried(self._p, dx, dy), along, yaw, both, c, s)

@@ -40,7 +40,16 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S, WHEELS, Estimate, GyroStatus, Instant, Outputs, Snapshot
+from acsard.values import (
+    NS_PER_S,
+    WHEELS,
+    Estimate,
+    GyroStatus,
+    Instant,
+    Outputs,
+    Snapshot,
+    WheelsStatus,
+)
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
 
@@ -206,6 +215,7 @@ class Report:
             },
             gyro=snapshot.gyro.does,
             encoders=list(snapshot.encoders),
+            doubt=snapshot.doubt.text,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -265,6 +275,7 @@ class Report:
                 {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
                 | {k: str(v) for k, v in counters.items() if k.startswith("command")},
             ),
+            ("wheels", *_wheels(snapshot.doubt, counters)),
             *self._gyro(snapshot.gyro),
             *([("certificate", *certificate, {})] if certificate[1] else []),
         )
@@ -287,6 +298,19 @@ def _found(encoders: tuple[int, ...]) -> dict[str, str]:
     """What the serial link's row says of the encoders: nothing, where nothing was found."""
     named = zip(WHEELS, encoders, strict=False)
     return {f"counts_{name}": str(counts) for name, counts in named if counts}
+
+
+def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> tuple[int, str, dict[str, str]]:
+    """How bad, in words, and what front and rear say of each other."""
+    left, right = doubt.differ
+    values = {
+        "left_out": ", ".join(doubt.left_out),
+        "slipping": ", ".join(doubt.slipping),
+        "front_more_left": f"{left:.3f}",
+        "front_more_right": f"{right:.3f}",
+    }
+    told = {k: str(v) for k, v in counters.items() if k.startswith("wheels")}
+    return int(bool(doubt.text)), doubt.text or "front and rear agree", values | told
 
 
 def _spread(spread: Measurements) -> Spread:

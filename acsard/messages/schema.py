@@ -218,6 +218,8 @@ class RobotState(Message, frozen=True):
     """What the gyro does for odometry: `values.GyroDoes`."""
     encoders: list[int] = []
     """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
+    doubt: str = ""
+    """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
 
 
 class DoorState(Message, frozen=True):

@@ -57,6 +57,7 @@ class FakeMcu(Faults):
         self._on_ns = self._boot_until_ns
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
+        self._moved = [0] * 4
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
@@ -215,7 +216,13 @@ class FakeMcu(Faults):
             every = [b - a for a, b in zip(before, counts, strict=True)]
             read = zip(self.encoders, self.encoder_signs, strict=True)
             moved = [every[encoder] * sign for encoder, sign in read]
-            self._measured = [count * scale for count in moved]
+            if self.frozen is not None:
+                moved[self.frozen] = self._moved[self.frozen]
+            self._moved = moved
+            said = [count * scale for count in moved]
+            if self.frozen is not None:
+                said[self.frozen] = self._measured[self.frozen]
+            self._measured = said
             for motor, (count, gain) in enumerate(zip(moved, self.gains, strict=True)):
                 self._counted[motor] += 0.0 if motor == self.stuck else count * gain
             self._window = (now_ns, counts)

@@ -29,6 +29,7 @@ class Faults:
         self.cut_replies = False
         self.gains = [1.0] * 4
         self.stuck: int | None = None
+        self.frozen: int | None = None
         self.extra_delay_ns = 0
         self.separator = ","
         self.ending = "\r\n"
@@ -101,6 +102,10 @@ class Faults:
     def stuck_encoder(self, wheel: int) -> Fault:
         """Sees motor `wheel` (0 to 3 for a to d) stand whatever it does."""
         return self._with(stuck=wheel)
+
+    def frozen_encoder(self, wheel: int) -> Fault:
+        """Sees motor `wheel` (0 to 3 for a to d) turn on as fast as it did."""
+        return self._with(frozen=wheel)
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
@@ -229,7 +234,8 @@ FAULTS = (
 """The faults that need no argument, by method name: what `acsard sim --fault` offers."""
 
 ARGUMENTS = {
-    "stuck_encoder": "m", "dead_motor": "m", "reversed_motor": "m", "reversed_encoder": "m",
+    "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
+    "reversed_encoder": "m",
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
     "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
     "pushed": "n", "stalls": "nn",

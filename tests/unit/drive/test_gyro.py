@@ -250,7 +250,7 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
     bench = Bench(sign=-1.0)
     bench.run(REST_FIRST)
     bench.run(20.0, stirring)
-    assert bench.says() == "not believed"
+    assert bench.says() == "reversed"
     none = bench.none
     bench.run(5.0, stirring)
     assert bench.none - none == 500

@@ -102,3 +102,10 @@ def test_saturation_keeps_the_curvature_and_no_wheel_is_too_fast(
     assert got.linear * twist.angular == pytest.approx(got.angular * twist.linear)
     assert got.linear * twist.linear >= 0.0
     assert got.angular * twist.angular >= 0.0
+
+
+@given(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0))
+def test_the_other_side_is_what_makes_the_turn(left: float, right: float) -> None:
+    kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=1.1))
+    turn = kinematics.twist(WheelSpeeds(right, left, left, right)).angular
+    assert kinematics.opposite(left, right, turn) == pytest.approx((left, right), abs=1e-9)

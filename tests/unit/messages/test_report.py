@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -43,7 +44,7 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.messages.topics import PUBLISHED
-from acsard.values import Estimate, GyroDoes, GyroStatus, Instant, Outputs, Snapshot
+from acsard.values import Estimate, GyroDoes, GyroStatus, Instant, Outputs, Snapshot, WheelsStatus
 from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
@@ -616,7 +617,16 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
 
 @pytest.mark.parametrize(
     ("does", "level"),
-    [("waiting for rest", 0), ("used", 0), ("silent", 1), ("disagrees", 1), ("not believed", 1)],
+    [
+        ("waiting for rest", 0),
+        ("used", 0),
+        ("silent", 1),
+        ("disagrees", 1),
+        ("reversed", 1),
+        ("in degrees", 1),
+        ("dead", 1),
+        ("not believed", 1),
+    ],
 )
 def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
@@ -631,6 +641,29 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
         "bias_rad_s": "-0.01230",
         "wheel_separation_multiplier": "1.500",
         "learned_multiplier": "1.800",
+    }
+
+
+# wheels that are doubted
+
+
+def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
+    doubt = WheelsStatus("rear_left wheel is left out", ("rear_left",), ("right",), (0.01, -0.02))
+    for said, level in ((WheelsStatus(), 0), (doubt, 1)):
+        report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=said)
+        list(report.due(OUTPUTS, set(), never))
+        seen = partial(replace, snapshot)
+        state, array = report.current("state", seen), report.current("diagnostics", seen)
+        assert isinstance(state, RobotState)
+        assert isinstance(array, DiagnosticArray)
+        (row,) = [one for one in array.status if one.name == "acsard: wheels"]
+        assert (state.doubt, row.level) == (said.text, level)
+        assert row.message == (said.text or "front and rear agree")
+    assert {pair.key: pair.value for pair in row.values} == {
+        "left_out": "rear_left",
+        "slipping": "right",
+        "front_more_left": "0.010",
+        "front_more_right": "-0.020",
     }
 
 

@@ -402,6 +402,7 @@ SEALED = LINE[:-2] + b"#07S*EE6B\r\n"
 NAMED: dict[str, Fault] = {name: methodcaller(name) for name in FAULTS}
 NAMED["bias"] = methodcaller("bias", 2, 1.5)
 NAMED["stuck_encoder"] = methodcaller("stuck_encoder", 1)
+NAMED["frozen_encoder"] = methodcaller("frozen_encoder", 2)
 
 
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
@@ -538,6 +539,18 @@ def test_a_stuck_encoder_slows_nothing_down() -> None:
         drive(stuck, 0, 20)
     drive(sound, 0, 20)
     assert stuck.vehicle.angles == sound.vehicle.angles
+
+
+@pytest.mark.parametrize("motor", range(4))
+def test_a_frozen_encoder_says_the_speed_it_had_whatever_its_wheel_does(motor: int) -> None:
+    mcu = FakeMcu(TRUE)
+    before = drive(mcu, 0, 5)[-1][1][:-2].split(b",")
+    with mcu.frozen_encoder(motor):
+        stopped = drive(mcu, 50 * MS, 5, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
+    after = stopped[-1][1][:-2].split(b",")
+    assert after[motor] == before[motor]
+    assert all(t.endswith(b"p00.00") for i, t in enumerate(after) if i != motor)
+    assert mcu.vehicle.speeds == [0.0] * 4
 
 
 def test_a_comma_latched_mcu_keeps_its_last_wheel_without_a_trailing_comma() -> None:

@@ -1,0 +1,256 @@
+"""Which wheel lies, and what slips: front and rear of a side watch each other, line by line.
+
+Where they contradict each other (`residual.py`) and one of them has the sign of a lying encoder and
+is denied from elsewhere (`suspect.py`), that one is left out of the pose: the other one stands in.
+It counts again when both have agreed for a while. All other contradiction is slip, and so is a lie
+until it is told. A side is never left without a wheel. A wheel that is blocked or dragged looks
+like one with a dead encoder, and is left out too: the other one is what is driven.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.residual import MEMORY_S, Residual
+from acsard.drive.suspect import WORDS, Known, Lie, Suspect, has_lied
+from acsard.mcu.frames import Motors
+from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
+
+COARSEST, FINEST = math.tau / 16, math.tau / 2000
+"""rad; the angle of a count is found between these where the configuration does not tell: a wheel
+that turns slowly says one count or none."""
+
+PERIOD, SMOOTHED = 0.01, 0.05
+"""s between two lines until that is known, and the share of a new one in their mean."""
+
+COMMANDED = 0.3
+"""rad/s; a slower command says little of who is right."""
+
+SLIP_S = 0.5
+"""s after the last contradiction for which a side slips on."""
+
+SLIP_TOLD_S = 0.1
+"""s of contradiction from which on a slip is worth a log line."""
+
+BACK_S = 0.5
+"""s for which a wheel that was left out must agree, rolling, to be believed again."""
+
+LEFT, RIGHT = (1, 2), (0, 3)
+"""The front and the rear wheel of each side, in `WHEELS` order."""
+
+
+class _Side:
+    """Two wheels; which of them is left out, and whether they slip."""
+
+    def __init__(self, name: str, wheels: tuple[int, int]) -> None:
+        self.name, self.wheels = name, wheels
+        self.residual = Residual()
+        self.suspected = False
+        self._suspects = (Suspect(), Suspect())
+        self.out: int | None = None
+        """0 the front, 1 the rear one."""
+        self._lie: Lie = "dead"
+        self.slip_s = self._odd_s = self._agreed_s = 0.0
+        self.event: Event | None = None
+        """What the last line has to tell."""
+
+    @property
+    def left_out(self) -> str:
+        """The wheel's name, "" when both count."""
+        return "" if self.out is None else WHEELS[self.wheels[self.out]]
+
+    @property
+    def text(self) -> str:
+        """What is wrong with them, "" when nothing is."""
+        if self.out is not None:
+            return f"{self.left_out} wheel is left out: it {WORDS[self._lie]}, look at its encoder"
+        if self.slip_s > 0.0:
+            return f"{self.name} wheels slip: front and rear turn differently"
+        return ""
+
+    def agree(self, dt: float) -> None:
+        """A line in which they do."""
+        if self.suspected:
+            self.suspected = False
+            for suspect in self._suspects:
+                suspect.forget()
+        self._pass(dt)
+        if self.out is None or not self.residual.rolling:
+            return
+        self._agreed_s += dt
+        if self._agreed_s >= BACK_S:
+            again = f"{self.left_out} wheel agrees with the other one of its side: it counts again"
+            self.event = Event("wheels_doubted", again, kind="again")
+            self.out, self.residual.learns = None, True
+
+    def contradict(
+        self, turned: Motors, same: tuple[bool, bool], dt: float, count: float, known: Known
+    ) -> bool:
+        """They do not; whether one of them is left out from now on."""
+        self._agreed_s = 0.0
+        if self.out is not None:
+            return False
+        self.suspected = True
+        angles = turned[self.wheels[0]], turned[self.wheels[1]]
+        for i, suspect in enumerate(self._suspects):
+            own, other = angles[i], angles[1 - i]
+            if suspect.looks(own, other, same[i], dt, count):
+                suspect.compare(own, other, dt, known)
+                if suspect.lies(count):
+                    self._leave_out(i)
+                    return True
+        if not self.residual.slips:
+            self._pass(dt)
+            return False
+        self.slip_s, told = SLIP_S, self._odd_s >= SLIP_TOLD_S
+        self._odd_s += dt
+        if self._odd_s >= SLIP_TOLD_S and not told:
+            self.event = Event("wheels_doubted", self.text, "warning", kind="slip")
+        return False
+
+    def lied(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
+        """The wheel that is left out may already have lied in an earlier line."""
+        if self.out is None:
+            return False
+        own, other = self.wheels[self.out], self.wheels[1 - self.out]
+        said = before.as_tuple()
+        return has_lied(self._lie, said[own], said[other], now.as_tuple()[own])
+
+    def _pass(self, dt: float) -> None:
+        self.slip_s = max(0.0, self.slip_s - dt)
+        if not self.slip_s:
+            self._odd_s = 0.0
+
+    def _leave_out(self, i: int) -> None:
+        self._lie, self.residual.learns = self._suspects[i].lie or "dead", False
+        self.out, self.slip_s, self._odd_s, self.suspected = i, 0.0, 0.0, False
+        for suspect in self._suspects:
+            suspect.forget()
+        self.event = Event("wheels_doubted", self.text, "warning", kind="left out")
+
+
+class Witness:
+    """Hears every line; says which wheels to leave out, and whether any slips."""
+
+    def __init__(self, kinematics: Kinematics, counts: int, response_time: float) -> None:
+        """`counts` of the encoders per wheel turn, 0 if unknown; a slow wheel's response, s."""
+        self._kinematics, self._response = kinematics, response_time
+        self._count = math.tau / counts if counts else COARSEST
+        self._seeking, self._period = not counts, PERIOD
+        self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
+        self._slow_left = self._slow_right = 0.0
+        """rad/s of wheels that follow their command slowly."""
+        self._last = STILL
+        self._busy = self._leaves_out = False
+        self.slips = False
+        """Front and rear of a side contradict each other, or did half a second ago."""
+        self._found: _Side | None = None
+        """The side of which the last line has shown the lie."""
+        self.events: list[Event] = []
+        """What the last line has to tell."""
+
+    @property
+    def status(self) -> WheelsStatus:
+        """Who is left out, and what slips."""
+        sides = self._sides
+        return WheelsStatus(
+            text="; ".join(side.text for side in sides if side.text),
+            left_out=tuple(side.left_out for side in sides if side.left_out),
+            slipping=tuple(side.name for side in sides if side.slip_s > 0.0),
+            differ=(self._left.residual.ratio, self._right.residual.ratio),
+        )
+
+    def believed(self, wheels: WheelSpeeds) -> WheelSpeeds:
+        """What four wheels say, rad or rad/s, with others in place of those that are left out."""
+        if not self._leaves_out:
+            return wheels
+        said = list(wheels.as_tuple())
+        for side in self._sides:
+            if side.out is not None:
+                share = side.residual.stand_in(front=side.out == 0)
+                said[side.wheels[side.out]] = share * said[side.wheels[1 - side.out]]
+        return WheelSpeeds(*said)
+
+    def hear(
+        self,
+        turned: Motors,
+        speeds: WheelSpeeds,
+        dt: float,
+        told: WheelSpeeds | None = None,
+        turn: float | None = None,
+    ) -> bool:
+        """A line: rad in `dt` s, and the speeds it says.
+
+        `told` is what the wheels are, rad/s; `turn` the rad that they would tell by a gyro that is
+        trusted. None is nothing known. True where a wheel is left out from now on: ask
+        `lied` of the lines before.
+        """
+        if self.events:
+            self.events = []
+        if dt <= 0.0:
+            return False
+        if told is not None:
+            share = dt / (self._response + dt)
+            self._slow_left += (told.front_left - self._slow_left) * share
+            self._slow_right += (told.front_right - self._slow_right) * share
+        if self._seeking:
+            self._seek(speeds, dt)
+        keep, count = MEMORY_S / (MEMORY_S + dt), self._count
+        front_right, front_left, rear_left, rear_right = turned
+        left = self._left.residual.add(front_left, rear_left, keep, dt, count)
+        right = self._right.residual.add(front_right, rear_right, keep, dt, count)
+        last, self._last = self._last, speeds
+        if left and right and not self._busy:
+            return False
+        same = [a == b for a, b in zip(speeds.as_tuple(), last.as_tuple(), strict=True)]
+        self._found = None
+        for i, side in enumerate(self._sides):
+            front, rear = side.wheels
+            agree, other_agrees = (right, left) if i else (left, right)
+            if agree:
+                side.agree(dt)
+                continue
+            known = self._known(i, dt, turned, told, turn if other_agrees else None)
+            if side.contradict(turned, (same[front], same[rear]), dt, count, known):
+                self._found = side
+        self._sum_up()
+        return self._found is not None
+
+    def lied(self, before: WheelSpeeds) -> bool:
+        """Of the wheel that the last line has shown to lie: it may have lied in that line too."""
+        return self._found is not None and self._found.lied(before, self._last)
+
+    def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
+        """The least that a wheel turns in a line is a count, or more."""
+        self._period += SMOOTHED * (dt - self._period)
+        for speed in (abs(speeds.front_right), abs(speeds.front_left)):
+            if 0.0 < speed * self._period < self._count:
+                self._count = max(FINEST, speed * self._period)
+                self._seeking = self._count > FINEST
+
+    def _known(
+        self, i: int, dt: float, turned: Motors, told: WheelSpeeds | None, turn: float | None
+    ) -> Known:
+        """What is known of the left (0) or right side beside its own wheels.
+
+        By a gyro only while the other side agrees: the turn is between both.
+        """
+        by_gyro = None
+        if turn is not None:
+            front_right, front_left, rear_left, rear_right = turned
+            by_gyro = self._kinematics.opposite(
+                (front_left + rear_left) / 2, (front_right + rear_right) / 2, turn
+            )[i]
+        slow = self._slow_right if i else self._slow_left
+        wish = 0.0 if told is None else told.front_right if i else told.front_left
+        commanded = min(abs(slow), abs(wish)) >= COMMANDED and slow * wish > 0.0
+        return Known(slow * dt, wish * dt, commanded, by_gyro)
+
+    def _sum_up(self) -> None:
+        left, right = self._sides
+        self.events = [side.event for side in self._sides if side.event]
+        left.event = right.event = None
+        self._leaves_out = left.out is not None or right.out is not None
+        self.slips = left.slip_s > 0.0 or right.slip_s > 0.0
+        self._busy = self.slips or self._leaves_out or left.suspected or right.suspected

@@ -1,0 +1,199 @@
+"""An encoder lies while the robot drives: the pose goes on right, and `state` says which wheel."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.settings import Config, FeedbackConfig, OdometryConfig, SimConfig
+from acsard.messages.schema import DiagnosticArray, DiagnosticStatus
+from acsard.sim.faults import Fault
+from acsard.sim.watched import WatchedMcu
+from acsard.values import NS_PER_S, WHEELS
+from tests.scenarios.world import World
+
+
+def world(gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0) -> World:
+    """Without the latched fault, so that there is something to drive on with."""
+    feedback = FeedbackConfig(fault_time=fault_time)
+    made = World(
+        Config(
+            feedback=feedback, odometry=OdometryConfig(gyro=gyro), sim=sim or SimConfig()
+        )
+    )  # fmt: skip
+    made.run(1.5)
+    return made
+
+
+def off(made: World) -> tuple[float, float]:
+    """m and rad between odometry and truth."""
+    pose, truth = made.state, made.mcu.vehicle.pose
+    turn = math.remainder(pose.yaw - truth.yaw, math.tau)
+    return math.dist((pose.x, pose.y), (truth.x, truth.y)), abs(turn)
+
+
+def row(made: World) -> DiagnosticStatus:
+    message = made.loop.report.current("diagnostics", made.loop._look)
+    assert isinstance(message, DiagnosticArray)
+    (found,) = [status for status in message.status if status.name == "acsard: wheels"]
+    return found
+
+
+def lies(made: World, kind: str, wheel: int) -> Fault:
+    return {
+        "dead": made.mcu.stuck_encoder(wheel),
+        "reversed": made.mcu.bias(wheel, -1.0),
+        "stuck": made.mcu.frozen_encoder(wheel),
+    }[kind]
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("kind", "wheel"),
+    [
+        ("dead", 0), ("reversed", 2), ("stuck", 1),
+        *(pytest.param(kind, wheel, marks=SLOW)
+          for kind in ("dead", "reversed", "stuck") for wheel in range(4)),
+    ],
+)  # fmt: skip
+def test_the_pose_goes_on_right_and_state_names_the_wheel(kind: str, wheel: int) -> None:
+    made = world()
+    made.drive(0.3, seconds=1.0)
+    with lies(made, kind, wheel):
+        made.hold(0.6, -0.8, seconds=1.0)
+        made.send(0.0)
+        made.run(1.0)
+        assert made.state.doubt.startswith(f"{WHEELS[wheel]} wheel is left out")
+        assert (row(made).level, row(made).message) == (1, made.state.doubt)
+        distance, turn = off(made)
+        assert distance < 0.02
+        assert turn < 0.03
+    told = [event.text for event in made.events if event.name == "wheels_doubted"]
+    assert f"{WHEELS[wheel]} wheel is left out" in told[0]
+
+
+def test_it_is_out_within_fifty_milliseconds_and_the_fault_comes_when_it_came() -> None:
+    made = world(fault_time=0.5)
+    made.drive(0.8, seconds=2.0)
+    begun, out = made.now_ns, 0
+    with made.mcu.stuck_encoder(1):
+        while made.state.mode == "driving" and made.now_ns - begun < NS_PER_S:
+            made.hold(0.8, seconds=0.01, hz=100.0)
+            if not out and made.state.doubt.startswith("front_left wheel is left out"):
+                out = made.now_ns
+        assert made.state.mode == "fault"
+        assert "front_left wheel does not turn" in made.state.reason
+    assert 0 < out - begun <= 0.05 * NS_PER_S
+    assert 0.49 < (made.now_ns - begun) / NS_PER_S < 0.6
+    assert off(made)[1] < 0.01
+
+
+@SLOW
+def test_an_encoder_that_lives_again_is_believed_again() -> None:
+    made = world()
+    made.drive(0.5, seconds=1.0)
+    with made.mcu.stuck_encoder(2):
+        made.hold(0.5, seconds=1.0)
+        assert made.state.doubt
+    made.hold(0.5, seconds=2.0)
+    assert not made.state.doubt
+    assert off(made)[1] < 0.02
+
+
+@SLOW
+def test_with_a_gyro_the_heading_and_the_distance_stay_right() -> None:
+    made = world(gyro=True, sim=SimConfig(track_multiplier=1.6, gyro_bias=0.01))
+    made.drive(0.4, 0.8, seconds=3.0)
+    with made.mcu.stuck_encoder(0):
+        made.hold(0.4, 0.8, seconds=3.0)
+        made.send(0.0)
+        made.run(1.0)
+        assert made.state.doubt.startswith("front_right wheel is left out")
+    assert made.state.gyro == "used"
+    distance, turn = off(made)
+    assert distance < 0.05
+    assert turn < 0.05
+
+
+def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_told() -> None:
+    made = world()
+    made.drive(0.3, seconds=0.5)
+    made.send(0.0)
+    made.run(2.0)
+    with made.mcu.stuck_encoder(3), made.mcu.pushed(0.4):
+        made.run(2.0)
+        assert made.state.doubt == "right wheels slip: front and rear turn differently"
+    made.run(2.0)
+    assert not made.state.doubt
+
+
+def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
+    made = world()
+    made.drive(0.5, seconds=1.5)
+    sure = made.odom.twist.covariance[0]
+    with made.mcu.bias(0, 1.15):
+        made.hold(0.5, seconds=0.3)
+        assert made.state.doubt.startswith("right wheels slip")
+        assert made.odom.twist.covariance[0] == pytest.approx(100.0 * sure, rel=0.2)
+    made.hold(0.5, seconds=1.5)
+    assert made.odom.twist.covariance[0] == pytest.approx(sure, rel=0.2)
+
+
+@pytest.mark.parametrize("counts", [96, 3200])
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        4,
+        pytest.param(120, marks=pytest.mark.slow),
+        pytest.param(3600, marks=[pytest.mark.soak, pytest.mark.timeout(3600)]),
+    ],
+)
+def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
+    """Skidding, on a slippery floor, with coarse encoders and with hands now and then."""
+    sim = SimConfig(encoder_counts=counts, track_multiplier=1.6, turn_slip=0.5)
+    made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
+    made.bus.wanted = set()
+    made.send(0.0)
+    made.run(0.1)
+    while made.now_ns < (6.5 + seconds) * NS_PER_S:
+        made.hold(dice.uniform(-0.6, 1.0), dice.uniform(-3.0, 3.0), dice.uniform(0.5, 3.0))
+        made.send(0.0)
+        made.run(dice.uniform(0.1, 2.0))
+        if dice.random() < 0.2:
+            made.run(1.0)
+            with made.mcu.pushed(dice.uniform(-0.5, 0.5)):
+                made.run(1.0)
+    assert not [event for event in made.events if event.name == "wheels_doubted"]
+
+
+# gyros that are none
+
+
+@pytest.mark.parametrize(
+    ("share", "does"),
+    [
+        (-1.0, "reversed"),
+        pytest.param(math.degrees(1.0), "in degrees", marks=SLOW),
+        pytest.param(0.0, "dead", marks=SLOW),
+    ],
+)
+def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
+    share: float, does: str
+) -> None:
+    made = world(gyro=True, sim=SimConfig(gyro_noise=0.002, gyro_bias=0.001))
+    assert isinstance(made.mcu, WatchedMcu)
+    see = made.mcu._see
+    made.mcu._see = lambda sight: see(replace(sight, gyro=sight.gyro * share))
+    made.run(1.5)
+    made.drive(0.2, 0.6, seconds=1.5)
+    assert made.state.gyro == does
+    for angular in (-1.0, 0.5):
+        made.hold(0.3, angular, seconds=0.7)
+        assert made.state.gyro == does
+    made.hold(0.0, seconds=1.0)
+    assert off(made)[1] < 0.02

@@ -1,0 +1,143 @@
+"""Drives as four encoders tell them, of which one may begin to lie: what judges `drive/witness.py`.
+
+Each wheel has a motor with its own lag, a tyre and load of its own, and stands anywhere within a
+count of its encoder; a line says counts over its period in two decimals. Written in numpy from that
+alone; shares no code with what it judges. All a robot does is in its seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from acsard.config.settings import DriveConfig, OdometryConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.odometry import Odometry
+from acsard.drive.path import Path
+from acsard.mcu.feedback import Feedback
+from acsard.values import Instant, Pose, WheelSpeeds
+
+Array = NDArray[np.float64]
+
+PERIOD, RADIUS, TRACK = 0.01, 0.05, 0.30
+AT = Instant(0, 0)
+SIDES = (1, -1, -1, 1)
+"""Which way a wheel goes in a turn to the left, in `WHEELS` order."""
+
+
+class Robot(Struct, frozen=True):
+    """How its wheels differ: standard deviations, shares of a lag of 0.05 s and of the way."""
+
+    counts: int = 3200
+    lag: float = 0.05
+    lags: float = 0.1
+    tyres: float = 0.015
+    load: float = 0.0
+    """Share of its speed that a wheel lacks in a turn of 1 rad/s, at most."""
+
+
+def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> Array:
+    """(lines, 4): what the wheels are told, rad/s, on a drive at random within the limits."""
+    v = w = 0.0
+    rows: list[list[float]] = []
+    while len(rows) * PERIOD < seconds:
+        stop = rng.random() < stops
+        linear = 0.0 if stop else rng.uniform(-0.6, 1.0)
+        angular = 0.0 if stop else rng.uniform(-2.0, 2.0)
+        for _ in range(round(rng.uniform(0.5, 4.0) / PERIOD)):
+            v += max(-PERIOD, min(PERIOD, linear - v))
+            w += max(-4 * PERIOD, min(4 * PERIOD, angular - w))
+            rows.append([(v + side * w * TRACK / 2) / RADIUS for side in SIDES])
+    return np.round(np.array(rows[: round(seconds / PERIOD)]), 2)
+
+
+def rolled(told: Array, robot: Robot, rng: np.random.Generator) -> Array:
+    """(lines, 4): by how much each wheel has turned since the start, rad."""
+    lag = robot.lag * (1 + robot.lags * rng.standard_normal(4))
+    size = 1 + robot.tyres * rng.standard_normal(4)
+    rest = np.exp(-PERIOD / lag)
+    turning = abs(told[:, 0] - told[:, 1]) * RADIUS / TRACK
+    loaded = 1 - robot.load * rng.uniform(0, 1, 4) * np.minimum(turning, 1.0)[:, None]
+    speed = np.zeros(4)
+    angles = np.empty_like(told)
+    angle = rng.uniform(0, 1, 4)
+    for i, goal in enumerate(told * size * loaded):
+        error = speed - goal
+        angle = angle + goal * PERIOD + error * lag * (1 - rest)
+        speed = goal + error * rest
+        angles[i] = angle
+    return angles
+
+
+def said(angles: Array, counts: int) -> Array:
+    """(lines, 4): what encoders of so many counts make of it, rad/s."""
+    count = math.tau / counts
+    whole = np.floor(angles / count)
+    steps = np.diff(whole, axis=0, prepend=whole[:1])
+    return np.round(steps * count / PERIOD, 2)
+
+
+Lie = Callable[[Array, int, int], Array]
+"""(what is said, wheel, line from which on) -> what is said then."""
+
+
+def dead(speeds: Array, wheel: int, begun: int) -> Array:
+    lying = speeds.copy()
+    lying[begun:, wheel] = 0.0
+    return lying
+
+
+def reversed_(speeds: Array, wheel: int, begun: int) -> Array:
+    lying = speeds.copy()
+    lying[begun:, wheel] *= -1.0
+    return lying
+
+
+def stuck(speeds: Array, wheel: int, begun: int) -> Array:
+    lying = speeds.copy()
+    lying[begun:, wheel] = lying[begun - 1, wheel]
+    return lying
+
+
+LIES: dict[str, Lie] = {"dead": dead, "reversed": reversed_, "stuck": stuck}
+
+
+def lines(speeds: Array) -> list[Feedback]:
+    return [Feedback(AT, WheelSpeeds(*row), PERIOD) for row in speeds.tolist()]
+
+
+def wishes(told: Array) -> list[WheelSpeeds]:
+    return [WheelSpeeds(*row) for row in told.tolist()]
+
+
+def odometry(counts: int = 0) -> Odometry:
+    return Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
+
+
+def apart(a: Pose, b: Pose) -> tuple[float, float]:
+    """m and rad between two poses."""
+    return math.dist((a.x, a.y), (b.x, b.y)), abs(math.remainder(a.yaw - b.yaw, math.tau))
+
+
+class Plain:
+    """The mean of front and rear, integrated: what odometry was before it doubted any wheel."""
+
+    def __init__(self) -> None:
+        self._kinematics, self._path, self._lost = Kinematics(DriveConfig()), Path(), 0.0
+
+    @property
+    def pose(self) -> Pose:
+        return self._path.pose
+
+    def skip(self, line: Feedback) -> None:
+        self._lost += line.dt
+
+    def fold(self, line: Feedback) -> None:
+        dt, self._lost = self._lost + line.dt, 0.0
+        turned = WheelSpeeds(*(speed * dt for speed in line.speeds.as_tuple()))
+        twist = self._kinematics.twist(turned)
+        self._path.advance(twist.linear, twist.angular)
