@@ -39,7 +39,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "odom", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
     )
     parser.add_argument(
-        "--seconds", type=_seconds, default=10.0, metavar="S", help="how long to look; 10 s"
+        "--seconds", type=_seconds, default=5.0, metavar="S", help="how long to look; 5 s"
     )
     parser.add_argument(
         "--follow",

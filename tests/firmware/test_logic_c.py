@@ -534,6 +534,7 @@ ACTIONS = st.tuples(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     st.floats(0.02, 1.0), st.floats(25.0, 80.0), st.floats(0.0, 0.3), st.booleans(),

@@ -17,7 +17,7 @@ def parsed(*words: str) -> argparse.Namespace:
 
 def test_it_looks_for_ten_seconds_and_ends() -> None:
     args = parsed()
-    assert (args.seconds, args.follow, args.json) == (10.0, False, False)
+    assert (args.seconds, args.follow, args.json) == (5.0, False, False)
 
 
 @pytest.mark.parametrize("seconds", ["0", "0.5", "601", "nan", "-3", "long"])
