@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -26,9 +27,13 @@ for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: None)
 
 # Where bytecode may not be written, as in many containers, each of the hundreds of daemons here
-# would compile all of acsard anew, and so would each worker the tests: it goes to pytest's cache.
-if sys.dont_write_bytecode:
-    sys.pycache_prefix = str(Path(__file__).parent.parent / ".pytest_cache" / "bytecode")
+# would compile all of acsard anew, and so would each worker the tests: it goes to pytest's cache, or
+# where anybody may write.
+if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
+    place = Path(__file__).parent.parent
+    if not os.access(place, os.W_OK):
+        place = Path(tempfile.gettempdir()) / f"acsard-tests-{os.getuid()}"
+    sys.pycache_prefix = str(place / ".pytest_cache" / "bytecode")
     sys.dont_write_bytecode = False
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
