@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -26,16 +28,17 @@ for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
 
-# Where bytecode may not be written, as in many containers, each of the hundreds of daemons here
-# would compile all of acsard anew, and so would each worker the tests: it goes to pytest's cache, or
-# where anybody may write.
+# Where bytecode may not be written, as in many containers, or by a user who does not own the clone,
+# each of the hundreds of daemons here would compile all of acsard anew, and each worker the tests.
 if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
-    place = Path(__file__).parent.parent
-    if not os.access(place, os.W_OK):
-        place = Path(tempfile.gettempdir()) / f"acsard-tests-{os.getuid()}"
-    sys.pycache_prefix = str(place / ".pytest_cache" / "bytecode")
+    place = str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    if "PYTHONPYCACHEPREFIX" in os.environ:  # a worker's
+        place = os.environ["PYTHONPYCACHEPREFIX"]
+    elif not os.access(__file__, os.W_OK):
+        place = tempfile.mkdtemp(prefix="acsard-")
+        atexit.register(shutil.rmtree, place, ignore_errors=True)
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = place
     sys.dont_write_bytecode = False
-    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
