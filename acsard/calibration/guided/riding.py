@@ -19,6 +19,8 @@ OPENING_S, OPENED_S = 0.4, 4.0
 SILENT_S = 0.5
 """Without a word from the daemon."""
 
+HELD_UP = "this computer was too busy to run the calibration: end what else runs on it"
+
 OBEYED_S = 1.5
 """After a command has changed the robot has to do it: a ramp takes a part of that."""
 
@@ -57,7 +59,7 @@ class Riding:
         self.phase = Phase.OPENING
         self.halted = ""
         """Why it ended before its end."""
-        self._begun = self._heard = self._changed = now
+        self._begun = self._heard = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits: str | None = "a daemon that hears us"
@@ -109,8 +111,11 @@ class Riding:
 
     def step(self, now: float) -> Twist:
         """What is to be commanded at this time."""
+        held_up, self._stepped = now - self._stepped, now
         if not self.over and now - self._heard > SILENT_S:
-            self._halt("no word from the daemon")
+            # Who was not let run cannot tell whether the other spoke.
+            late = held_up > SILENT_S / 2
+            self._halt(HELD_UP if late else "no word from the daemon")
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:

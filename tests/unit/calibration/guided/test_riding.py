@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from acsard.calibration.guided.riding import OPENED_S, SILENT_S, Phase, Riding
+from acsard.calibration.guided.riding import HELD_UP, OPENED_S, SILENT_S, Phase, Riding
 from acsard.calibration.guided.steps import Leg, Move
 from acsard.config.settings import DriveConfig
 from acsard.messages.schema import RobotState, SourceState, Time
@@ -117,6 +117,12 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.run(SILENT_S + 2 * TICK)
     assert world.said[-1] == REST
     assert world.riding.halted == "no word from the daemon"
+
+
+def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
+    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    assert world.riding.step(world.now + SILENT_S + TICK) == REST
+    assert world.riding.halted == HELD_UP
 
 
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
