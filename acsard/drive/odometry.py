@@ -157,7 +157,8 @@ class Odometry:
         else:
             turned = _sum(turned, feedback.turned)
         said = _times(speeds.as_tuple(), moved_dt)
-        now = feedback.turned or _sum(_sum(between, counted), said)
+        # Counts may hold what rounding cost one wheel until they were known: nothing it did now.
+        now = feedback.turned or _sum(between, _times(speeds.as_tuple(), passed - bridged))
         self._watch(now, speeds, dt if feedback.turned else passed, told, gyro)
         believed = self._witness.believed(speeds)
         twist = self._kinematics.twist(believed)

@@ -38,6 +38,10 @@ KEPT = 0.98
 GLANCE, MISSING = 10, 0.6
 """Lines all of which came so many periods late: one is missing that nobody has bridged."""
 
+ALIKE = 3.0
+"""How much further than the second coarsest of four encoders one may step by what it reports: what
+jumps at random shows steps too, and only proven counts may be so much coarser."""
+
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -72,7 +76,13 @@ class Snapping:
             b.steps.add(speeds[1])
             c.steps.add(speeds[2])
             d.steps.add(speeds[3])
-        return replace(line, counted=counted, steps=(a.step, b.step, c.step, d.step))
+        steps = a.steps.size, b.steps.size, c.steps.size, d.steps.size
+        most = ALIKE * sorted(steps)[2]
+        a_step, b_step, c_step, d_step = (
+            wheel.quantum or min(step, most)
+            for wheel, step in zip(self._wheels, steps, strict=True)
+        )
+        return replace(line, counted=counted, steps=(a_step, b_step, c_step, d_step))
 
     def _counted(self, speeds: Motors, own: float) -> Motors | None:
         """How far each wheel turned in the `own` s of this line, rad; None: nothing is known."""

@@ -43,11 +43,6 @@ class WheelCounter:
         """Changes until it is searched, and how many more if that does not help."""
 
     @property
-    def step(self) -> float:
-        """rad/s by which it steps for its encoder's sake; `math.inf` while unknown."""
-        return self.quantum or self.steps.size
-
-    @property
     def searches(self) -> bool:
         """It is being looked for a lattice."""
         return self._search is not None

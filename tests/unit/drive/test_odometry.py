@@ -666,3 +666,13 @@ def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> Non
     robot, steps = odometry(), (math.inf, 31.4, 31.4, math.inf)
     some = robot.fold(msgspec.structs.replace(snapped(0.1), steps=steps))
     assert math.isfinite(some.twist_variances.linear)
+
+
+def test_rounding_made_good_to_one_wheel_is_no_lie_and_no_slip() -> None:
+    robot, speeds = odometry(), WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+    steady, owing = (0.1,) * 4, (2.0, 0.1, 0.1, 0.1)
+    for i in range(100):
+        line = Feedback(AT, speeds, 0.01, counted=owing if i == 50 else steady)
+        robot.fold(line, None, speeds)
+        assert robot.doubt.text == ""
+        assert robot.events == []

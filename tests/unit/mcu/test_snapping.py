@@ -259,3 +259,12 @@ def test_counts_are_found_whenever_the_wheels_begin_to_turn() -> None:
         look(snapping, np.zeros((standing, 4)))
         look(snapping, toggling)
         assert snapping.counts == (20,) * 4
+
+
+def test_a_wheel_that_jumps_at_random_is_no_coarse_encoder_beside_three_fine_ones() -> None:
+    dice, snapping = random.Random(1), Snapping()
+    for _ in range(1000):
+        fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
+        speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
+        line = snapping.look(Feedback(Instant(0, 0), speeds, 0.01))
+    assert max(line.steps) < 1.0
