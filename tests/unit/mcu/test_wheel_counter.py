@@ -113,9 +113,9 @@ def test_a_stream_without_a_lattice_is_looked_at_less_and_less_often() -> None:
     assert sum(searching[-10_000:]) < 0.2 * 10_000
 
 
-def test_its_steps_are_its_count_once_that_is_known() -> None:
+def test_its_quantum_is_its_count_once_that_is_known() -> None:
     wheel = learned(20)
-    assert wheel.step == math.inf  # nothing was added
+    assert wheel.quantum == 0.0
     wheel.show(PERIOD)
-    assert wheel.step == pytest.approx(math.tau / 20 / PERIOD)
-    assert wheel.step > STEEP
+    assert wheel.quantum == pytest.approx(math.tau / 20 / PERIOD)
+    assert wheel.quantum > STEEP
