@@ -20,10 +20,10 @@ from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, VERBS, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
-ARRIVALS = 64
-"""Samples held of one key between two steps, the newest; at 4000 Hz (`session.py`) and 100 steps a
-second 40 come in from a neighbour who sends all he may. What comes in on other keys than those of
-listed sources is held together: no flood pushes out a command on another key."""
+ARRIVALS = 16
+"""Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
+in from one who sends all he may. What comes in on other keys than those of listed sources is held
+together: no flood pushes out a command on another key."""
 
 SAMPLES = 64
 """Samples of a gyro held: what one of 400 Hz says while the loop stands still for 150 ms."""

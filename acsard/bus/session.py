@@ -17,12 +17,7 @@ from acsard.host.errors import InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key of each client: enough for a zero 1 ms after a command, too few to cost a
-period."""
-
-DAEMON_RATE_HZ = 4000.0
-"""The same at the daemon, of each neighbour. All who come through the door are one: at the door's
-own rate one of them who sends all he may would leave the others a third of their commands."""
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
@@ -53,7 +48,7 @@ def daemon_session(
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
     }
-    settings |= _listening() | _limits(robot_id, sources, limited, access, DAEMON_RATE_HZ)
+    settings |= _listening() | _limits(robot_id, sources, limited, access)
     if any(endpoint.startswith(TLS) for endpoint in bus.connect):
         settings |= _tls(bus.tls)
     if bus.connect:
@@ -70,7 +65,7 @@ def door_session(
 ) -> zenoh.Session:
     """The door's session: a router between the network, by TLS, and the daemon on this machine."""
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    settings |= _limits(robot_id, sources, limited, access, COMMAND_RATE_HZ)
+    settings |= _limits(robot_id, sources, limited, access)
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -105,14 +100,10 @@ def _listening() -> dict[str, object]:
 
 
 def _limits(
-    robot_id: str,
-    sources: tuple[str, ...],
-    limited: tuple[str, ...],
-    access: dict[str, object],
-    rate_hz: float,
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], access: dict[str, object]
 ) -> dict[str, object]:
-    """Who may do what, and how often each of them."""
-    limits = [_command_limits(robot_id, sources, limited, rate_hz)]
+    """Who may do what, and how often."""
+    limits = [_command_limits(robot_id, sources, limited)]
     return {"access_control": access, "downsampling": limits}
 
 
@@ -187,19 +178,16 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(
-    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], rate_hz: float
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
-    """A limit per listed source, so that none uses up another's; one more for all unlisted.
-
-    Zenoh counts for each neighbour by itself: who floods a key leaves others theirs.
-    """
+    """A limit per listed source, so that none uses up another's; one more for all unlisted."""
     keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
     keys += limited
     return {
         "id": "commands",
         "messages": ["put", "delete"],
         "flows": ["ingress"],
-        "rules": [{"key_expr": key, "freq": rate_hz} for key in keys],
+        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
     }
 
 

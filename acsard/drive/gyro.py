@@ -194,7 +194,12 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float) -> bool:
         """Until a turn has proved it: whether this line is one that the wheels tell."""
         trial, known = self._trial, self._bias.known
-        if not trial.open or not trial.add(wheels, angle, dt, known) or not trial.open:
+        if not trial.open:
+            return False
+        if not trial.add(wheels, angle, dt, known):
+            # In degrees it is a turn already where the wheels only begin one.
+            return wheels != 0.0 and abs(angle) > PROPORTIONS[1] * abs(wheels)
+        if not trial.open:
             return False
         if known and trial.verdict == "none yet":
             self._owed += angle - wheels

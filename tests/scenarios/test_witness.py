@@ -16,14 +16,22 @@ from acsard.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 
 
-def world(gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0) -> World:
-    """Without the latched fault, so that there is something to drive on with."""
+def world(
+    gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0, share: float = 1.0
+) -> World:
+    """Without the latched fault, so that there is something to drive on with.
+
+    Its gyro tells this share of what it sees.
+    """
     feedback = FeedbackConfig(fault_time=fault_time)
     made = World(
         Config(
             feedback=feedback, odometry=OdometryConfig(gyro=gyro), sim=sim or SimConfig()
         )
     )  # fmt: skip
+    if isinstance(made.mcu, WatchedMcu):
+        see = made.mcu._see
+        made.mcu._see = lambda sight: see(replace(sight, gyro=sight.gyro * share))
     made.run(1.5)
     return made
 
@@ -185,10 +193,7 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
 def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
     share: float, does: str
 ) -> None:
-    made = world(gyro=True, sim=SimConfig(gyro_noise=0.002, gyro_bias=0.001))
-    assert isinstance(made.mcu, WatchedMcu)
-    see = made.mcu._see
-    made.mcu._see = lambda sight: see(replace(sight, gyro=sight.gyro * share))
+    made = world(gyro=True, sim=SimConfig(gyro_noise=0.002, gyro_bias=0.001), share=share)
     made.run(1.5)
     made.drive(0.2, 0.6, seconds=1.5)
     assert made.state.gyro == does

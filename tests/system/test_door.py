@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,6 @@ import zenoh
 from tests.system.harness import (
     Bus,
     Daemon,
-    Program,
     acsard,
     children,
     finish,
@@ -23,7 +21,7 @@ from tests.system.harness import (
     until,
     write_config,
 )
-from tests.system.identities import Certificates, Identity, free_tls_endpoint
+from tests.system.identities import Certificates, free_tls_endpoint
 
 pytestmark = pytest.mark.network
 
@@ -32,7 +30,7 @@ class Open:
     """A daemon with a door, and who comes through it."""
 
     def __init__(self, where: Path, certificates: Certificates) -> None:
-        self.certificates = certificates
+        self._certificates = certificates
         self._plain, self.tls = free_endpoint(), free_tls_endpoint()
         bus = {"listen": [self._plain, self.tls], "tls": str(certificates.robot)}
         self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
@@ -44,7 +42,7 @@ class Open:
 
     def lets_in(self) -> bool:
         try:
-            config = self.certificates.config("viewer", self._plain, self.tls)
+            config = self._certificates.config("viewer", self._plain, self.tls)
             with zenoh.open(config) as session:
                 return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
         except zenoh.ZError:
@@ -141,49 +139,3 @@ def test_without_a_tls_endpoint_there_is_no_door_to_open(tmp_path: Path) -> None
     assert "no tls/ endpoint" in done.err
     with Daemon(tmp_path) as daemon:
         assert not children(daemon.pid, "acsard door")
-
-
-class Commander(Program):
-    """Puts one payload on `cmd/app` again and again, for a while; says how often it did."""
-
-    def __init__(self, where: Path, config: zenoh.Config, payload: str, gap: float) -> None:
-        text = (
-            "import sys, time, zenoh\n"
-            "session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\n"
-            "publisher = session.declare_publisher('acsard/acsar/cmd/app')\n"
-            "time.sleep(0.3)\n"  # until the other side is known
-            "due = time.monotonic()\n"
-            "end, sent = due + 3.0, 0\n"
-            "while time.monotonic() < end:\n"
-            "    publisher.put(sys.argv[2])\n"
-            "    sent, due = sent + 1, due + float(sys.argv[3])\n"
-            "    time.sleep(max(0.0, due - time.monotonic()))\n"
-            "print('sent', sent, flush=True)\n"
-            "session.close()\n"
-        )
-        super().__init__([sys.executable, "-c", text, str(config), payload, str(gap)], where)
-
-    def sent(self) -> int:
-        return int(self.says("sent ").split()[1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("who", "share"), [("operator", 0.6), ("local", 0.9)])
-def test_who_sends_all_he_may_through_the_door_leaves_room_for_others_on_his_key(
-    tmp_path: Path, robot: Open, who: Identity, share: float
-) -> None:
-    """The other one's are told from his by what they are refused for."""
-    zero, wrong = '{"linear": {"x": 0}, "angular": {"z": 0}}', '{"linear": 1}'
-    endpoint, robots = robot.daemon.endpoint, robot.certificates
-    crowder = robots.config("operator", endpoint, robot.tls)
-    other = robots.config(who, endpoint, robot.tls)
-    with (
-        Commander(tmp_path, crowder, zero, 0.0011) as his,
-        Commander(tmp_path, other, wrong, 0.02) as theirs,
-    ):
-        sent = theirs.sent()
-        assert his.sent() > 10 * sent
-    with Bus(endpoint) as bus:
-        got = bus.count("command_wrong_shape")
-    print(f"\n{who}: {got} of {sent} commands")
-    assert got >= share * sent
