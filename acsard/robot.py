@@ -13,7 +13,7 @@ from collections import Counter
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.dropped import Dropped
-from acsard.drive.gyro import Gyro, Turn
+from acsard.drive.gyro import Gyro
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
@@ -39,7 +39,6 @@ from acsard.values import (
     Refusal,
     Request,
     Snapshot,
-    WheelSpeeds,
 )
 
 MAX_DT = 0.05
@@ -229,24 +228,13 @@ class Robot:
         if self._sanity.turned:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
-        estimate = self._odometry.fold(line, self._turn(line, events), self._speeds)
-        self.counters["wheels_doubted"] += len(self._odometry.events)
-        events += self._odometry.events
+        estimate = self._odometry.fold(line, self._gyro, self._speeds)
+        if self._gyro is not None:
+            events += self._gyro.events
+        if self._odometry.events:
+            self.counters["wheels_doubted"] += len(self._odometry.events)
+            events += self._odometry.events
         return estimate
-
-    def _turn(self, line: Feedback, events: list[Event]) -> Turn | None:
-        """What the gyro says of the turn since the line before; None where it says nothing."""
-        gyro = self._gyro
-        if gyro is None:
-            return None
-        speeds = self._odometry.believed(line.speeds)
-        wheels = self._kinematics.twist(speeds).angular * line.dt
-        if line.turned is not None:
-            turned = self._odometry.believed(WheelSpeeds(*line.turned))
-            wheels = self._kinematics.twist(turned).angular
-        turn = gyro.turn(line.at.mono_ns, line.dt, wheels, speeds == STILL)
-        events += gyro.events
-        return turn
 
     # requests
 

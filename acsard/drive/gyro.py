@@ -104,6 +104,8 @@ class Gyro:
         """Variance of the last sample."""
         self._owed = self._owed_variance = 0.0
         """rad by which it told more than the wheels while it was on trial: owed if it is proved."""
+        self.owes = False
+        """The wheels told the turn of the last line, until the trial ends."""
         self._hole = False
         """Since the last line some of the turn was not heard."""
         self._does: GyroDoes = "silent"
@@ -142,6 +144,7 @@ class Gyro:
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
         variance += SCALE_VARIANCE * abs(angle)
+        self.owes = False
         tried = not silent and dt > 0.0 and self._try(wheels, angle, variance, dt)
         if not silent and self._bias.known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
@@ -156,6 +159,16 @@ class Gyro:
         self._owed = self._owed_variance = 0.0
         noise = self._noise + self._bias.variance
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
+
+    def taken_back(self, turn: float) -> float:
+        """Of lines that it `owes`, the wheels' turn has become another one, by so many rad.
+
+        Returns the rad of that which it had put right before.
+        """
+        verdict = self._trial.verdict
+        if verdict == "none yet":
+            self._owed -= turn
+        return turn if verdict == "good" else 0.0
 
     # samples
 
@@ -204,6 +217,7 @@ class Gyro:
         if known and trial.verdict == "none yet":
             self._owed += angle - wheels
             self._owed_variance += variance
+            self.owes = True
         else:
             self._owed = self._owed_variance = 0.0
         return True

@@ -17,12 +17,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from itertools import takewhile
+from typing import Protocol
+
+from msgspec import Struct
 
 from acsard.config.settings import FeedbackConfig, OdometryConfig
 from acsard.drive.gaps import Gaps
 from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.path import Path
+from acsard.drive.rolled import NOWHERE, Rolled, Rolling, plus
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.drive.witness import Witness
@@ -40,19 +44,38 @@ from acsard.values import (
     WheelsStatus,
 )
 
-MAX_LOST_S = 0.05
-"""s of lines that could not be true, up to which the robot is held to have gone on as it did."""
-
 REST_S = 0.2
 """s of four wheels that report 0.00, after which the robot is at rest."""
 
 TAKEN_BACK = 128
 """Lines at most that are taken back of a lie that was believed."""
 
-NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
-Step = tuple[Pose, tuple[Motors, ...], Turn | None, WheelSpeeds]
-"""Where it was, how its wheels turned from there, by a gyro too, and the speeds they said."""
+class Heading(Protocol):
+    """Who tells by how much the robot turned, beside its wheels: `gyro.Gyro`."""
+
+    owes: bool
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
+
+    def taken_back(self, turn: float) -> float: ...
+
+
+class Step(Struct, frozen=True, gc=False):
+    """A line's part of the way."""
+
+    pose: Pose
+    """Where it was before."""
+    pieces: tuple[Motors, ...]
+    """How its wheels turned from there, rad,"""
+    gyro: Turn | None
+    """by a gyro too,"""
+    speeds: WheelSpeeds
+    """and the speeds they said."""
+    turn: float
+    """rad that the heading turned,"""
+    on_trial: bool
+    """which a gyro on trial will put right once it is proved."""
 
 
 class Odometry:
@@ -68,7 +91,9 @@ class Odometry:
         """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel."""
         self._kinematics = kinematics
         self._positions = NOWHERE
-        self._lost_dt, self._lost_turned = 0.0, NOWHERE
+        self._rolling = Rolling()
+        self._held = NOWHERE
+        """rad of counts at rest, whose way is not clear yet."""
         self._path = Path()
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
@@ -124,63 +149,42 @@ class Odometry:
 
         Counts are cumulative: what they made of it then stays true. Else only its time is known.
         """
-        if feedback.turned is None:
-            self._lost_dt += feedback.dt
-        else:
-            self._lost_turned = _sum(self._lost_turned, feedback.turned)
+        self._rolling.skip(feedback)
 
     def fold(
-        self, feedback: Feedback, gyro: Turn | None = None, told: WheelSpeeds | None = None
+        self, feedback: Feedback, gyro: Heading | None = None, told: WheelSpeeds | None = None
     ) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count to
-        and fro is left to the line that tells where it went. Where a gyro tells the turn since the
+        and fro is left to the line that tells where it went. Where `gyro` tells the turn since the
         line before, the wheels tell the distance only. `told` is what the wheels are to do, by
         which one that lies is found: then its side's other wheel stands in, and what it made of the
         lines until then is taken back.
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
-        lost_dt, self._lost_dt = self._lost_dt, 0.0
-        # Of lost lines without counts: it went on at about this speed, or too long to guess.
-        moved_dt, unknown = (lost_dt, 0.0) if lost_dt <= MAX_LOST_S else (0.0, lost_dt)
-        turned, bridged, passed = self._lost_turned, 0.0, moved_dt + dt
-        between = counted = NOWHERE
-        if feedback.turned is None:
-            unknown, bridged = unknown + feedback.gap, feedback.bridged
-            if bridged:
-                between = _between(self.speeds, speeds, bridged)
-            if feedback.counted is None:
-                moved_dt += dt - bridged
-            else:
-                counted = feedback.counted
-        else:
-            turned = _sum(turned, feedback.turned)
-        said = _times(speeds.as_tuple(), moved_dt)
-        # Counts may hold what rounding cost one wheel until they were known: nothing it did now.
-        now = feedback.turned or _sum(between, _times(speeds.as_tuple(), passed - bridged))
-        self._watch(now, speeds, dt if feedback.turned else passed, told, gyro)
+        rolled = self._rolling.take(feedback, self.speeds)
+        turn, by_wheels = None, 0.0
+        if gyro is not None:
+            by_wheels = self._wheels_turn(rolled)
+            still = self.believed(speeds) == STILL
+            turn = gyro.turn(feedback.at.mono_ns, rolled.known, by_wheels, still)
+        by_gyro = None if turn is None else turn.wheels
+        if self._witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
+            self._take_back(gyro)
         believed = self._witness.believed(speeds)
         twist = self._kinematics.twist(believed)
         self._still = self._still + dt if believed == STILL else 0.0
         at_rest = self._still > REST_S
-        if unknown > 0.0:
-            self._stand(unknown, before, twist)
-        rolled = NOWHERE
-        if not at_rest or max(map(abs, turned)) > self._unsettled:
-            rolled, turned = turned, NOWHERE
-        self._lost_turned = turned
-        self._move((rolled, between, counted, said), gyro, speeds)
-        if bridged > 0.0:
-            self.bridged += bridged
-            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
-        elif feedback.gap:
-            self._gaps.interrupt(twist)
-        else:
-            self._gaps.follow(twist, dt)
-        variances = self._twist_variances(twist, feedback, at_rest, gyro)
-        if gyro is not None and dt > 0.0:
-            twist = Twist(twist.linear, gyro.rate)
+        if rolled.unknown > 0.0:
+            self._stand(rolled.unknown, before, twist)
+        turned = self._move(self._settled(rolled, at_rest), turn, speeds, gyro)
+        if gyro is not None and gyro.owes and turned != by_wheels:
+            gyro.taken_back(turned - by_wheels)
+        self._go_on(rolled.bridged, feedback, before, twist)
+        variances = self._twist_variances(twist, feedback, at_rest, turn)
+        if turn is not None and dt > 0.0:
+            twist = Twist(twist.linear, turn.rate)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
@@ -194,45 +198,85 @@ class Odometry:
             feedback.heard_ns,
         )
 
-    def _watch(
-        self, turned: Motors, speeds: WheelSpeeds, dt: float, told: WheelSpeeds | None,
-        gyro: Turn | None,
-    ) -> None:  # fmt: skip
-        """Let front and rear judge a line; take back what a wheel made of the last ones that lied.
+    def _wheels_turn(self, rolled: Rolled) -> float:
+        """rad by which the wheels say the robot turned since the last line that was believed."""
+        turned = rolled.turned
+        for piece in rolled.pieces:
+            turned = plus(turned, piece)
+        return self._kinematics.twist(self.believed(WheelSpeeds(*turned))).angular
 
-        The steps since are gone through anew without it, so that the pose leaps by what was wrong.
+    def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
+        """The wheel angles to advance by; at rest counts are held until it is clear where to."""
+        turned = rolled.turned
+        if self._held != NOWHERE:
+            turned = plus(self._held, turned)
+        if turned == NOWHERE:
+            return rolled.pieces
+        if at_rest and max(map(abs, turned)) <= self._unsettled:
+            self._held = turned
+            return rolled.pieces
+        self._held = NOWHERE
+        return (turned, *rolled.pieces)
+
+    def _take_back(self, gyro: Heading | None) -> None:
+        """Take back what a wheel, found to lie, made of the last lines that it lied in.
+
+        The steps since are gone through anew without it, so that the pose leaps by what was wrong;
+        but what a gyro has put right of it, or will, is right.
         """
-        turn = None if gyro is None else gyro.wheels
-        if not self._witness.hear(turned, speeds, dt, told, turn):
-            return
-        lies = list(takewhile(lambda step: self._witness.lied(step[3]), reversed(self._steps)))
+        lies = list(takewhile(lambda step: self._witness.lied(step.speeds), reversed(self._steps)))
         if not lies:
             return
-        self._path.set(lies[-1][0])
+        self._path.set(lies[-1].pose)
+        on_trial = 0.0
         for step in reversed(lies):
-            for distance, angle in self._arcs(step[1], step[2]):
+            arcs = self._arcs(step.pieces, step.gyro)
+            for distance, angle in arcs:
                 self._path.advance(distance, angle)
+            if step.on_trial:
+                on_trial += sum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
+        if gyro is not None and on_trial:
+            self._path.turn(-gyro.taken_back(on_trial))
 
     def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
         """m and rad for each of so many wheel angles: (4) to (7) are linear.
 
         A gyro tells one turn for all of them.
         """
-        rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces if one != NOWHERE]
+        rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces]
         moved = [self._kinematics.twist(one) for one in rolled]
         if gyro is not None:
-            return [(sum(one.linear for one in moved), gyro.angle)]
+            return [(sum([one.linear for one in moved]), gyro.angle)]
         return [(one.linear, one.angular) for one in moved]
 
-    def _move(self, pieces: tuple[Motors, ...], gyro: Turn | None, speeds: WheelSpeeds) -> None:
-        """Advance by wheel angles in rad, an arc for each piece, of a line with these speeds."""
-        self._steps.append((self._path.pose, pieces, gyro, speeds))
+    def _move(
+        self,
+        pieces: tuple[Motors, ...],
+        turn: Turn | None,
+        speeds: WheelSpeeds,
+        gyro: Heading | None,
+    ) -> float:
+        """Advance by wheel angles in rad, an arc for each piece; by how many rad it turned."""
+        pose, turned = self._path.pose, 0.0
         for piece in pieces:
-            if piece != NOWHERE:
-                self._positions = _sum(self._positions, piece)
-        for distance, turn in self._arcs(pieces, gyro):
-            self._advance(distance, turn, gyro)
+            self._positions = plus(self._positions, piece)
+        for distance, angle in self._arcs(pieces, turn):
+            turned += angle
+            self._advance(distance, angle, turn)
+        on_trial = gyro is not None and gyro.owes
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial))
+        return turned
+
+    def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
+        """Doubt a way that was bridged; else measure how twists change from line to line."""
+        if bridged > 0.0:
+            self.bridged += bridged
+            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
+        elif feedback.gap:
+            self._gaps.interrupt(twist)
+        else:
+            self._gaps.follow(twist, feedback.dt)
 
     def _slips(self, gyro: Turn | None) -> bool:
         """Front and rear of a side contradict each other, or the gyro all of them."""
@@ -267,16 +311,3 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
-
-
-def _sum(a: Motors, b: Motors) -> Motors:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
-
-
-def _times(a: Motors, dt: float) -> Motors:
-    return a[0] * dt, a[1] * dt, a[2] * dt, a[3] * dt
-
-
-def _between(before: WheelSpeeds, after: WheelSpeeds, dt: float) -> Motors:
-    """Wheel angles over a time that no line reported: linear from one report to the next."""
-    return _times(_sum(before.as_tuple(), after.as_tuple()), dt / 2)

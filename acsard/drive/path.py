@@ -45,6 +45,11 @@ class Path:
         self.pose = Pose(self._x, self._y, self._yaw)
         return dx, dy, heading
 
+    def turn(self, turn: float) -> None:
+        """Turn on the spot by `turn` rad."""
+        self._turn(turn)
+        self.pose = Pose(self._x, self._y, self._yaw)
+
     def _turn(self, turn: float) -> None:
         yaw, rest = plus(self._yaw, turn)
         wrapped = math.remainder(yaw, math.tau)

@@ -26,6 +26,9 @@ from acsard.values import NS_PER_S, Instant, WheelSpeeds
 BRIDGED_S = 1.0
 """s; what is missing for longer is not guessed: the MCU may have been reset."""
 
+APART_NS = 1000
+"""Between the stamps of two lines at least: what has the time of the one before is taken for it."""
+
 FULL_READ = 1024
 """Bytes that the port reads at once: behind so many there may be more."""
 
@@ -220,8 +223,9 @@ class Timeline:
         mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
-        if last is not None and mono_ns < last.mono_ns:
-            mono_ns, wall_ns = last.mono_ns, max(wall_ns, last.wall_ns)
+        if last is not None and mono_ns < last.mono_ns + APART_NS:
+            late_ns = last.mono_ns + APART_NS - mono_ns
+            mono_ns, wall_ns = mono_ns + late_ns, max(wall_ns + late_ns, last.wall_ns + APART_NS)
         self._last = Instant(mono_ns, wall_ns)
         return self._last
 

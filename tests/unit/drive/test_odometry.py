@@ -528,6 +528,21 @@ def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
 # the turn of a gyro
 
 
+class Says:
+    """Always the same turn."""
+
+    owes = False
+
+    def __init__(self, turn: Turn) -> None:
+        self._turn = turn
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn:
+        return self._turn
+
+    def taken_back(self, turn: float) -> float:
+        raise AssertionError("it owes nothing")
+
+
 def line(seconds: float, dt: float, speeds: WheelSpeeds, **more: Any) -> Feedback:
     return Feedback(Instant(int(seconds * 1e9), 0), speeds, dt, **more)
 
@@ -539,7 +554,7 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
     speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
     wheels, gyro = (Odometry(OdometryConfig(), kinematics) for _ in range(2))
     by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
-    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Turn(0.05, 1e-4, 4.0, 1e-3))
+    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Says(Turn(0.05, 1e-4, 4.0, 1e-3)))
     assert by_gyro.pose.yaw == pytest.approx(0.05)
     assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
     assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
@@ -551,7 +566,9 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
 
 def test_over_a_gap_the_gyro_knows_the_turn() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
-    estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4), Turn(0.3, 1e-4, 0.7, 1e-3))
+    estimate = odometry.fold(
+        line(1.0, 0.0, WheelSpeeds(), gap=0.4), Says(Turn(0.3, 1e-4, 0.7, 1e-3))
+    )
     assert estimate.pose == Pose(0.0, 0.0, 0.3)
 
 

@@ -29,6 +29,7 @@ from tests.unit.drive.liars import (
     said,
     wishes,
 )
+from tests.unit.drive.test_odometry import Says
 
 TEN = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
 
@@ -207,8 +208,8 @@ def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     for _ in range(100):
         line = Feedback(AT, TEN, PERIOD)
-        sure = calm.fold(line, Turn(0.0, 0.0, 0.0, 0.0, slips=False))
-        unsure = slipping.fold(line, Turn(0.0, 0.0, 0.0, 0.0, slips=True))
+        sure = calm.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False)))
+        unsure = slipping.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True)))
     ratio = unsure.twist_variances.linear / sure.twist_variances.linear
     assert ratio == pytest.approx(100.0)
     assert unsure.covariance.xx > 90 * sure.covariance.xx

@@ -1,0 +1,173 @@
+"""Odometry and a gyro together: each rad that the wheels tell is compared and put right once."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec import Struct
+
+from acsard.config.settings import DriveConfig, OdometryConfig
+from acsard.drive.gyro import Gyro, Turn
+from acsard.drive.kinematics import Kinematics
+from acsard.drive.odometry import Odometry
+from acsard.mcu.feedback import Feedback
+from acsard.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
+
+KINEMATICS = Kinematics(DriveConfig())
+
+PERIOD_NS = NS_PER_S // 100
+
+
+class Listening:
+    """Hears what the wheels tell of the turn, and leaves it to them."""
+
+    owes = False
+
+    def __init__(self) -> None:
+        self.turned = 0.0
+        self.seconds: list[float] = []
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
+        self.turned += wheels
+        self.seconds.append(dt)
+        return None
+
+    def taken_back(self, turn: float) -> float:
+        raise AssertionError("it owes nothing")
+
+
+class One(Struct):
+    """A line: how fast, what it lacks, and whether it is passed over."""
+
+    left: float
+    right: float
+    bridged: float = 0.0
+    gap: float = 0.0
+    counts: bool = False
+    skipped: bool = False
+
+
+def said(one: One, dt: float = 0.01) -> Feedback:
+    speeds = WheelSpeeds(one.right, one.left, one.left, one.right)
+    if one.gap:
+        return Feedback(Instant(0, 0), speeds, 0.0, one.gap)
+    if one.counts:
+        turned = (one.right * dt, one.left * dt, one.left * dt, one.right * dt)
+        return Feedback(Instant(0, 0), speeds, dt, turned=turned)
+    return Feedback(Instant(0, 0), speeds, dt + one.bridged, bridged=one.bridged)
+
+
+WHEEL = st.floats(1.0, 20.0)  # never at rest: there counts are held
+
+LINES = st.lists(
+    st.builds(
+        One,
+        WHEEL,
+        WHEEL,
+        st.sampled_from([0.0, 0.0, 0.3]),
+        st.sampled_from([0.0, 0.0, 0.0, 0.5]),
+        st.booleans(),
+        st.booleans(),
+    ),
+    max_size=30,
+)
+
+
+@given(LINES)
+def test_what_a_gyro_hears_of_the_wheels_is_what_the_heading_turned(lines: list[One]) -> None:
+    robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
+    for one in lines:
+        if one.skipped:
+            robot.skip(said(one))
+        else:
+            robot.fold(said(one), listening)
+    off = math.remainder(robot.pose.yaw - listening.turned, math.tau)
+    assert off == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_line_passed_over_leaves_the_gap_before_it_to_the_next() -> None:
+    robot = Odometry(OdometryConfig(), KINEMATICS)
+    robot.fold(said(One(10.0, 10.0)))
+    robot.skip(said(One(10.0, 10.0, gap=0.5)))
+    robot.fold(said(One(10.0, 10.0)))
+    assert robot.missed() == {"gaps": 1, "gap_ms": 500}
+
+
+def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
+    robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
+    for one in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
+        robot.fold(said(one), listening)
+    assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
+
+
+class Turning:
+    """A robot with a true gyro: it stands for a second, then does as told."""
+
+    def __init__(self) -> None:
+        self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
+        self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
+        self.does: list[str] = []
+        self.run(1.0, Twist())
+
+    def run(self, seconds: float, twist: Twist, dead: bool = False, gap: bool = False) -> None:
+        """Its front left wheel is `dead`; over a `gap` it reaches its twist and tells the end."""
+        told = KINEMATICS.wheel_speeds(twist)
+        speeds = told if not dead else WheelSpeeds(told.front_right, 0.0, *told.as_tuple()[2:])
+        lines = round(100 * seconds)
+        before, dt, bridged = self.rate, 0.01, 0.0
+        if gap:
+            dt, bridged = seconds, seconds - 0.01
+        for number in range(1, lines + 1):
+            self.now_ns += PERIOD_NS
+            share = min(1.0, number / (lines - 1)) if gap else 1.0
+            rate = before + (twist.angular - before) * share
+            self.true += (rate + self.rate) / 200 if gap else rate / 100
+            self.rate = rate
+            self.gyro.hear((GyroSample(self.now_ns, None, rate),))
+            if gap and number < lines:
+                continue
+            at = Instant(self.now_ns, self.now_ns)
+            self.robot.fold(Feedback(at, speeds, dt, bridged=bridged), self.gyro, told)
+            self.does += [event.kind for event in self.gyro.events]
+
+    @property
+    def off(self) -> float:
+        """rad by which the heading is wrong."""
+        return math.remainder(self.robot.pose.yaw - self.true, math.tau)
+
+
+def test_a_gap_that_is_bridged_is_no_slip() -> None:
+    bench = Turning()
+    bench.run(2.0, Twist(0.0, 1.0))
+    for rate in (-1.0, 1.0, 0.0, 1.0, -1.0):
+        bench.run(0.3, Twist(0.0, rate), gap=True)
+        bench.run(1.0, Twist(0.0, rate))
+    assert "disagrees" not in bench.does
+    assert bench.off == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> None:
+    bench = Turning()
+    bench.run(0.1, Twist(0.0, 0.5), gap=True)
+    bench.run(0.1, Twist(0.0, 0.9), gap=True)
+    bench.run(2.0, Twist(0.0, 0.9))
+    assert bench.gyro.status.does == "used"
+    assert bench.off == pytest.approx(0.0, abs=0.006)  # its samples are taken as steps
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.0, 0.4), st.floats(0.4, 2.0), st.floats(0.2, 1.0))
+def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
+    before: float, turning: float, ahead: float
+) -> None:
+    bench = Turning()
+    bench.run(1.0, Twist(ahead, 0.0))
+    bench.run(before, Twist(ahead, turning))
+    bench.run(0.3, Twist(ahead, turning), dead=True)
+    assert bench.robot.doubt.left_out
+    bench.run(2.0, Twist(ahead, turning), dead=True)
+    assert bench.gyro.status.does == "used"
+    assert bench.off == pytest.approx(0.0, abs=2e-3)

@@ -1,0 +1,90 @@
+"""A line -> the wheel angles since the last one that was believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.drive.rolled import MAX_LOST_S, NOWHERE, Rolled, Rolling
+from acsard.mcu.feedback import Feedback
+from acsard.values import Instant, WheelSpeeds
+
+AT = Instant(0, 0)
+FOUR = WheelSpeeds(4.0, 4.0, 4.0, 4.0)
+TWO = WheelSpeeds(2.0, 2.0, 2.0, 2.0)
+
+
+def all_four(angle: float) -> Any:
+    return (pytest.approx(angle),) * 4
+
+
+def total(rolled: Rolled) -> float:
+    """rad of the first wheel."""
+    return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
+
+
+def test_a_line_is_its_speed_times_its_time() -> None:
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01), TWO)
+    assert rolled.pieces == (all_four(0.04),)
+    assert rolled.seen == all_four(0.04)
+    assert (rolled.seconds, rolled.known, rolled.unknown) == (0.01, 0.01, 0.0)
+
+
+def test_who_stands_rolls_nowhere() -> None:
+    rolled = Rolling().take(Feedback(AT, WheelSpeeds(), 0.01), WheelSpeeds())
+    assert rolled.pieces == ()
+    assert rolled.turned == NOWHERE
+
+
+def test_what_no_line_reported_lies_between_two_speeds() -> None:
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.03, bridged=0.02), TWO)
+    assert rolled.pieces == (all_four(0.06), all_four(0.04))
+    assert rolled.seen == all_four(0.1)
+    assert (rolled.seconds, rolled.bridged) == (0.03, 0.02)
+
+
+def test_counts_go_before_the_speed() -> None:
+    counted = (0.05, 0.05, 0.05, 0.05)
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
+    assert rolled.pieces == (counted,)
+    assert rolled.seen == all_four(0.04)  # a count made good is nothing that it did now
+    turned = (0.06, 0.06, 0.06, 0.06)
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
+
+
+@pytest.mark.parametrize("lines", [1, 4])
+def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int) -> None:
+    rolling = Rolling()
+    for _ in range(lines):
+        rolling.skip(Feedback(AT, TWO, 0.01))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
+    assert total(rolled) == pytest.approx(0.04 * (lines + 1))
+    assert (rolled.known, rolled.unknown) == (pytest.approx(0.01 * (lines + 1)), 0.0)
+    assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
+
+
+def test_of_more_nobody_knows() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, MAX_LOST_S))
+    rolling.skip(Feedback(AT, TWO, 0.01))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
+    assert total(rolled) == pytest.approx(0.04)
+    assert (rolled.known, rolled.unknown) == (0.0, pytest.approx(MAX_LOST_S + 0.01))
+
+
+def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, TWO, 0.01, turned=turned))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    assert rolled.turned == all_four(0.12)
+    assert rolled.seen == turned
+    assert (rolled.seconds, rolled.known) == (0.01, pytest.approx(0.02))
+
+
+def test_gaps_before_lines_passed_over_stay_gaps() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, 0.0, gap=0.5))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.0, gap=0.3), TWO)
+    assert (rolled.known, rolled.unknown) == (0.0, pytest.approx(0.8))
