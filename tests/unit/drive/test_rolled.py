@@ -19,6 +19,10 @@ def all_four(angle: float) -> Any:
     return (pytest.approx(angle),) * 4
 
 
+def near(*values: float) -> Any:
+    return pytest.approx(values)
+
+
 def total(rolled: Rolled) -> float:
     """rad of the first wheel."""
     return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
@@ -41,7 +45,7 @@ def test_what_no_line_reported_lies_between_two_speeds() -> None:
     rolled = Rolling().take(Feedback(AT, FOUR, 0.03, bridged=0.02), TWO)
     assert rolled.pieces == (all_four(0.06), all_four(0.04))
     assert rolled.seen == all_four(0.1)
-    assert (rolled.seconds, rolled.bridged) == (0.03, 0.02)
+    assert (rolled.seconds, rolled.bridged) == near(0.03, 0.02)
 
 
 def test_counts_go_before_the_speed() -> None:
@@ -61,7 +65,7 @@ def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int
         rolling.skip(Feedback(AT, TWO, 0.01))
     rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
     assert total(rolled) == pytest.approx(0.04 * (lines + 1))
-    assert (rolled.known, rolled.unknown) == (pytest.approx(0.01 * (lines + 1)), 0.0)
+    assert (rolled.known, rolled.unknown) == near(0.01 * (lines + 1), 0.0)
     assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
 
 
@@ -71,7 +75,7 @@ def test_of_more_nobody_knows() -> None:
     rolling.skip(Feedback(AT, TWO, 0.01))
     rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
     assert total(rolled) == pytest.approx(0.04)
-    assert (rolled.known, rolled.unknown) == (0.0, pytest.approx(MAX_LOST_S + 0.01))
+    assert (rolled.known, rolled.unknown) == near(0.0, MAX_LOST_S + 0.01)
 
 
 def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
@@ -80,11 +84,11 @@ def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
     rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
     assert rolled.turned == all_four(0.12)
     assert rolled.seen == turned
-    assert (rolled.seconds, rolled.known) == (0.01, pytest.approx(0.02))
+    assert (rolled.seconds, rolled.known) == near(0.01, 0.02)
 
 
 def test_gaps_before_lines_passed_over_stay_gaps() -> None:
     rolling = Rolling()
     rolling.skip(Feedback(AT, TWO, 0.0, gap=0.5))
     rolled = rolling.take(Feedback(AT, FOUR, 0.0, gap=0.3), TWO)
-    assert (rolled.known, rolled.unknown) == (0.0, pytest.approx(0.8))
+    assert (rolled.known, rolled.unknown) == near(0.0, 0.8)
