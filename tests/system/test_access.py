@@ -129,9 +129,11 @@ def _questions() -> Iterator[Try]:
     # By wildcard at the machine only.
     yield from (Try(f"{key}/@adv/**", HERE) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC))
     yield Try(f"{ME}/config", KEEPERS)
-    yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*", "json/*"))
+    yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
     yield from (Try(f"{ME}/{key}", NOBODY) for key in services)
+    # The plain keys answer wildcards, so that nothing is answered twice.
+    yield from (Try(f"{ME}/{key}", NOBODY) for key in ("json/*", "json/**"))
     wilder = ("acsard/*/state", "acsard/*/srv/stop", "acsard/**", "**")
     yield from (Try(key, NOBODY) for key in wilder)
     yield from (Try(f"{OTHER}/{key}", NOBODY) for key in ("state", "srv/stop", "config", "**"))
