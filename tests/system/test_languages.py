@@ -120,7 +120,8 @@ def commands() -> list[str]:
 
 def copied(language: str, kept: Path) -> Path:
     """The example where it may be built, on top of what was built there before."""
-    return shutil.copytree(CLIENTS / language, kept / language, dirs_exist_ok=True)
+    built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
+    return shutil.copytree(CLIENTS / language, kept / language, ignore=built, dirs_exist_ok=True)
 
 
 @pytest.mark.languages
