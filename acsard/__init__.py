@@ -21,7 +21,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is
                       followed?), neutral (who may drive?), freshness (what came too late), words
                       (all that in sentences), limits, modes (the table), tally (the log)
-    messages/      P  the published structs, topics (**the** key table), encodings, report
+    messages/      P  the published structs, topics (**the** key table), encodings, report,
+                      json_schema (of what goes out and comes in)
     ros/           P  the two ROS trees: names and hashes, tokens, attachments, parameters
     incoming/      P  what comes in over the bus: sample -> command, query -> reply or request
     robot.py       P  the order; guard.py: the last look at every outgoing line

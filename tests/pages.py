@@ -111,6 +111,7 @@ ROUTER = "tests/system/test_router.py"
 SERVICE = "tests/systemd/test_service.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
+CLIENTS = "tests/system/test_languages.py"
 GUIDED = "tests/system/test_calibrate.py"
 
 NO_ROS = Shown("needs ROS 2; the page says that it was not tried")
@@ -133,6 +134,13 @@ LAUNCH = Elsewhere(
     "tests/test_deploy_ros2.py",
     "test_the_launch_file_puts_the_namespace_before_every_topic",
     "the file is run, with what ROS has in it stood in for",
+)
+
+IN_TYPESCRIPT = Elsewhere(
+    CLIENTS, "test_the_typescript_example_follows_the_robot_through_the_bridge"
+)
+TYPED = Elsewhere(
+    CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says"
 )
 
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
@@ -173,7 +181,9 @@ COMMANDS: dict[str, How] = {
     ),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
-    ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
+    ".venv/bin/pytest -m '(slow or network or systemd or firmware or languages) and not soak'": (
+        PYTEST
+    ),
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
@@ -181,6 +191,24 @@ COMMANDS: dict[str, How] = {
         "tests/system/test_bench.py",
         "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",
     ),
+    # deploy/clients
+    "python deploy/clients/python/follow.py": Elsewhere(
+        CLIENTS, "test_the_python_example_follows_the_robot"
+    ),
+    "cd deploy/clients/rust && cargo run": Elsewhere(
+        CLIENTS, "test_the_rust_example_follows_the_robot"
+    ),
+    "cargo install zenoh-bridge-remote-api@1.10.2 --locked": IN_TYPESCRIPT,
+    "zenoh-bridge-remote-api -m client -e tcp/127.0.0.1:7448 --no-multicast-scouting "
+    "--ws-port 127.0.0.1:10000": IN_TYPESCRIPT,
+    "cd deploy/clients/typescript && npm install && npm run build && npm start": IN_TYPESCRIPT,
+    "python deploy/clients/python/schemas.py schemas": TYPED,
+    "npx quicktype --lang typescript --src-lang schema --src schemas/*.json -o acsard.ts": (
+        Elsewhere(CLIENTS, "test_types_made_by_quicktype_compile_and_read_what_the_daemon_says")
+    ),
+    "pip install datamodel-code-generator": TYPED,
+    "datamodel-codegen --input schemas --input-file-type jsonschema "
+    "--output-model-type pydantic_v2.BaseModel --output acsard_types": TYPED,
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
     "make": Elsewhere("tests/firmware/test_board.py", "test_it_boots_stopped_and_says_who_it_is"),

@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.config.settings import Config
-from acsard.messages.schema import MESSAGES
+from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import (
     IMU,
     Direction,
     full_key,
+    json_key,
     offered,
     published,
     service_key,
@@ -115,7 +116,9 @@ class _Keys:
         self.config = full_key(robot, "config")
         self.stop = full_key(robot, "stop")
         self.imu = full_key(robot, IMU)
-        self.published = [full_key(robot, topic.key) for topic in told] + _of(ros, "out")
+        self.published = [full_key(robot, topic.key) for topic in told]
+        self.published += [full_key(robot, json_key(topic.key)) for topic in told]
+        self.published += _of(ros, "out")
         latched = [full_key(robot, topic.key) for topic in told if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
@@ -135,7 +138,7 @@ class _Keys:
         asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
         self.questions = [key for key in asked if key != self.config]
         self.exact_questions = [key for key in self.questions if "*" not in key]
-        self.exact_questions += [full_key(robot, f"schema/{name}") for name in MESSAGES]
+        self.exact_questions += [full_key(robot, f"schema/{name}") for name in SCHEMAS]
         self.parameters = _of(ros, "query")
 
     def of(self, verb: Verb) -> list[str]:

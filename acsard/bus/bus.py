@@ -26,7 +26,7 @@ from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
 from acsard.messages.signature import Signature
-from acsard.messages.topics import IMU, Topic, full_key
+from acsard.messages.topics import IMU, Topic, full_key, json_key
 from acsard.ros.tokens import gid
 from acsard.ros.transports import Endpoint, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
@@ -132,7 +132,7 @@ class ZenohBus:
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
                 self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
-            elif topic.key != "alive":
+            elif topic.key not in ("alive", json_key("<key>")):
                 on_query = direct(partial(inbox.on_query, topic.key))
                 self._kept.append(session.declare_queryable(key, on_query))
         for topic in self._published:
@@ -141,6 +141,15 @@ class ZenohBus:
             self._outlets.declare(
                 session, topic.key, key, "msgpack", encoding, topic.latched, signed=signed
             )
+            self._declare_json(session, topic)
+
+    def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
+        """The same once more for who has no msgpack; kept for nobody, or it were encoded always."""
+        below = json_key(topic.key)
+        key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
+        self._outlets.declare(session, topic.key, key, "json", encoding)
+        on_query = direct(partial(self._inbox.on_query, below))
+        self._kept.append(session.declare_queryable(key, on_query))
 
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key

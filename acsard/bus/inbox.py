@@ -17,7 +17,7 @@ from acsard.incoming.bus import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.encodings import encoding_name
-from acsard.messages.topics import IMU, VERBS, service_key, source_keys
+from acsard.messages.topics import IMU, JSON_TREE, VERBS, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
 ARRIVALS = 16
@@ -139,8 +139,8 @@ class Inbox:
     def on_query(self, topic: str, query: zenoh.Query) -> None:
         """A query that reached a row of the native table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
-        if topic in VERBS and asked != topic:
-            return  # letting go of it ends it
+        if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
+            return  # letting go of it ends it; a wildcard reaches the plain key as well
         self._asked(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:

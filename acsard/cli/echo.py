@@ -103,7 +103,7 @@ def _hint(topic: str) -> None:
     from acsard.messages.topics import TOPICS, by_key
 
     prefix = topic.partition("/")[0]
-    if by_key(topic) is None and prefix not in ("cmd", "wheel_cmd"):
+    if by_key(topic) is None and prefix not in ("cmd", "wheel_cmd", "json"):
         near = difflib.get_close_matches(topic, [t.key for t in TOPICS], n=1)
         hint = f"did you mean {near[0]}?" if near else "`acsard topics` lists the keys"
         print(f"acsard: {topic} is not in the topic table; {hint} Waiting.", file=sys.stderr)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -18,6 +17,7 @@ from acsard.incoming.asker import asker
 from acsard.incoming.commands import Receiver, Via
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
+from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.schema import (
     MESSAGES,
     HardwareInterface,
@@ -28,7 +28,7 @@ from acsard.messages.schema import (
     TopicInfo,
     Topics,
 )
-from acsard.messages.topics import PUBLISHED, VERBS, full_key, offered
+from acsard.messages.topics import JSON_TREE, PUBLISHED, VERBS, full_key, offered
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.transports import PARAMETERS
@@ -77,7 +77,6 @@ class Queries:
             "config": effective(config),
             "topics": topic_table(config),
         }
-        self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
         self._parameters = Parameters(effective(config))
         self._waiting: dict[int, tuple[str, Format, Attachment | None]] = {}
 
@@ -152,14 +151,14 @@ class Queries:
         topic = query.topic
         if topic == "schema/<Type>":
             asked = query.asked.removeprefix("schema/")
-            names = list(self._schemas) if "*" in asked else [asked]
-            return [(f"schema/{n}", "", self._schemas[n]) for n in names if n in self._schemas]
+            names = list(SCHEMAS) if "*" in asked else [asked]
+            return [(f"schema/{n}", "", SCHEMAS[n]) for n in names if n in SCHEMAS]
         if topic == "interfaces":
             return [(topic, "Interfaces", interfaces(self._config, outputs))]
         if topic in self._fixed:
             value = self._fixed[topic]
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
-        value = current(topic)
+        value = current(topic.removeprefix(JSON_TREE))
         return [] if value is None else [(topic, type(value).__name__, value)]
 
 
@@ -183,11 +182,6 @@ def _format(query: Query) -> Format:
         except DecodeError:
             pass  # a service that takes no payload does not mind one
     return "json"
-
-
-def schema(cls: type[Message]) -> dict[str, object]:
-    """The JSON Schema of a type."""
-    return msgspec.json.schema(cls)
 
 
 def topic_table(config: Config) -> Topics:

@@ -6,11 +6,15 @@ structs refuse unknown fields, so a misspelt axis is an error and not a standsti
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterable
+from typing import Annotated, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.values import NS_PER_S
+from acsard.drive.modes import Mode
+from acsard.mcu.link import State
+from acsard.messages.topics import Direction
+from acsard.values import NS_PER_S, GyroDoes
 
 # What `cdr.py` has to know: the width of an int in CDR, the length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -22,6 +26,11 @@ Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 FEW = Meta(max_length=64)
 """More joints than any robot of ours; what a stranger sends must not take long to refuse."""
+
+
+def one_of(values: Iterable[object]) -> Meta:
+    """Says in the JSON Schema which values there are; who decodes does not refuse a later one."""
+    return Meta(extra_json_schema={"enum": list(values)})
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True):
@@ -195,7 +204,7 @@ class RobotState(Message, frozen=True):
     """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s)."""
 
     stamp: Time
-    mode: str
+    mode: Annotated[str, one_of(mode.value for mode in Mode)]
     reason: str
     x: float
     y: float
@@ -204,7 +213,7 @@ class RobotState(Message, frozen=True):
     angular: float
     wheels: list[float]
     """Measured speeds in the order front right, front left, rear left, rear right."""
-    link: str
+    link: Annotated[str, one_of(get_args(State))]
     source: str
     sources: list[SourceState]
     refused: str
@@ -214,7 +223,7 @@ class RobotState(Message, frozen=True):
     """How long the bus's TLS certificate is valid, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
     """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
-    gyro: str = "off"
+    gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """What the gyro does for odometry: `values.GyroDoes`."""
     encoders: list[int] = []
     """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
@@ -245,7 +254,7 @@ class KeyValue(Message, frozen=True):
 class DiagnosticStatus(Message, frozen=True):
     """`level` 0 ok, 1 warning, 2 error, 3 stale."""
 
-    level: Byte
+    level: Annotated[Byte, one_of(range(4))]
     name: str
     message: str
     hardware_id: str
@@ -292,9 +301,8 @@ class HardwareInterface(Message, frozen=True):
     """One line of `ros2 control list_hardware_interfaces`."""
 
     name: str
-    kind: str
-    """"command" or "state"."""
-    unit: str
+    kind: Annotated[str, one_of(("command", "state"))]
+    unit: Annotated[str, one_of(("rad", "rad/s"))]
     available: bool
     claimed: bool
     """A command interface is claimed while a source drives."""
@@ -310,7 +318,7 @@ class TopicInfo(Message, frozen=True):
     """One row of the topic table."""
 
     key: str
-    direction: str
+    direction: Annotated[str, one_of(get_args(Direction))]
     type: str
     rate: str
     note: str

@@ -19,7 +19,7 @@ Direction = Literal["out", "in", "query", "service"]
 
 
 class Topic(Struct, frozen=True):
-    """One row. `key` may hold `<source>` or `<Type>` where a name goes."""
+    """One row. `key` may hold `<source>`, `<Type>` or `<key>` where a name goes."""
 
     key: str
     direction: Direction
@@ -35,7 +35,7 @@ class Topic(Struct, frozen=True):
     @property
     def pattern(self) -> str:
         """The key with each placeholder as a Zenoh wildcard."""
-        return self.key.replace("<source>", "*").replace("<Type>", "*")
+        return self.key.replace("<source>", "*").replace("<Type>", "*").replace("<key>", "**")
 
 
 SERVICES: tuple[Verb, ...] = get_args(Verb)
@@ -59,6 +59,14 @@ def service_key(verb: str) -> str:
     return f"srv/{verb}"
 
 
+JSON_TREE = "json/"
+
+
+def json_key(key: str) -> str:
+    """Where a published key is there once more, in JSON."""
+    return JSON_TREE + key
+
+
 VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
 """What each service asks of the robot, by its key."""
 
@@ -73,6 +81,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic(
         "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
     ),
+    Topic(json_key("<key>"), "out", "JSON", "as the key", "each key above, for subscribers"),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
     Topic(IMU, "in", "Imu", "any", "turn rate by a gyro, with [odometry] gyro", gyro=True),
@@ -80,7 +89,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
     *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
     Topic("info", "query", "Info", "", "who is this daemon"),
-    Topic("config", "query", "configuration", "", "the configuration in force"),
+    Topic("config", "query", "Config", "", "the configuration in force"),
     Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
     Topic("topics", "query", "Topics", "", "this table"),
     Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a type"),
@@ -88,7 +97,9 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 PUBLISHED: tuple[Topic, ...] = tuple(
-    topic for topic in TOPICS if topic.direction == "out" and topic.key != "alive"
+    topic
+    for topic in TOPICS
+    if topic.direction == "out" and topic.key not in ("alive", json_key("<key>"))
 )
 """The topics with a payload; each also answers queries with its last value."""
 

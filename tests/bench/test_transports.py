@@ -220,12 +220,15 @@ def encoded(
 
 
 def test_a_tree_nobody_listens_to_encodes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, ros = full_key(config().robot.id, "odom"), "odom"
+    robot, ros = config().robot.id, "odom"
+    ours, text = full_key(robot, "odom"), full_key(robot, "json/odom")
     cases: list[tuple[tuple[str, ...], dict[str, int]]] = [
         ((), {}),
         ((ours,), {"msgpack": 50}),
         ((ros,), {"cdr": 50}),
+        ((text,), {"json": 50}),
         ((ours, ros), {"msgpack": 50, "cdr": 50}),
+        ((ours, text), {"msgpack": 50, "json": 50}),
     ]
     for keys, wanted in cases:
         made = encoded(monkeypatch, keys, config(), 50)

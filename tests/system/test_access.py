@@ -41,7 +41,8 @@ ANYBODY: Who = DRIVERS | {"viewer"}
 
 ME, OTHER = "acsard/acsar", "acsard/other"
 SOURCES = ("teleop", "app", "ros2_control", "nav")
-VALUES = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics")
+PLAIN = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics")
+VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 
 TWIST_JSON = json.dumps(ZERO).encode()
 WHEELS_JSON = json.dumps({"name": ros.WHEELS, "velocity": [0.0] * 4}).encode()
@@ -131,6 +132,8 @@ def _questions() -> Iterator[Try]:
     yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
     yield from (Try(f"{ME}/{key}", NOBODY) for key in services)
+    # The plain keys answer wildcards, so that nothing is answered twice.
+    yield from (Try(f"{ME}/{key}", NOBODY) for key in ("json/*", "json/**"))
     wilder = ("acsard/*/state", "acsard/*/srv/stop", "acsard/**", "**")
     yield from (Try(key, NOBODY) for key in wilder)
     yield from (Try(f"{OTHER}/{key}", NOBODY) for key in ("state", "srv/stop", "config", "**"))
@@ -154,7 +157,7 @@ def _services() -> Iterator[Try]:
 
 
 def _subscriptions() -> Iterator[Try]:
-    often = [value for value in VALUES if value != "tf_static"]
+    often = [value for value in VALUES if not value.endswith("tf_static")]
     yield from (Try(f"{ME}/{key}", ANYBODY) for key in often)
     for name, (kind, _, late) in ros.PUBLISHED.items():
         how: Literal["plain", "late"] = "late" if late else "plain"
@@ -166,7 +169,8 @@ def _subscriptions() -> Iterator[Try]:
     yield from (Try(key, HERE, how="token") for key in tokens)
     yield from (Try(key, NOBODY, how="token") for key in ("**", f"{OTHER}/alive"))
     # At the machine any wildcard will do: what is published there is no secret there.
-    wild = (f"{ME}/*", f"{ME}/**", "acsard/*/odom", "acsard/**", "**", "*", "0/**", "0/odom/**")
+    wild = (f"{ME}/*", f"{ME}/**", f"{ME}/json/*", "acsard/*/odom", "acsard/**", "**", "*", "0/**",
+            "0/odom/**")  # fmt: skip
     yield from (Try(key, HERE) for key in wild)
     others = (f"{OTHER}/odom", f"{OTHER}/**", "other/odom", "0/other/odom/**", "1/odom/**")
     yield from (Try(key, NOBODY) for key in others)

@@ -175,8 +175,7 @@ def test_topics_lists_every_key_that_is_declared(bus: Bus) -> None:
 
 def test_a_schema_describes_the_fields_of_its_type(bus: Bus) -> None:
     schema = bus.get("schema/Odometry")
-    fields = schema["$defs"]["Odometry"]["properties"]
-    assert set(fields) == set(bus.get("odom"))
+    assert set(schema["properties"]) == set(bus.get("odom"))
 
 
 def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
@@ -184,7 +183,8 @@ def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
     assert all(answer.ok for answer in answers)
     types = [answer.key.removeprefix("schema/") for answer in answers]
     assert len(types) == len(set(types))
-    assert {*PUBLISHED.values(), "ServiceReply", "Twist", "SetPose"} <= set(types)
+    asked = {"ServiceReply", "Twist", "JointStateIn", "SetPose", "Config"}
+    assert {*PUBLISHED.values(), *asked} <= set(types)
 
 
 def test_a_schema_that_does_not_exist_is_no_answer_at_once(bus: Bus) -> None:
@@ -380,6 +380,31 @@ def test_every_published_key_names_its_encoding(bus: Bus) -> None:
             seen = messages.find(lambda _: True, 3.0, key)
         assert seen.encoding == f"application/msgpack;acsard.{type_name}.v1"
         assert set(seen.value) == FIELDS[key]
+
+
+@pytest.mark.parametrize("key", [key for key in PUBLISHED if key != "tf_static"])
+def test_every_published_key_is_there_in_json_with_the_same_fields(bus: Bus, key: str) -> None:
+    with bus.follow(f"json/{key}") as messages:
+        seen = messages.find(lambda _: True, 3.0, f"json/{key}")
+    assert seen.encoding == f"application/json;acsard.{PUBLISHED[key]}.v1"
+    assert set(seen.value) == FIELDS[key]
+
+
+def test_in_json_each_message_is_the_one_on_the_plain_key(bus: Bus) -> None:
+    with bus.follow("odom") as packed, bus.follow("json/odom") as texts:
+        until(lambda: len(packed.seen) > 20 and len(texts.seen) > 20, 5.0, "both")
+        told = {seconds(seen.value["header"]["stamp"]): seen.value for seen in list(packed.seen)}
+        again = [seen.value for seen in list(texts.seen)]
+    both = [value for value in again if seconds(value["header"]["stamp"]) in told]
+    assert len(both) > 10
+    assert all(value == told[seconds(value["header"]["stamp"])] for value in both)
+
+
+def test_a_key_in_json_answers_by_its_exact_name_and_not_once_more_by_a_wildcard(bus: Bus) -> None:
+    (answer,) = bus.ask("json/tf_static")
+    assert (answer.ok, answer.key) == (True, "json/tf_static")
+    assert json.loads(answer.payload) == bus.get("tf_static")
+    assert not [one.key for one in bus.ask("**") if one.key.startswith("json/")]
 
 
 def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -> None:

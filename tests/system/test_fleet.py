@@ -25,7 +25,7 @@ from acsard.config.contradictions import warnings
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.exits import Exit
-from acsard.messages.schema import MESSAGES
+from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
 from tests.system.fleet_router import (
     ITS_NAME,
@@ -68,8 +68,8 @@ POSE = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
 TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
-VALUES = tuple(topic.key for topic in PUBLISHED)
-OFTEN = tuple(topic.key for topic in PUBLISHED if not topic.latched)
+VALUES = tuple(key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}"))
+OFTEN = tuple(key for key in VALUES if not key.endswith("tf_static"))
 EVERY_REPLY = zenoh.ConsolidationMode.NONE
 
 
@@ -493,10 +493,10 @@ def test_the_lines_for_a_robot_are_a_configuration_without_surprises() -> None:
 def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() -> None:
     access = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("access_control"))
     keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
-    published = {topic.key for topic in PUBLISHED}
+    published = set(VALUES)
     assert keys["hear"] == {f"acsard/*/{key}" for key in published}
     asked = {topic.key for topic in TOPICS if topic.direction == "query"} - {"schema/<Type>"}
-    asked |= {f"schema/{name}" for name in MESSAGES}
+    asked |= {f"schema/{name}" for name in SCHEMAS}
     services = {f"srv/{verb}" for verb in SERVICES}
     commands = {f"{kind}/{source}" for kind in ("cmd", "wheel_cmd") for source in SOURCES}
     for robot in ("robot1", "robot2"):

@@ -119,9 +119,12 @@ def test_every_policy_names_rules_and_subjects_that_exist() -> None:
 # the native keys
 
 
-@pytest.mark.parametrize("topic", PUBLISHED, ids=lambda topic: topic.key)
-def test_everybody_admitted_may_follow_and_ask_for_what_is_published(topic: Any) -> None:
-    key = DEFAULT.key(topic.key)
+TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
+
+
+@pytest.mark.parametrize("told", TOLD)
+def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) -> None:
+    key = DEFAULT.key(told)
     assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
     assert DEFAULT.who("query", key) == FROM["viewer"]
     for who in EVERYBODY:
@@ -129,7 +132,7 @@ def test_everybody_admitted_may_follow_and_ask_for_what_is_published(topic: Any)
         assert DEFAULT.lets(who, "reply", key, "egress")
 
 
-@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*"])
+@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
 def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
     assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
     assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
@@ -229,7 +232,7 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
         "*/app",
         "cmd/ghost",
     ]
-    below += [topic.key for topic in PUBLISHED]
+    below += ["json/*", "json/**", *TOLD]
     for key in (*map(DEFAULT.key, below), "acsard/*/cmd/app", "acsard/**", "**"):
         assert not DEFAULT.lets(role, "put", key), key
 

@@ -14,6 +14,7 @@ from acsard.config.settings import Config, JointsConfig, RobotConfig
 from acsard.incoming.queries import Queries, Query, Reply
 from acsard.messages.cdr import Cdr
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
+from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.report import Report
 from acsard.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
@@ -78,6 +79,12 @@ def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -
         encode(report().current(topic.key, lambda: SNAPSHOT), form),
         encoding_name(form, topic.type),
     )
+
+
+@pytest.mark.parametrize("key", ["odom", "state"])
+def test_a_key_of_the_json_tree_answers_as_the_plain_one(key: str) -> None:
+    plain = answer(query(key))
+    assert answer(query(f"json/{key}")) == replace(plain, key=f"json/{key}")
 
 
 @pytest.mark.parametrize("topic", [t for t in PUBLISHED if t.key in NATIVE], ids=lambda t: t.key)
@@ -151,20 +158,18 @@ def test_topics_is_the_whole_table_with_full_keys() -> None:
     assert reply.encoding == encoding_name("json", "Topics")
 
 
-@pytest.mark.parametrize("name", MESSAGES)
+@pytest.mark.parametrize("name", SCHEMAS)
 def test_each_type_has_its_schema(name: str) -> None:
     reply = answer(query("schema/<Type>", f"schema/{name}"))
-    schema = msgspec.json.decode(reply.payload)
     assert reply.key == f"schema/{name}"
-    assert schema["$ref"] == f"#/$defs/{name}"
-    assert tuple(schema["$defs"][name]["properties"]) == MESSAGES[name].__struct_fields__
+    assert msgspec.json.decode(reply.payload) == SCHEMAS[name]
     assert reply.encoding == "application/json"
 
 
 @pytest.mark.parametrize("asked", ["schema/*", "schema/**", "**", "acsard/*/schema/*"])
 def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
     assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
-        f"schema/{name}" for name in MESSAGES
+        f"schema/{name}" for name in SCHEMAS
     ]
 
 

@@ -14,6 +14,7 @@ from acsard.messages.topics import (
     VERBS,
     by_key,
     full_key,
+    json_key,
     offered,
     published,
     source_keys,
@@ -28,6 +29,7 @@ PROMISED = [
     ("state", "out", "RobotState"),
     ("diagnostics", "out", "DiagnosticArray"),
     ("sim/pose", "out", "PoseStamped"),
+    ("json/<key>", "out", "JSON"),
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
     ("imu", "in", "Imu"),
@@ -40,7 +42,7 @@ PROMISED = [
     ("srv/reset_odometry", "service", "ServiceReply"),
     ("srv/set_pose", "service", "ServiceReply"),
     ("info", "query", "Info"),
-    ("config", "query", "configuration"),
+    ("config", "query", "Config"),
     ("interfaces", "query", "Interfaces"),
     ("topics", "query", "Topics"),
     ("schema/<Type>", "query", "JSON Schema"),
@@ -61,8 +63,9 @@ def test_every_row_says_what_it_is_for() -> None:
     assert all(topic.note for topic in TOPICS)
 
 
-def test_published_is_every_way_out_but_the_token() -> None:
-    names = [key for key, direction, _ in PROMISED if direction == "out" and key != "alive"]
+def test_published_is_every_way_out_but_the_token_and_the_same_in_json() -> None:
+    apart = ("alive", "json/<key>")
+    names = [key for key, direction, _ in PROMISED if direction == "out" and key not in apart]
     assert [topic.key for topic in PUBLISHED] == names
     assert all(topic.type in MESSAGES for topic in PUBLISHED)
 
@@ -111,7 +114,8 @@ def test_a_full_key_has_the_robot_in_it() -> None:
 @pytest.mark.parametrize(
     ("key", "pattern"),
     [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
-     ("schema/<Type>", "schema/*"), ("odom", "odom"), ("srv/stop", "srv/stop")],
+     ("schema/<Type>", "schema/*"), ("json/<key>", "json/**"),
+     ("odom", "odom"), ("srv/stop", "srv/stop")],
 )  # fmt: skip
 def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
     row = by_key(key)
@@ -122,6 +126,10 @@ def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
 def test_a_source_commands_by_twist_or_by_wheels() -> None:
     keys = ["cmd/app", "cmd/nav", "wheel_cmd/app", "wheel_cmd/nav"]
     assert source_keys(["app", "nav"]) == keys
+
+
+def test_a_published_key_is_in_the_json_tree_by_its_whole_name() -> None:
+    assert json_key("sim/pose") == "json/sim/pose"
 
 
 def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:

@@ -1,0 +1,286 @@
+"""deploy/clients as its page says: the examples follow a robot, types made of the schemas read it.
+
+    pytest -m 'languages and not soak'   Rust, types in TypeScript and Python: two minutes
+    pytest -m languages                  TypeScript too, whose bridge is built for ten minutes
+
+What is built is kept in pytest's cache.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.pages import blocks
+from tests.system.harness import (
+    ROOT,
+    Bus,
+    Daemon,
+    Program,
+    environment,
+    free_endpoint,
+    until,
+)
+
+CLIENTS = ROOT / "deploy/clients"
+BRIDGE = "zenoh-bridge-remote-api"
+
+
+@pytest.fixture(scope="module")
+def kept(request: pytest.FixtureRequest) -> Path:
+    """A place for what takes long to build."""
+    cache = request.config.cache
+    assert cache is not None
+    return Path(cache.mkdir("languages"))
+
+
+def program(name: str, needed: str) -> str:
+    """Where it is; the test is skipped without it."""
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"no {name} on the PATH: {needed}")
+    return found
+
+
+def run(words: Sequence[str], where: Path, **more: str) -> str:
+    """Run to the end, which is a good one."""
+    done = subprocess.run(
+        words, cwd=where, env=environment(**more), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+# the examples
+
+LINE = re.compile(r"x (-?\d+\.\d{3}) m, y (-?\d+\.\d{3}) m, (-?\d+\.\d{3}) m/s")
+
+
+def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
+    """It prints where the robot is, and that while it drives."""
+    with Program(words, where) as follower:
+        follower.says(" m/s", 30.0)
+        begun = bus.state()["x"]
+        with bus.commanding(0.3):
+
+            def moved() -> bool:
+                lines = [LINE.fullmatch(line) for line in list(follower.out)]
+                told = [match for match in lines if match]
+                return bool(told) and float(told[-1][1]) > begun + 0.1 and float(told[-1][3]) > 0.2
+
+            until(moved, 20.0, f"the robot moves\n{follower}")
+    bus.at_rest()
+
+
+def test_the_python_example_follows_the_robot(shared: Daemon, bus: Bus, tmp_path: Path) -> None:
+    words = [sys.executable, str(CLIENTS / "python/follow.py"), shared.endpoint]
+    followed(words, tmp_path, bus)
+
+
+@pytest.fixture(scope="module")
+def cargo() -> str:
+    return program("cargo", "it builds the example in Rust and the bridge")
+
+
+@pytest.fixture(scope="module")
+def npm() -> str:
+    program("node", "it runs what is made of TypeScript")
+    return program("npm", "it fetches zenoh-ts, quicktype and tsc")
+
+
+@pytest.fixture(scope="module")
+def bridge(kept: Path) -> str:
+    """The one that is installed, or else the one of the page's first line, built here."""
+    words = next(line for line in commands() if line.startswith(f"cargo install {BRIDGE}"))
+    if (found := shutil.which(BRIDGE)) is None:
+        program("cargo", "it builds the bridge")
+        run(
+            [*words.split(), "--quiet", "--root", str(kept)],
+            kept,
+            CARGO_TARGET_DIR=str(kept / "bridge"),
+        )
+        found = str(kept / "bin" / BRIDGE)
+    return found
+
+
+def commands() -> list[str]:
+    """What the page says to type."""
+    page = "deploy/clients/README.md"
+    return [line for block in blocks("sh") if block.page == page for line in block.commands()]
+
+
+def copied(language: str, kept: Path) -> Path:
+    """The example where it may be built, on top of what was built there before."""
+    built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
+    return shutil.copytree(CLIENTS / language, kept / language, ignore=built, dirs_exist_ok=True)
+
+
+@pytest.mark.languages
+@pytest.mark.timeout(1800)
+def test_the_rust_example_follows_the_robot(
+    shared: Daemon, bus: Bus, kept: Path, cargo: str
+) -> None:
+    here = copied("rust", kept)
+    run([cargo, "build", "--quiet"], here)
+    followed([str(here / "target/debug/follow"), shared.endpoint], here, bus)
+
+
+@pytest.mark.languages
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_the_typescript_example_follows_the_robot_through_the_bridge(
+    shared: Daemon, bus: Bus, kept: Path, npm: str, bridge: str
+) -> None:
+    here = copied("typescript", kept)
+    run([npm, "install", "--no-package-lock"], here)
+    run([npm, "run", "build"], here)
+    where = free_endpoint().removeprefix("tcp/")
+    quiet = ["-m", "client", "-e", shared.endpoint, "--no-multicast-scouting", "--ws-port", where]
+    with Program([bridge, *quiet], kept) as between:
+        host, port = where.split(":")
+        until(lambda: listens(host, int(port)), 20.0, f"the bridge listens\n{between}")
+        followed([npm, "start", "--silent", "--", f"ws/{where}"], here, bus)
+
+
+def listens(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((host, port)) == 0
+
+
+# types from the schemas
+
+Said = tuple[str, Any]
+"""A type and a value of it, as JSON."""
+
+
+@pytest.fixture(scope="module")
+def schemas(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Written as the page says."""
+    where = tmp_path_factory.mktemp("types")
+    run([sys.executable, str(CLIENTS / "python/schemas.py"), "schemas", shared.endpoint], where)
+    return where / "schemas"
+
+
+@pytest.fixture(scope="module")
+def heard(shared: Daemon) -> list[Said]:
+    """What the daemon says, of every key and in JSON."""
+    found: list[Said] = []
+    with Bus(shared.endpoint) as bus:
+        bus.linked()
+        for row in bus.get("topics")["topics"]:
+            key, kind = row["key"].removeprefix("acsard/acsar/"), row["type"]
+            if "<" in key or key == "alive" or row["direction"] == "in":
+                continue
+            if row["direction"] == "out" and key != "tf_static":
+                with bus.follow(f"json/{key}") as messages:
+                    found.append((kind, messages.find(lambda _: True, 5.0, key).value))
+            elif row["direction"] != "service":
+                found.append((kind, bus.get(key)))
+        found.append(("ServiceReply", bus.get("srv/activate")))
+    return found
+
+
+def wrong(heard: list[Said]) -> list[Said]:
+    """What no daemon says."""
+    of = dict(heard)
+    lacking = {name: value for name, value in of["Odometry"].items() if name != "twist"}
+    return [("RobotState", of["RobotState"] | {"mode": "idle"}), ("Odometry", lacking)]
+
+
+def judged(words: Sequence[str], where: Path, said: list[Said]) -> list[str]:
+    """What the reader prints of each: its type, and `read` or `refused`."""
+    text = "".join(json.dumps(one) + "\n" for one in said)
+    done = subprocess.run(
+        words, cwd=where, env=environment(), input=text, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+    return done.stdout.splitlines()
+
+
+READER_TS = """
+import { createInterface } from "node:readline";
+import { Convert, RobotState } from "./acsard.js";
+
+// Neither more nor fewer modes, or it does not compile.
+const moves: Record<RobotState["mode"], boolean> = {
+  inactive: false, waiting: false, ready: false, driving: true, stopped: false, fault: false,
+  leaving: true,
+};
+const readers = Convert as unknown as Record<string, (text: string) => unknown>;
+for await (const line of createInterface({ input: process.stdin })) {
+  const [kind, value] = JSON.parse(line);
+  try {
+    const message = readers["to" + kind](JSON.stringify(value));
+    if (kind === "RobotState" && typeof moves[(message as RobotState).mode] !== "boolean") throw 1;
+    console.log(kind, "read");
+  } catch {
+    console.log(kind, "refused");
+  }
+}
+"""
+
+
+@pytest.mark.languages
+@pytest.mark.timeout(600)
+def test_types_made_by_quicktype_compile_and_read_what_the_daemon_says(
+    schemas: Path, heard: list[Said], kept: Path, npm: str
+) -> None:
+    here = kept / "types"
+    here.mkdir(exist_ok=True)
+    (here / "package.json").write_text('{"private": true, "type": "module"}')
+    run([npm, "install", "--no-save", "quicktype@26", "typescript@5", "@types/node@20"], here)
+    shutil.copytree(schemas, here / "schemas", dirs_exist_ok=True)
+    (line,) = (line for line in commands() if line.startswith("npx quicktype "))
+    run(["sh", "-c", line.replace("npx", "npx --no-install", 1)], here)
+    tsc = ["npx", "--no-install", "tsc", "--strict", "--target", "es2022", "--module", "nodenext"]
+    (here / "reader.ts").write_text(READER_TS)
+    run([*tsc, "reader.ts"], here)
+    said, lies = [kind for kind, _ in heard], wrong(heard)
+    told = judged(["node", "reader.js"], here, heard + lies)
+    assert told == [f"{kind} read" for kind in said] + [f"{kind} refused" for kind, _ in lies]
+    (here / "reader.ts").write_text(READER_TS.replace("ready:", "idle:"))
+    with pytest.raises(AssertionError, match="idle"):
+        run([*tsc, "reader.ts"], here)
+
+
+READER_PY = """
+import importlib, json, sys
+for line in sys.stdin:
+    kind, value = json.loads(line)
+    model = getattr(importlib.import_module(f"acsard_types.{kind}"), kind)
+    try:
+        model.model_validate_json(json.dumps(value))
+        print(kind, "read")
+    except ValueError:
+        print(kind, "refused")
+"""
+
+
+@pytest.mark.languages
+@pytest.mark.timeout(600)
+def test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says(
+    schemas: Path, heard: list[Said], kept: Path
+) -> None:
+    install, generate = commands()[-2:]
+    venv = kept / "venv"
+    run([sys.executable, "-m", "venv", str(venv)], kept)
+    run([str(venv / "bin" / install.split()[0]), *install.split()[1:], "--quiet"], kept)
+    program, *words = generate.split()
+    run([str(venv / "bin" / program), *words], schemas.parent)
+    python = str(venv / "bin/python")
+    run([python, "-m", "compileall", "-q", "acsard_types"], schemas.parent)
+    sent = ("Twist", {"linear": {"x": 1.0}, "angular": {}})
+    misspelt = ("Twist", {"linear": {"X": 1.0}, "angular": {}})
+    lies = [*wrong(heard), misspelt]
+    told = judged([python, "-c", READER_PY], schemas.parent, [*heard, sent, *lies])
+    good = [*(kind for kind, _ in heard), "Twist"]
+    assert told == [f"{kind} read" for kind in good] + [f"{kind} refused" for kind, _ in lies]
