@@ -60,7 +60,7 @@ class Guard:
             return "it moves a wheel without a link"
         if self._require_check and b"#" not in line:
             return "it moves a wheel without the check that mcu.link_check requires"
-        grows = any(
+        grows = wheels != before and any(
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):

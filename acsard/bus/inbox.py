@@ -74,11 +74,13 @@ class Inbox:
         if not self._any:
             return NOTHING
         self._any = False
-        arrivals = [one for held in self._arrivals.values() for one in _drained(held, SAMPLES)]
+        arrivals = [
+            one for held in self._arrivals.values() for one in taken_of(held, most_of(held))
+        ]
         arrivals.sort(key=lambda one: one.arrived_ns)
-        arrivals = _drained(self._stops, STOPS) + arrivals
-        asked = _drained(self._services, queries) + _drained(self._slow, 1)
-        asked += _drained(self._questions, queries - len(asked))
+        arrivals = taken_of(self._stops, STOPS) + arrivals
+        asked = taken_of(self._services, queries) + taken_of(self._slow, 1)
+        asked += taken_of(self._questions, queries - len(asked))
         if self._services or self._slow or self._questions:
             self._any = True  # those wait for the next step
         overrun, self._overrun = self._overrun, 0
@@ -192,7 +194,12 @@ def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 
-def _drained(held: deque[T], most: int) -> list[T]:
+def most_of(held: deque[T]) -> int:
+    """No flood that goes on while they are taken out makes them more than it may hold."""
+    return held.maxlen or len(held)
+
+
+def taken_of(held: deque[T], most: int) -> list[T]:
     """Take up to `most` out; another thread may be putting in."""
     taken: list[T] = []
     while held and len(taken) < most:

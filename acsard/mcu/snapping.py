@@ -55,6 +55,8 @@ class Snapping:
         """Another MCU may be there, or the same one may report otherwise."""
         self._wheels = [WheelCounter() for _ in NOTHING]
         self._owing: list[int] = []
+        self._reported, self._steps = NOTHING, NOTHING
+        """rad/s; how far each wheel's reports step, and what is made of that."""
         self._time, self._lines = 0.0, 0
         self._period = self._apart = self._least = 0.0
         """s; what the firmware divides by, 0 while unknown; how much more the lines' times say,
@@ -76,13 +78,19 @@ class Snapping:
             b.steps.add(speeds[1])
             c.steps.add(speeds[2])
             d.steps.add(speeds[3])
-        steps = a.steps.size, b.steps.size, c.steps.size, d.steps.size
-        most = ALIKE * sorted(steps)[2]
-        a_step, b_step, c_step, d_step = (
+        reported = a.steps.size, b.steps.size, c.steps.size, d.steps.size
+        if reported != self._reported:
+            self._reported, self._steps = reported, self._bounded(reported)
+        return replace(line, counted=counted, steps=self._steps)
+
+    def _bounded(self, reported: Motors) -> Motors:
+        """How far the wheels' speeds step, of what they report and what is proven, rad/s."""
+        most = ALIKE * sorted(reported)[2]
+        a, b, c, d = (
             wheel.quantum or min(step, most)
-            for wheel, step in zip(self._wheels, steps, strict=True)
+            for wheel, step in zip(self._wheels, reported, strict=True)
         )
-        return replace(line, counted=counted, steps=(a_step, b_step, c_step, d_step))
+        return a, b, c, d
 
     def _counted(self, speeds: Motors, own: float) -> Motors | None:
         """How far each wheel turned in the `own` s of this line, rad; None: nothing is known."""
@@ -157,7 +165,7 @@ class Snapping:
             shown = [i for i in found if self._wheels[i].show(period)]
             self._owing += shown
             if shown:
-                self._period = period
+                self._period, self._reported = period, NOTHING
                 return
 
 

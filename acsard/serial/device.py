@@ -30,7 +30,9 @@ class _Device(serial.Serial):  # type: ignore[misc]
     """A port that is read when it has something to read, and does not ask once more whether."""
 
     def read(self, size: int = 1) -> bytes:
-        """What is there, at most `size` bytes; raises `SerialException` when it is lost."""
+        """What is there, at most `size` bytes; raises `SerialException` when lost or closed."""
+        if self.fd is None:
+            raise serial.PortNotOpenError
         try:
             data = os.read(self.fd, size)
         except BlockingIOError:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from serial import SerialException
 
 from acsard.cli.exits import code_of
 from acsard.host import clock
@@ -122,3 +123,10 @@ def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
     link = tmp_path / "acsar"
     link.symlink_to("/dev/null")
     require(str(link))
+
+
+def test_a_port_that_was_closed_is_read_as_a_lost_one(path: str) -> None:
+    device = open_raw(path, 115200)
+    device.close()
+    with pytest.raises(SerialException):
+        device.read(1)
