@@ -8,7 +8,8 @@
 
 `connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
 messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive opens
-with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them.
+with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them. A
+drive that the robot does not follow is an error, and one that returns has come to a stand.
 
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
@@ -16,6 +17,8 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
     NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
     ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
                                         says so in its reply instead
+    NotDrivenError   RuntimeError     the robot does not follow your drive: stopped, in fault,
+                                        behind somebody else, not allowed; the text says which
     NotPermittedError  PermissionError  certificates that you may not read
     CertificateError   ValueError       certificates that are not there, or cannot be used
     UsageError         ValueError       an endpoint, a key or a number that cannot be
@@ -25,12 +28,11 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import platform
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import aclosing, asynccontextmanager, closing, contextmanager
 from typing import Any
 
 import msgspec
@@ -38,10 +40,12 @@ import zenoh
 
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.driving import drive
 from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
     NoAnswerError,
+    NotDrivenError,
     NotPermittedError,
     ReplyError,
     UnreachableError,
@@ -62,6 +66,7 @@ __all__ = (
     "Client",
     "DecodeError",
     "NoAnswerError",
+    "NotDrivenError",
     "NotPermittedError",
     "Pose",
     "ReplyError",
@@ -73,19 +78,6 @@ __all__ = (
 )
 
 ENDPOINT = "tcp/127.0.0.1:7448"
-SEND_PERIOD_S = 0.05
-"""Commands are repeated at 20 Hz: five times within the default timeout."""
-
-OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Zeros at first: for 0.25 s a daemon that never heard us wants to see that they are not late, and
-sees it sooner through the jitter of a busy machine the more there are."""
-
-OPENED_S = 2.0
-"""By when zeros that count have counted."""
-
-NEVER = ("inactive", "stopped", "fault", "leaving")
-"""Modes in which no command counts."""
-
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -100,7 +92,7 @@ class Client:
         """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
         self._put_s = 0.0
-        self._sender, self._sequence = _name(session), 0
+        self.sender, self._sequence = _name(session), 0
         started = clock.now()
         # The wall clock may be set while we drive; stamps that jump would be refused as stale.
         self._wall_offset_ns = started.wall_ns - started.mono_ns
@@ -121,9 +113,13 @@ class Client:
             self._put(0.0, 0.0)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long, then send a zero. Returns when that is sent."""
-        for pause in _drive(self, linear, angular, seconds):
-            time.sleep(pause)
+        """Drive for so long, then to a stand; returns when the robot stands.
+
+        Raises `NotDrivenError` with the daemon's reason as soon as it does not follow us.
+        """
+        with closing(drive(self, linear, angular, seconds)) as steps:
+            for pause in steps:
+                time.sleep(pause)
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
@@ -165,6 +161,14 @@ class Client:
         """The raw samples of a key, for a loop of your own, which must not wait here."""
         return Subscription(self._queue(name), self.key(name))
 
+    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+        """Call back with the last value of a key, if it comes, on a thread of Zenoh's."""
+        self.session.get(
+            self.key(name),
+            lambda reply: take(reply.ok) if reply.ok is not None else None,
+            timeout=REPLY_TIMEOUT_S,
+        )
+
     def _queue(self, name: str) -> Any:
         topic = by_key(name)
         try:
@@ -188,7 +192,7 @@ class Client:
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
-            attachment=Signature(self._sender, now_ns, self._sequence).pack(),
+            attachment=Signature(self.sender, now_ns, self._sequence).pack(),
             timestamp=self.session.new_timestamp(),
         )
 
@@ -227,13 +231,10 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long, then send a zero; cancelling sends the zero at once."""
-        try:
-            for pause in _drive(self._client, linear, angular, seconds):
+        """Drive as `Client.drive`; cancelling sends a zero at once."""
+        with closing(drive(self._client, linear, angular, seconds)) as steps:
+            for pause in steps:
                 await asyncio.sleep(pause)
-        except asyncio.CancelledError:
-            self._client.send(0.0, 0.0)
-            raise
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, as `Client.call`."""
@@ -250,19 +251,9 @@ class AsyncClient:
     async def messages(self, name: str) -> AsyncIterator[Any]:
         """The typed messages of a published key as they come, until the loop over them ends."""
         decoder = _decoder(name)
-        subscriber = self._client.subscribe(name)
-        try:
-            while True:
-                try:
-                    sample = subscriber.try_recv()
-                except zenoh.ZError:
-                    return  # the connection was closed
-                if sample is None:
-                    await asyncio.sleep(0.001)
-                    continue
+        async with aclosing(self._client.subscribe(name).arriving()) as samples:
+            async for sample in samples:
                 yield decoder.decode(*encoded(sample))
-        finally:
-            subscriber.undeclare()
 
 
 @contextmanager
@@ -290,53 +281,6 @@ async def connect_async(
         yield AsyncClient(Client(session, robot_id, source))
     finally:
         await in_thread(lambda: _close(session), 5.0)
-
-
-def _drive(client: Client, linear: float, angular: float, seconds: float) -> Iterator[float]:
-    """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
-    if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
-        raise UsageError("linear, angular and seconds must be finite numbers")
-    # Each time: the robot may have been stopped and cleared, or started, since the last drive.
-    yield from _opening(client)
-    end = time.monotonic() + seconds
-    try:
-        while (left := end - time.monotonic()) > 0:
-            client.send(linear, angular)
-            yield min(SEND_PERIOD_S, left)
-    finally:
-        # Whatever interrupts the drive, the robot is told to stop.
-        client.send(0.0, 0.0)
-
-
-def _opening(client: Client) -> Iterator[float]:
-    """Zeros until the daemon counts them; it may never, and says why in its state."""
-    begun, states, counts = time.monotonic(), client.subscribe("state"), False
-    decoder = _decoder("state")
-    try:
-        while (passed := time.monotonic() - begun) < OPENING_S or (
-            passed < OPENED_S and not counts
-        ):
-            client.send(0.0, 0.0)
-            yield OPENING_PERIOD_S
-            sample = states.try_recv()
-            if sample is None:
-                continue
-            try:
-                state = decoder.decode(*encoded(sample))
-            except DecodeError:  # of a daemon of another version
-                continue
-            counts = state.mode in NEVER or _counts(state, client.source)
-    finally:
-        states.undeclare()
-
-
-def _counts(state: schema.RobotState, source: str) -> bool:
-    """Commands of this source are heard, and it need not be neutral first."""
-    return any(
-        one.age is not None and one.age < OPENING_S and not one.waits_for.startswith("neutral")
-        for one in state.sources
-        if one.name == source
-    )
 
 
 def _name(session: zenoh.Session) -> str:

@@ -362,3 +362,5 @@ class Snapshot(Struct, frozen=True):
     """Which check the serial lines have, in words."""
     encoders: tuple[int, ...] = ()
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
+    sender: str = ""
+    """Whose command counts, of the senders of one source; "" when nobody's does."""
