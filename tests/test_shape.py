@@ -34,6 +34,7 @@ PURE_AMONG_SHELLS = (
     "host.silence",
     "top.sections",
     "top.seen",
+    "top.teleop",
     "top.text",
     "top.view",
 )

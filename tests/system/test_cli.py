@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pty
+import re
 import select
 import signal
+import struct
 import subprocess
 import sys
 import termios
@@ -426,6 +429,38 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
         ) as program:
             until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state on the screen")
             yield terminal, program
+
+
+def screens(terminal: Terminal) -> list[str]:
+    """All whole screens so far, without their colours."""
+    frames = terminal.screen.split("\x1b[H")[1:-1]
+    return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
+    shared: Daemon, bus: Bus, columns: int
+) -> None:
+    with Terminal() as terminal:
+        size = struct.pack("HHHH", 24, columns, 0, 0)
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
+        env = environment(TERM="xterm-256color")
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            env.pop(name, None)
+        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
+        ends = dict.fromkeys(("stdin", "stdout"), terminal.slave)
+        where = shared.config.parent
+        with Program(words, where, env, **ends, stderr=subprocess.PIPE, start_new_session=True):
+            until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
+            during, frames = terminal.screen, screens(terminal)
+    shown = next(frame for frame in frames if "no commands" in frame)
+    told = " ".join(shown.split())
+    for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
+        assert text in told
+    assert all(len(line.rstrip()) <= columns for line in shown.split("\r\n"))
+    # Each screen is written over the one before: nothing scrolls.
+    assert "\x1b[?1049h" in during
+    assert all(frame.count("\n") < 24 for frame in frames)
 
 
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
