@@ -97,6 +97,12 @@ class Client:
         # The wall clock may be set while we drive; stamps that jump would be refused as stale.
         self._wall_offset_ns = started.wall_ns - started.mono_ns
 
+    def like(self, robot_id: str) -> Client:
+        """The same connection, to another robot behind it."""
+        other = Client(self.session, robot_id, self.source)
+        other.name = self.name
+        return other
+
     def key(self, name: str) -> str:
         """The full key of a name of the topic table, for example "odom"."""
         return full_key(self._id, name)
@@ -129,8 +135,11 @@ class Client:
 
     def get(self, name: str) -> Any:
         """The last value of a published key as its typed message, or of `info`, `config`, …"""
-        encoding, payload = self._ask(name)[0]
-        return _decoder(name).decode(encoding, payload)
+        return _decoder(name).decode(*self.reply(name))
+
+    def reply(self, name: str) -> tuple[str, bytes]:
+        """The same as it came: encoding and payload."""
+        return self._ask(name)[0]
 
     def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -172,7 +181,9 @@ class Client:
     def _queue(self, name: str) -> Any:
         topic = by_key(name)
         try:
-            return queue_on(self.session, self.key(name), topic is not None and topic.latched)
+            return queue_on(
+                self.session, self.key(name), latched=topic is not None and topic.latched
+            )
         except zenoh.ZError:
             raise _no_key(name) from None
 

@@ -33,6 +33,7 @@ PURE_AMONG_SHELLS = (
     "door.watch",
     "host.silence",
     "top.sections",
+    "top.roster",
     "top.seen",
     "top.teleop",
     "top.text",

@@ -23,7 +23,7 @@ class Arrivals:
     """What Zenoh's thread hands over, until it is taken: a callback and an event."""
 
     def __init__(self) -> None:
-        self.declared: Any = None
+        self.declared: list[Any] = []
         """What Zenoh gave for it."""
         self._held: deque[zenoh.Sample] = deque(maxlen=QUEUED)
         self._event = threading.Event()
@@ -61,7 +61,8 @@ class Arrivals:
 
     def undeclare(self) -> None:
         """No more of them."""
-        self.declared.undeclare()
+        for one in self.declared:
+            one.undeclare()
 
 
 class Subscription:
@@ -136,15 +137,15 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
     return str(sample.encoding), sample.payload.to_bytes()
 
 
-def queue_on(session: zenoh.Session, key: str, latched: bool) -> Arrivals:
+def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
     """Subscribe; a latched key begins with what is kept of it."""
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.take, arrivals.close)
-    if latched:
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        arrivals.declared = zenoh.ext.declare_advanced_subscriber(
-            session, key, handler, history=history
-        )
-    else:
-        arrivals.declared = session.declare_subscriber(key, handler)
+    for key in keys:
+        if latched:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+            one: Any = zenoh.ext.declare_advanced_subscriber(session, key, handler, history=history)
+        else:
+            one = session.declare_subscriber(key, handler)
+        arrivals.declared.append(one)
     return arrivals

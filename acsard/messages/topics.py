@@ -121,3 +121,13 @@ def source_keys(sources: Iterable[str]) -> list[str]:
 def by_key(key: str) -> Topic | None:
     """The row of this key as written in the table, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
+
+
+def row_of(key: str) -> Topic | None:
+    """The row that a key below the robot's id belongs to, as `cmd/app` to `cmd/<source>`."""
+    for topic in TOPICS:
+        head, mark, _ = topic.key.partition("<")
+        name = key.removeprefix(head)
+        if key == topic.key or (mark and name != key and name and "/" not in name):
+            return topic
+    return None

@@ -16,7 +16,9 @@ from rich.live import Live
 from rich.text import Text
 
 from acsard.top.feed import Feed
+from acsard.top.fleet import Fleet
 from acsard.top.keys import keys
+from acsard.top.roster import table
 from acsard.top.teleop import Look, Teleop, lines
 from acsard.top.view import MODES, screen
 from acsard.values import AcsardError
@@ -60,6 +62,11 @@ def live(feed: Feed) -> None:
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
     """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
     _hold(lambda console, suspend: _drive(step, seen, console, suspend))
+
+
+def roster(fleet: Fleet) -> None:
+    """Show a line for each robot, and what changes, until a key or a signal."""
+    _hold(lambda console, suspend: _roster(fleet, console, suspend))
 
 
 def _hold(shows: Callable[[Console, list[bool]], bool]) -> None:
@@ -112,6 +119,24 @@ def _drive(
                 shown.update(teleop_screen(seen(), *console.size), refresh=True)
     for letter in ("k", "", ""):
         step(letter)  # nobody steps while we are stopped
+    return True
+
+
+def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
+    with keys() as read, _screen(console) as shown:
+        while not suspend:
+            rows = fleet.rows()
+            width, height = console.size
+            told = [Text(line, no_wrap=True) for line in table(rows, width, height - 2)]
+            told[0].stylize("bold cyan")
+            for line in told[1:]:
+                if "GONE" in line.plain or "SILENT" in line.plain:
+                    line.stylize("bold red")
+            below = "q leaves" if rows else fleet.hint()
+            shown.update(Group(*told, Text(), Text(below, "dim")), refresh=True)
+            typed = read(PERIOD_S)
+            if typed is None or "q" in typed.lower():
+                return False
     return True
 
 

@@ -37,7 +37,7 @@ from tests.system.harness import (
     until,
 )
 
-VERBS = ("run", "sim", "check", "topics", "echo", "hz", "top", "drive", "call")
+VERBS = ("run", "sim", "check", "topics", "echo", "get", "hz", "top", "fleet", "drive", "call")
 
 
 def tool(shared: Daemon, *words: str) -> Finished:
@@ -350,6 +350,37 @@ def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
             assert (state["link"], state["mode"]) == ("booting", "waiting")
             assert state["counters"]["lines"] == 0
     assert "faults: mute" in sim.stderr
+
+
+# get
+
+
+def test_get_prints_what_a_query_key_answers_on_one_line_of_json(shared: Daemon) -> None:
+    ended = tool(shared, "get", "info")
+    assert (ended.code, ended.err) == (0, "")
+    (line,) = ended.out.splitlines()
+    assert json.loads(line)["pid"] == shared.pid
+
+
+@pytest.mark.parametrize("key", ["config", "schema/Odometry", "state", "odom"])
+def test_get_answers_on_every_kind_of_key(shared: Daemon, key: str) -> None:
+    ended = tool(shared, "get", key)
+    assert (ended.code, ended.err) == (0, "")
+    assert isinstance(json.loads(ended.out), dict)
+
+
+def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "get", "srv/stop")
+    assert (ended.code, ended.out) == (2, "")
+    assert "acsard call stop" in ended.err
+    assert bus.state()["mode"] != "stopped"
+
+
+@pytest.mark.parametrize("verb", ["echo", "hz"])
+def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None:
+    ended = tool(shared, verb, "info")
+    assert (ended.code, ended.out) == (2, "")
+    assert "acsard get info" in ended.err
 
 
 # drive

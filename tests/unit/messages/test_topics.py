@@ -16,6 +16,7 @@ from acsard.messages.topics import (
     full_key,
     offered,
     published,
+    row_of,
     source_keys,
 )
 
@@ -127,3 +128,12 @@ def test_a_source_commands_by_twist_or_by_wheels() -> None:
 def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
     assert by_key("odometry") is None
     assert by_key("cmd/teleop") is None
+
+
+def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
+    for topic in TOPICS:
+        filled = topic.key.replace("<source>", "app").replace("<Type>", "Twist")
+        assert row_of(filled) is topic
+        assert row_of(topic.key) is topic
+    for key in ("", "cmd", "cmd/", "cmd/app/x", "schema/", "odometry", "srv/ghost"):
+        assert row_of(key) is None
