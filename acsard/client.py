@@ -19,7 +19,7 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
                                         says so in its reply instead
     NotDrivenError   RuntimeError     the robot does not follow your drive: stopped, in fault,
                                         behind somebody else, not allowed; the text says which
-    NotPermittedError  PermissionError  certificates that you may not read
+    NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
     CertificateError   ValueError       certificates that are not there, or cannot be used
     UsageError         ValueError       an endpoint, a key or a number that cannot be
     DecodeError                         what was sent is not one of our messages
@@ -32,18 +32,24 @@ import os
 import platform
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import aclosing, asynccontextmanager, closing, contextmanager
-from typing import Any
+from contextlib import aclosing, asynccontextmanager, closing, contextmanager, suppress
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import Any, Literal
 
 import msgspec
 import zenoh
+from msgspec import Struct
 
+from acsard.bus.access import MAY, least_role
+from acsard.bus.certificates import common_name
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.driving import drive
+from acsard.driving import UnheardError, drive
 from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
+    MendableError,
     NoAnswerError,
     NotDrivenError,
     NotPermittedError,
@@ -56,8 +62,8 @@ from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
-from acsard.messages.topics import by_key, full_key, service_key
-from acsard.values import AcsardError, Pose
+from acsard.messages.topics import by_key, full_key, service_key, whoami_key
+from acsard.values import ROLES, AcsardError, Pose, Role
 
 __all__ = (
     "AcsardError",
@@ -65,6 +71,7 @@ __all__ = (
     "CertificateError",
     "Client",
     "DecodeError",
+    "Identity",
     "NoAnswerError",
     "NotDrivenError",
     "NotPermittedError",
@@ -79,14 +86,37 @@ __all__ = (
 
 ENDPOINT = "tcp/127.0.0.1:7448"
 SPACING_S = 0.003
+WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
 REPLY_TIMEOUT_S = 3.0
+
+
+class Identity(Struct, frozen=True):
+    """Who a client is to the daemon."""
+
+    role: Role | Literal[""]
+    """What its link lets it do; "" when it may not even ask, or the daemon does not tell."""
+    certificate: str
+    """The name in its certificate, "" without one."""
+    sender: str
+    """Its name on each command."""
+
+    def words(self) -> str:
+        """Role and certificate in a sentence."""
+        if self.role:
+            whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
+            whose += "" if self.certificate else " a certificate here, by this link"
+            return f"{whose} is {self.role}: {MAY[self.role]}"
+        return (
+            f"your certificate {self.certificate or '(unknown)'} is in no list of [access], or "
+            "the robot's daemon is not there: it may do nothing"
+        )
 
 
 class Client:
     """A connection to one robot; make it with `connect`."""
 
-    def __init__(self, session: zenoh.Session, robot_id: str, source: str) -> None:
-        self.session = session
+    def __init__(self, session: zenoh.Session, robot_id: str, source: str, tls: str = "") -> None:
+        self.session, self._tls = session, tls
         self._id, self.source = robot_id, source
         self.name = own_name()
         """Who calls services, in the daemon's log; set it to what you like."""
@@ -99,7 +129,7 @@ class Client:
 
     def like(self, robot_id: str) -> Client:
         """The same connection, to another robot behind it."""
-        other = Client(self.session, robot_id, self.source)
+        other = Client(self.session, robot_id, self.source, self._tls)
         other.name = self.name
         return other
 
@@ -123,9 +153,12 @@ class Client:
 
         Raises `NotDrivenError` with the daemon's reason as soon as it does not follow us.
         """
-        with closing(drive(self, linear, angular, seconds)) as steps:
-            for pause in steps:
-                time.sleep(pause)
+        try:
+            with closing(drive(self, linear, angular, seconds)) as steps:
+                for pause in steps:
+                    time.sleep(pause)
+        except UnheardError as error:
+            raise self._unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
@@ -140,6 +173,21 @@ class Client:
     def reply(self, name: str) -> tuple[str, bytes]:
         """The same as it came: encoding and payload."""
         return self._ask(name)[0]
+
+    def whoami(self) -> Identity:
+        """Who we are to the daemon; the role is "" when it answers none of them."""
+        answers: SimpleQueue[str] = SimpleQueue()
+        for one in ROLES:
+            self.ask(whoami_key(one), lambda sample: answers.put(str(sample.key_expr)))
+        best, end = -1, time.monotonic() + WHOAMI_S
+        while best < len(ROLES) - 1 and (left := end - time.monotonic()) > 0:
+            with suppress(Empty):
+                role = answers.get(timeout=left).rpartition("/")[2]
+                # What one may not ask gets no answer: the others come at the same time, or never.
+                end = min(end, time.monotonic() + WHOAMI_MORE_S)
+                best = max(best, next((n for n, r in enumerate(ROLES) if r == role), -1))
+        name = common_name(self._tls) if self._tls else ""
+        return Identity(ROLES[best] if best >= 0 else "", name, self.sender)
 
     def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -224,11 +272,30 @@ class Client:
             elif reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
+            self._require(name)
             raise NoAnswerError(
                 f"no answer on {self.key(name)}; is the daemon running with robot.id "
                 f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
             )
         return found
+
+    def _require(self, name: str) -> None:
+        """Raises `NotPermittedError` when our certificate is why nobody answers."""
+        least = least_role(name.partition("?")[0])
+        if not self._tls or least == "viewer":
+            return
+        us = self.whoami()
+        if us.role and ROLES.index(us.role) < ROLES.index(least):
+            raise NotPermittedError(f"{us.words()}; {name} is for a certificate that is {least}")
+
+    def _unheard(self, error: UnheardError) -> MendableError:
+        """The same with what our certificate has to do with it."""
+        if not self._tls:
+            return error
+        us = self.whoami()
+        if us.role == "viewer":
+            return NotPermittedError(us.words())
+        return NotDrivenError(f"{error}; {us.words()}")
 
 
 class AsyncClient:
@@ -243,9 +310,13 @@ class AsyncClient:
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive as `Client.drive`; cancelling sends a zero at once."""
-        with closing(drive(self._client, linear, angular, seconds)) as steps:
-            for pause in steps:
-                await asyncio.sleep(pause)
+        try:
+            with closing(drive(self._client, linear, angular, seconds)) as steps:
+                for pause in steps:
+                    await asyncio.sleep(pause)
+        except UnheardError as error:
+            found = await in_thread(partial(self._client._unheard, error), 2 * REPLY_TIMEOUT_S)
+            raise found from None
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, as `Client.call`."""
@@ -254,6 +325,10 @@ class AsyncClient:
     async def get(self, name: str) -> Any:
         """The last value of a key, as `Client.get`."""
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
+
+    async def whoami(self) -> Identity:
+        """Who we are to the daemon, as `Client.whoami`."""
+        return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
 
     async def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -277,7 +352,7 @@ def connect(
     """
     session = client_session(endpoint, tls)
     try:
-        yield Client(session, robot_id, source)
+        yield Client(session, robot_id, source, tls)
     finally:
         _close(session)
 
@@ -289,7 +364,7 @@ async def connect_async(
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
     session = await in_thread(lambda: client_session(endpoint, tls), 10.0, late=_close)
     try:
-        yield AsyncClient(Client(session, robot_id, source))
+        yield AsyncClient(Client(session, robot_id, source, tls))
     finally:
         await in_thread(lambda: _close(session), 5.0)
 

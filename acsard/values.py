@@ -6,7 +6,7 @@ What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere in the
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from msgspec import Struct
 
@@ -17,6 +17,12 @@ NS_PER_S = 1_000_000_000
 
 ROOT = "acsard"
 """Begins every key of the native tree: `acsard/<robot.id>/...`."""
+
+
+Role = Literal["viewer", "operator", "maintainer"]
+"""What somebody may do on the bus; each may what those before it may."""
+
+ROLES: tuple[Role, ...] = get_args(Role)
 
 
 class AcsardError(Exception):

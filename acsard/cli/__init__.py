@@ -35,6 +35,7 @@ from acsard.cli import (
     sim,
     top,
     topics,
+    whoami,
 )
 from acsard.cli.exits import code_of
 from acsard.host.errors import MendableError
@@ -52,6 +53,7 @@ VERBS = (
     fleet,
     drive,
     call,
+    whoami,
     bench,
     doctor,
     ports,

@@ -108,12 +108,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C."""
     from acsard.client import connect
-    from acsard.host.errors import UsageError
+    from acsard.host.errors import NotPermittedError, UsageError
 
     if not sys.stdin.isatty():
         raise UsageError("drive reads keys and needs a terminal; use acsard.client")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
+        if tls and (us := robot.whoami()).role == "viewer":
+            raise NotPermittedError(us.words())
         ride = _Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
         try:
             _show(ride)

@@ -27,12 +27,13 @@ from acsard.messages.schema import (
     ServiceReply,
     TopicInfo,
     Topics,
+    WhoAmI,
 )
-from acsard.messages.topics import PUBLISHED, VERBS, full_key, offered
+from acsard.messages.topics import PUBLISHED, VERBS, WHOAMI, full_key, offered, whoami_key
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.transports import PARAMETERS
-from acsard.values import Answer, Outputs, Request
+from acsard.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
 
@@ -154,6 +155,10 @@ class Queries:
             asked = query.asked.removeprefix("schema/")
             names = list(self._schemas) if "*" in asked else [asked]
             return [(f"schema/{n}", "", self._schemas[n]) for n in names if n in self._schemas]
+        if topic == WHOAMI:
+            found = [role for role in ROLES if whoami_key(role) == query.asked]
+            by = asker(query.via, query.attachment)
+            return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in found]
         if topic == "interfaces":
             return [(topic, "Interfaces", interfaces(self._config, outputs))]
         if topic in self._fixed:

@@ -324,6 +324,15 @@ class Topics(Message, frozen=True):
     topics: list[TopicInfo]
 
 
+class WhoAmI(Message, frozen=True):
+    """Who asks, as the daemon sees it."""
+
+    role: str
+    """At least this, by the access rules: `viewer`, `operator` or `maintainer`."""
+    sender: str
+    """The name he gives himself, and the way he came, as the log has it."""
+
+
 MESSAGES: dict[str, type[Message]] = {
     cls.__name__: cls
     for cls in (
@@ -342,6 +351,7 @@ MESSAGES: dict[str, type[Message]] = {
         Info,
         Interfaces,
         Topics,
+        WhoAmI,
     )
 }
 """Every type that crosses the bus by itself, by name: what `schema/<Type>` answers for."""

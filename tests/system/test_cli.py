@@ -37,7 +37,20 @@ from tests.system.harness import (
     until,
 )
 
-VERBS = ("run", "sim", "check", "topics", "echo", "get", "hz", "top", "fleet", "drive", "call")
+VERBS = (
+    "run",
+    "sim",
+    "check",
+    "topics",
+    "echo",
+    "get",
+    "hz",
+    "top",
+    "fleet",
+    "drive",
+    "call",
+    "whoami",
+)
 
 
 def tool(shared: Daemon, *words: str) -> Finished:

@@ -45,6 +45,7 @@ PROMISED = [
     ("interfaces", "query", "Interfaces"),
     ("topics", "query", "Topics"),
     ("schema/<Type>", "query", "JSON Schema"),
+    ("whoami/<role>", "query", "WhoAmI"),
     ("alive", "out", "liveliness token"),
 ]
 """DESIGN section 3, and what the door tells the daemon."""
@@ -132,7 +133,11 @@ def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
 
 def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
     for topic in TOPICS:
-        filled = topic.key.replace("<source>", "app").replace("<Type>", "Twist")
+        filled = (
+            topic.key.replace("<source>", "app")
+            .replace("<Type>", "Twist")
+            .replace("<role>", "viewer")
+        )
         assert row_of(filled) is topic
         assert row_of(topic.key) is topic
     for key in ("", "cmd", "cmd/", "cmd/app/x", "schema/", "odometry", "srv/ghost"):
