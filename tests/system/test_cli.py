@@ -481,10 +481,9 @@ def screens(terminal: Terminal) -> list[str]:
     return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
 
 
-@pytest.mark.parametrize("columns", [40, 80])
-def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
-    shared: Daemon, bus: Bus, columns: int
-) -> None:
+@contextmanager
+def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal of that width that can have a screen."""
     with Terminal() as terminal:
         size = struct.pack("HHHH", 24, columns, 0, 0)
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
@@ -492,19 +491,81 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
         for name in ("COLUMNS", "LINES", "NO_COLOR"):
             env.pop(name, None)
         words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
-        ends = dict.fromkeys(("stdin", "stdout"), terminal.slave)
-        where = shared.config.parent
-        with Program(words, where, env, **ends, stderr=subprocess.PIPE, start_new_session=True):
+        with Program(
+            words,
+            shared.config.parent,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
             until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
-            during, frames = terminal.screen, screens(terminal)
+            yield terminal, program
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
+    shared: Daemon, bus: Bus, columns: int
+) -> None:
+    with screened(shared, columns) as (terminal, _):
+        frames = screens(terminal)
     shown = next(frame for frame in frames if "no commands" in frame)
     told = " ".join(shown.split())
     for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
         assert text in told
     assert all(len(line.rstrip()) <= columns for line in shown.split("\r\n"))
     # Each screen is written over the one before: nothing scrolls.
-    assert "\x1b[?1049h" in during
+    assert "\x1b[?1049h" in terminal.screen
     assert all(frame.count("\n") < 24 for frame in frames)
+
+
+def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
+    shared: Daemon, bus: Bus
+) -> None:
+    with Terminal() as fresh:
+        usual = fresh.settings
+    with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
+        during = terminal.settings
+        assert during != usual
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.1, 5.0, "moving")
+        suspended = time.monotonic()
+        program.signal(signal.SIGTSTP)
+        until(lambda: terminal.settings == usual, 5.0, "the terminal as it was")
+        commands.find(
+            lambda value: value["twist"]["linear"]["x"] == 0, 2.0, "a zero", after=suspended
+        )
+        bus.at_rest()
+        program.signal(signal.SIGCONT)
+        until(lambda: terminal.settings == during, 5.0, "the screen again")
+        terminal.press("\x03")
+        assert program.ended(3.0) == 0
+
+
+@pytest.mark.slow
+def test_without_a_screen_there_is_a_line_a_second_and_the_help(shared: Daemon, bus: Bus) -> None:
+    with Terminal() as terminal:
+        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
+        with Program(
+            words,
+            shared.config.parent,
+            environment(TERM="dumb"),
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ):
+            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
+            begun = time.monotonic()
+            with held(terminal, "i"):
+                until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some lines")
+            took = time.monotonic() - begun
+    lines = terminal.screen.splitlines()
+    assert any("u  i  o" in line for line in lines)
+    assert terminal.screen.count("driving: ") <= 2 * took + 2
+    assert "yaw" in lines[-1]
+    bus.at_rest()
 
 
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:

@@ -502,7 +502,7 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
     asked = {topic.key for topic in TOPICS if topic.direction == "query"}
     asked -= {"schema/<Type>", WHOAMI}
     asked |= {f"schema/{name}" for name in MESSAGES} | {whoami_key("viewer")}
-    least = {role: whoami_key(role) for role in ROLES}
+    least: dict[str, str] = {role: whoami_key(role) for role in ROLES}
     services = {f"srv/{verb}" for verb in SERVICES}
     commands = {f"{kind}/{source}" for kind in ("cmd", "wheel_cmd") for source in SOURCES}
     for robot in ("robot1", "robot2"):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -172,3 +175,13 @@ def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second()
     assert [line.partition(":")[0] for line in told] == ["driving", "stopped", "driving"]
     flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
     assert len(lines_of(flickering)) <= 20
+
+
+def test_without_the_library_of_the_screen_the_rest_is_there() -> None:
+    words = (
+        "import sys; sys.modules['rich'] = None\n"
+        "import acsard.cli.drive, acsard.top.fleet, acsard.top.keys, acsard.top.roster\n"
+        "try:\n    import acsard.top.terminal\nexcept ImportError:\n    print('no screen')"
+    )
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("no screen\n", "")
