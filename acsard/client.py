@@ -32,17 +32,15 @@ import os
 import platform
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import aclosing, asynccontextmanager, closing, contextmanager, suppress
+from contextlib import aclosing, asynccontextmanager, closing, contextmanager
 from functools import partial
-from queue import Empty, SimpleQueue
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import zenoh
-from msgspec import Struct
 
-from acsard.bus.access import MAY, least_role
-from acsard.bus.certificates import common_name
+from acsard.bus.access import least_role
+from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.driving import UnheardError, drive
@@ -62,8 +60,8 @@ from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
-from acsard.messages.topics import by_key, full_key, service_key, whoami_key
-from acsard.values import ROLES, AcsardError, Pose, Role
+from acsard.messages.topics import by_key, full_key, service_key
+from acsard.values import AcsardError, Pose
 
 __all__ = (
     "AcsardError",
@@ -86,30 +84,7 @@ __all__ = (
 
 ENDPOINT = "tcp/127.0.0.1:7448"
 SPACING_S = 0.003
-WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
 REPLY_TIMEOUT_S = 3.0
-
-
-class Identity(Struct, frozen=True):
-    """Who a client is to the daemon."""
-
-    role: Role | Literal[""]
-    """What its link lets it do; "" when it may not even ask, or the daemon does not tell."""
-    certificate: str
-    """The name in its certificate, "" without one."""
-    sender: str
-    """Its name on each command."""
-
-    def words(self) -> str:
-        """Role and certificate in a sentence."""
-        if self.role:
-            whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
-            whose += "" if self.certificate else " a certificate here, by this link"
-            return f"{whose} is {self.role}: {MAY[self.role]}"
-        return (
-            f"your certificate {self.certificate or '(unknown)'} is in no list of [access], or "
-            "the robot's daemon is not there: it may do nothing"
-        )
 
 
 class Client:
@@ -176,18 +151,7 @@ class Client:
 
     def whoami(self) -> Identity:
         """Who we are to the daemon; the role is "" when it answers none of them."""
-        answers: SimpleQueue[str] = SimpleQueue()
-        for one in ROLES:
-            self.ask(whoami_key(one), lambda sample: answers.put(str(sample.key_expr)))
-        best, end = -1, time.monotonic() + WHOAMI_S
-        while best < len(ROLES) - 1 and (left := end - time.monotonic()) > 0:
-            with suppress(Empty):
-                role = answers.get(timeout=left).rpartition("/")[2]
-                # What one may not ask gets no answer: the others come at the same time, or never.
-                end = min(end, time.monotonic() + WHOAMI_MORE_S)
-                best = max(best, next((n for n, r in enumerate(ROLES) if r == role), -1))
-        name = common_name(self._tls) if self._tls else ""
-        return Identity(ROLES[best] if best >= 0 else "", name, self.sender)
+        return identity(self.ask, self._tls, self.sender)
 
     def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -281,12 +245,9 @@ class Client:
 
     def _require(self, name: str) -> None:
         """Raises `NotPermittedError` when our certificate is why nobody answers."""
-        least = least_role(name.partition("?")[0])
-        if not self._tls or least == "viewer":
-            return
-        us = self.whoami()
-        if us.role and ROLES.index(us.role) < ROLES.index(least):
-            raise NotPermittedError(f"{us.words()}; {name} is for a certificate that is {least}")
+        key = name.partition("?")[0]
+        if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
+            raise NotPermittedError(why)
 
     def _unheard(self, error: UnheardError) -> MendableError:
         """The same with what our certificate has to do with it."""
