@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import signal
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -22,11 +25,13 @@ from tests.system.harness import (
     Tables,
     acsard,
     client_config,
+    environment,
     finish,
     free_endpoint,
     until,
 )
 from tests.system.identities import free_tls_endpoint
+from tests.system.test_cli import ON_TERMINAL, Terminal, screens
 
 ONE, TWO = "robot1", "robot2"
 
@@ -97,6 +102,39 @@ def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots
     assert [row.split()[0] for row in rows] == [ONE, TWO]
     for row in rows:
         assert re.search(r"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +no commands", row), row
+
+
+@pytest.mark.slow
+def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> None:
+    third: Tables = {
+        "robot": {"id": "robot3"},
+        "bus": {"listen": [free_endpoint()], "connect": [robots.endpoint]},
+    }
+    env = environment(TERM="xterm-256color", COLUMNS="100", LINES="24")
+    words = [sys.executable, "-c", ON_TERMINAL, "fleet", "--connect", robots.endpoint]
+    with Terminal() as terminal:
+        with Program(
+            words,
+            robots.where,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+
+            def line(of: str, says: str) -> bool:
+                rows = screens(terminal)[-1:]
+                return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
+
+            until(lambda: line(ONE, "no commands") and line(TWO, "no commands"), 10.0, "both")
+            with Daemon(robots.where, config=third, name="third") as daemon:
+                until(lambda: line("robot3", "ready"), 10.0, "the third, that came later")
+                daemon.signal(signal.SIGKILL)
+                until(lambda: line("robot3", "GONE, was: "), 10.0, "that it has gone")
+            terminal.press("q")
+            assert program.ended(3.0) == 0
+        assert "Traceback" not in terminal.screen + program.stderr
 
 
 @pytest.mark.slow
