@@ -37,6 +37,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     runtime/       S  the control loop and the daemon; figures of itself
     door/          S  `acsard door`: where TLS ends, a process of its own
     client.py      S  drive and follow a robot from Python
+    driving.py     S  one drive of the client, and what `state` says becomes of it
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
     doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
     cli/           S  one verb per file

@@ -8,7 +8,8 @@
 
 `connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
 messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive opens
-with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them.
+with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them. A
+drive that the robot does not follow is an error, and one that returns has come to a stand.
 
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
@@ -16,7 +17,9 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
     NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
     ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
                                         says so in its reply instead
-    NotPermittedError  PermissionError  certificates that you may not read
+    NotDrivenError   RuntimeError     the robot does not follow your drive: stopped, in fault,
+                                        behind somebody else, not allowed; the text says which
+    NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
     CertificateError   ValueError       certificates that are not there, or cannot be used
     UsageError         ValueError       an endpoint, a key or a number that cannot be
     DecodeError                         what was sent is not one of our messages
@@ -25,23 +28,28 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import platform
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import aclosing, asynccontextmanager, closing, contextmanager
+from functools import partial
 from typing import Any
 
 import msgspec
 import zenoh
 
+from acsard.bus.access import least_role
+from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.driving import UnheardError, drive
 from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
+    MendableError,
     NoAnswerError,
+    NotDrivenError,
     NotPermittedError,
     ReplyError,
     UnreachableError,
@@ -61,7 +69,9 @@ __all__ = (
     "CertificateError",
     "Client",
     "DecodeError",
+    "Identity",
     "NoAnswerError",
+    "NotDrivenError",
     "NotPermittedError",
     "Pose",
     "ReplyError",
@@ -73,19 +83,6 @@ __all__ = (
 )
 
 ENDPOINT = "tcp/127.0.0.1:7448"
-SEND_PERIOD_S = 0.05
-"""Commands are repeated at 20 Hz: five times within the default timeout."""
-
-OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Zeros at first: for 0.25 s a daemon that never heard us wants to see that they are not late, and
-sees it sooner through the jitter of a busy machine the more there are."""
-
-OPENED_S = 2.0
-"""By when zeros that count have counted."""
-
-NEVER = ("inactive", "stopped", "fault", "leaving")
-"""Modes in which no command counts."""
-
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -93,17 +90,23 @@ REPLY_TIMEOUT_S = 3.0
 class Client:
     """A connection to one robot; make it with `connect`."""
 
-    def __init__(self, session: zenoh.Session, robot_id: str, source: str) -> None:
-        self.session = session
+    def __init__(self, session: zenoh.Session, robot_id: str, source: str, tls: str = "") -> None:
+        self.session, self._tls = session, tls
         self._id, self.source = robot_id, source
         self.name = own_name()
         """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
         self._put_s = 0.0
-        self._sender, self._sequence = _name(session), 0
+        self.sender, self._sequence = _name(session), 0
         started = clock.now()
         # The wall clock may be set while we drive; stamps that jump would be refused as stale.
         self._wall_offset_ns = started.wall_ns - started.mono_ns
+
+    def like(self, robot_id: str) -> Client:
+        """The same connection, to another robot behind it."""
+        other = Client(self.session, robot_id, self.source, self._tls)
+        other.name = self.name
+        return other
 
     def key(self, name: str) -> str:
         """The full key of a name of the topic table, for example "odom"."""
@@ -121,9 +124,16 @@ class Client:
             self._put(0.0, 0.0)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long, then send a zero. Returns when that is sent."""
-        for pause in _drive(self, linear, angular, seconds):
-            time.sleep(pause)
+        """Drive for so long, then to a stand; returns when the robot stands.
+
+        Raises `NotDrivenError` with the daemon's reason as soon as it does not follow us.
+        """
+        try:
+            with closing(drive(self, linear, angular, seconds)) as steps:
+                for pause in steps:
+                    time.sleep(pause)
+        except UnheardError as error:
+            raise self._unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
@@ -133,8 +143,15 @@ class Client:
 
     def get(self, name: str) -> Any:
         """The last value of a published key as its typed message, or of `info`, `config`, …"""
-        encoding, payload = self._ask(name)[0]
-        return _decoder(name).decode(encoding, payload)
+        return _decoder(name).decode(*self.reply(name))
+
+    def reply(self, name: str) -> tuple[str, bytes]:
+        """The same as it came: encoding and payload."""
+        return self._ask(name)[0]
+
+    def whoami(self) -> Identity:
+        """Who we are to the daemon; the role is "" when it answers none of them."""
+        return identity(self.ask, self._tls, self.sender)
 
     def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -165,10 +182,20 @@ class Client:
         """The raw samples of a key, for a loop of your own, which must not wait here."""
         return Subscription(self._queue(name), self.key(name))
 
+    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+        """Call back with the last value of a key, if it comes, on a thread of Zenoh's."""
+        self.session.get(
+            self.key(name),
+            lambda reply: take(reply.ok) if reply.ok is not None else None,
+            timeout=REPLY_TIMEOUT_S,
+        )
+
     def _queue(self, name: str) -> Any:
         topic = by_key(name)
         try:
-            return queue_on(self.session, self.key(name), topic is not None and topic.latched)
+            return queue_on(
+                self.session, self.key(name), latched=topic is not None and topic.latched
+            )
         except zenoh.ZError:
             raise _no_key(name) from None
 
@@ -188,7 +215,7 @@ class Client:
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
-            attachment=Signature(self._sender, now_ns, self._sequence).pack(),
+            attachment=Signature(self.sender, now_ns, self._sequence).pack(),
             timestamp=self.session.new_timestamp(),
         )
 
@@ -209,11 +236,27 @@ class Client:
             elif reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
+            self._require(name)
             raise NoAnswerError(
                 f"no answer on {self.key(name)}; is the daemon running with robot.id "
                 f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
             )
         return found
+
+    def _require(self, name: str) -> None:
+        """Raises `NotPermittedError` when our certificate is why nobody answers."""
+        key = name.partition("?")[0]
+        if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
+            raise NotPermittedError(why)
+
+    def _unheard(self, error: UnheardError) -> MendableError:
+        """The same with what our certificate has to do with it."""
+        if not self._tls:
+            return error
+        us = self.whoami()
+        if us.role == "viewer":
+            return NotPermittedError(us.words())
+        return NotDrivenError(f"{error}; {us.words()}")
 
 
 class AsyncClient:
@@ -227,13 +270,14 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long, then send a zero; cancelling sends the zero at once."""
+        """Drive as `Client.drive`; cancelling sends a zero at once."""
         try:
-            for pause in _drive(self._client, linear, angular, seconds):
-                await asyncio.sleep(pause)
-        except asyncio.CancelledError:
-            self._client.send(0.0, 0.0)
-            raise
+            with closing(drive(self._client, linear, angular, seconds)) as steps:
+                for pause in steps:
+                    await asyncio.sleep(pause)
+        except UnheardError as error:
+            found = await in_thread(partial(self._client._unheard, error), 2 * REPLY_TIMEOUT_S)
+            raise found from None
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, as `Client.call`."""
@@ -243,6 +287,10 @@ class AsyncClient:
         """The last value of a key, as `Client.get`."""
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
 
+    async def whoami(self) -> Identity:
+        """Who we are to the daemon, as `Client.whoami`."""
+        return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
+
     async def pose(self) -> Pose:
         """Where base_link is in odom now."""
         return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
@@ -250,19 +298,9 @@ class AsyncClient:
     async def messages(self, name: str) -> AsyncIterator[Any]:
         """The typed messages of a published key as they come, until the loop over them ends."""
         decoder = _decoder(name)
-        subscriber = self._client.subscribe(name)
-        try:
-            while True:
-                try:
-                    sample = subscriber.try_recv()
-                except zenoh.ZError:
-                    return  # the connection was closed
-                if sample is None:
-                    await asyncio.sleep(0.001)
-                    continue
+        async with aclosing(self._client.subscribe(name).arriving()) as samples:
+            async for sample in samples:
                 yield decoder.decode(*encoded(sample))
-        finally:
-            subscriber.undeclare()
 
 
 @contextmanager
@@ -275,7 +313,7 @@ def connect(
     """
     session = client_session(endpoint, tls)
     try:
-        yield Client(session, robot_id, source)
+        yield Client(session, robot_id, source, tls)
     finally:
         _close(session)
 
@@ -287,56 +325,9 @@ async def connect_async(
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
     session = await in_thread(lambda: client_session(endpoint, tls), 10.0, late=_close)
     try:
-        yield AsyncClient(Client(session, robot_id, source))
+        yield AsyncClient(Client(session, robot_id, source, tls))
     finally:
         await in_thread(lambda: _close(session), 5.0)
-
-
-def _drive(client: Client, linear: float, angular: float, seconds: float) -> Iterator[float]:
-    """Send what a drive of `seconds` needs, yielding how long to wait before the next."""
-    if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
-        raise UsageError("linear, angular and seconds must be finite numbers")
-    # Each time: the robot may have been stopped and cleared, or started, since the last drive.
-    yield from _opening(client)
-    end = time.monotonic() + seconds
-    try:
-        while (left := end - time.monotonic()) > 0:
-            client.send(linear, angular)
-            yield min(SEND_PERIOD_S, left)
-    finally:
-        # Whatever interrupts the drive, the robot is told to stop.
-        client.send(0.0, 0.0)
-
-
-def _opening(client: Client) -> Iterator[float]:
-    """Zeros until the daemon counts them; it may never, and says why in its state."""
-    begun, states, counts = time.monotonic(), client.subscribe("state"), False
-    decoder = _decoder("state")
-    try:
-        while (passed := time.monotonic() - begun) < OPENING_S or (
-            passed < OPENED_S and not counts
-        ):
-            client.send(0.0, 0.0)
-            yield OPENING_PERIOD_S
-            sample = states.try_recv()
-            if sample is None:
-                continue
-            try:
-                state = decoder.decode(*encoded(sample))
-            except DecodeError:  # of a daemon of another version
-                continue
-            counts = state.mode in NEVER or _counts(state, client.source)
-    finally:
-        states.undeclare()
-
-
-def _counts(state: schema.RobotState, source: str) -> bool:
-    """Commands of this source are heard, and it need not be neutral first."""
-    return any(
-        one.age is not None and one.age < OPENING_S and not one.waits_for.startswith("neutral")
-        for one in state.sources
-        if one.name == source
-    )
 
 
 def _name(session: zenoh.Session) -> str:

@@ -114,6 +114,7 @@ class Robot:
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
             encoders=session.snapping.counts,
+            sender=self._choice.sender,
         )
 
     @property

@@ -6,7 +6,7 @@ What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere in the
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from msgspec import Struct
 
@@ -17,6 +17,12 @@ NS_PER_S = 1_000_000_000
 
 ROOT = "acsard"
 """Begins every key of the native tree: `acsard/<robot.id>/...`."""
+
+
+Role = Literal["viewer", "operator", "maintainer"]
+"""What somebody may do on the bus; each may what those before it may."""
+
+ROLES: tuple[Role, ...] = get_args(Role)
 
 
 class AcsardError(Exception):
@@ -362,3 +368,5 @@ class Snapshot(Struct, frozen=True):
     """Which check the serial lines have, in words."""
     encoders: tuple[int, ...] = ()
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
+    sender: str = ""
+    """Whose command counts, of the senders of one source; "" when nobody's does."""

@@ -124,6 +124,11 @@ AUTHORITY = Elsewhere(
     HERE, "test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs"
 )
 LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
+MANY = Elsewhere(
+    "tests/system/test_many.py",
+    "test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do",
+    "robot2 is not there",
+)
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
@@ -146,6 +151,7 @@ TYPED = Elsewhere(
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
 _LAUNCH_FILE = "deploy/ros2/acsar.launch.py"
 _ROUTER = "--id robot1 --connect tls/router.local:7447 --tls"
+_ROUTERS = _ROUTER.replace("robot1", "robot1,robot2")
 _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'"""
 
 COMMANDS: dict[str, How] = {
@@ -329,6 +335,8 @@ COMMANDS: dict[str, How] = {
         but="without the router; `laptop-anna` calls by it"
     ),
     f"acsard call stop {_ROUTER} laptop-anna": LAPTOP,
+    f"acsard fleet {_ROUTERS} laptop-anna": MANY,
+    f"acsard call stop {_ROUTERS} laptop-anna": MANY,
     f"acsard echo state -n 1 {_ROUTER} fleet/clients/viewer": LAPTOP,
     f"acsard call clear {_ROUTER} fleet/clients/viewer": LAPTOP,
     f"acsard call clear {_ROUTER} fleet/clients/operator": LAPTOP,

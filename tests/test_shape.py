@@ -33,7 +33,9 @@ PURE_AMONG_SHELLS = (
     "door.watch",
     "host.silence",
     "top.sections",
+    "top.roster",
     "top.seen",
+    "top.teleop",
     "top.text",
     "top.view",
 )

@@ -16,6 +16,7 @@ from acsard.config.settings import Config
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import (
     IMU,
+    VERBS,
     Direction,
     full_key,
     json_key,
@@ -23,11 +24,10 @@ from acsard.messages.topics import (
     published,
     service_key,
     source_keys,
+    whoami_key,
 )
 from acsard.ros.transports import Endpoint, endpoints, left_out
-from acsard.values import ROOT, Verb
-
-Role = Literal["viewer", "operator", "maintainer"]
+from acsard.values import ROLES, ROOT, Role, Verb
 
 SERVICE_ROLES: dict[Verb, Role] = {
     "stop": "viewer",
@@ -38,6 +38,13 @@ SERVICE_ROLES: dict[Verb, Role] = {
     "set_pose": "maintainer",
 }
 """The least role that may call each service: whoever sees the robot may stop it."""
+
+MAY: dict[Role, str] = {
+    "viewer": "it may follow and stop, not drive",
+    "operator": "it may drive by the listed sources, stop and clear",
+    "maintainer": "it may do all",
+}
+"""In words, for the person whose tool does not do what was asked."""
 
 LOCAL_LINKS = ("tcp",)
 """Links without a certificate. They do not leave the machine unless `bus.insecure` lets them."""
@@ -136,7 +143,11 @@ class _Keys:
         self.gyro += [e.key for e in ros if e.native == IMU]
         """What a gyro is heard on; the simulator has its own."""
         asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
-        self.questions = [key for key in asked if key != self.config]
+        self.whoami = {role: full_key(robot, whoami_key(role)) for role in ROLES}
+        """Each role may ask its own and those below it: the highest that answers is who asks."""
+        self.any_role = full_key(robot, whoami_key("*"))
+        own = (self.config, self.any_role)
+        self.questions = [key for key in asked if key not in own]
         self.exact_questions = [key for key in self.questions if "*" not in key]
         self.exact_questions += [full_key(robot, f"schema/{name}") for name in SCHEMAS]
         self.parameters = _of(ros, "query")
@@ -145,6 +156,16 @@ class _Keys:
         """The keys of a service."""
         native = service_key(verb)
         return [full_key(self._robot, native)] + [e.key for e in self._ros if e.native == native]
+
+
+def least_role(key: str) -> Role:
+    """Who may at least use a key below the robot's id."""
+    verb = VERBS.get(key)
+    if verb is not None:
+        return SERVICE_ROLES[verb]
+    if key.startswith(("cmd/", "wheel_cmd/")):
+        return "operator"
+    return "maintainer" if key in ("config", IMU) else "viewer"
 
 
 def access_control(config: Config) -> dict[str, object]:
@@ -196,12 +217,15 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
 
     tokens = [keys.alive, *keys.kept, *TOKENS]
     answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
+    answered.append(keys.any_role)
     answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
     # Who puts his gyro beside the simulator's is told so, by the code that refuses it.
     forged = [key for key in answered if key != keys.imu]
     watching = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
-    asked = [*keys.published, *keys.exact_questions, *services("viewer")]
-    maintained = [*services("maintainer"), keys.config, *keys.parameters]
+    asked = [*keys.published, *keys.exact_questions, *services("viewer"), keys.whoami["viewer"]]
+    operated = [*services("operator"), keys.whoami["operator"]]
+    maintained = [*services("maintainer"), keys.whoami["maintainer"], keys.config]
+    maintained += keys.parameters
     rules = (
         _rule("speak", "egress", SPOKEN, [*answered, *keys.heard, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
@@ -212,7 +236,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("ask", "ingress", ["query"], asked),
         _rule("halt", "ingress", ["put"], [keys.stop]),
         _rule("command", "ingress", ["put"], keys.commands),
-        _rule("operate", "ingress", ["query"], services("operator")),
+        _rule("operate", "ingress", ["query"], operated),
         _rule("maintain", "ingress", ["query"], maintained),
         # who bends the pose, as by set_pose
         _rule("sense", "ingress", ["put"], keys.gyro),

@@ -6,7 +6,9 @@ Reading how long takes the library of the extra `lan`.
 from __future__ import annotations
 
 import ssl
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
@@ -40,6 +42,32 @@ def require_usable(directory: str) -> None:
             f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
             "another certificate or has a password; `acsard lan init` or `lan add` makes them",
         ) from None
+
+
+def common_name(directory: str) -> str:
+    """The name in the certificate in `directory`, "" where it cannot be told.
+
+    Read by showing it to ourselves: the standard library tells a name only of who has connected.
+    """
+    shown = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    asks, shows = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+    shown.verify_mode = ssl.CERT_REQUIRED
+    try:
+        shown.load_verify_locations(f"{directory}/{CA}")
+        for context in (shown, client):
+            context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
+        one = client.wrap_bio(asks, shows)
+        other = shown.wrap_bio(shows, asks, server_side=True)
+        for side in (one, other, one, other):
+            with suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+    except (OSError, ValueError):  # an SSLError is an OSError
+        return ""
+    subject: Any = (other.getpeercert() or {}).get("subject", ())
+    names = [value for part in subject for kind, value in part if kind == "commonName"]
+    return str(names[-1]) if names else ""
 
 
 def ends_ns(directory: str) -> int | None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+import asyncio
+import threading
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -14,6 +17,52 @@ from acsard.values import NS_PER_S
 
 QUEUED = 1000
 """Samples held for a slow reader; the oldest are dropped beyond that."""
+
+
+class Arrivals:
+    """What Zenoh's thread hands over, until it is taken: a callback and an event."""
+
+    def __init__(self) -> None:
+        self.declared: list[Any] = []
+        """What Zenoh gave for it."""
+        self._held: deque[zenoh.Sample] = deque(maxlen=QUEUED)
+        self._event = threading.Event()
+        self._wake: Callable[[], object] = self._event.set
+        self._closed = False
+
+    def take(self, sample: zenoh.Sample) -> None:
+        """One has come."""
+        self._held.append(sample)
+        self._wake()
+
+    def close(self) -> None:
+        """No more will come."""
+        self._closed = True
+        self._wake()
+
+    def wakes(self, wake: Callable[[], object]) -> None:
+        """Have this called, on a thread of Zenoh's, when something has come or all has ended."""
+        self._wake = wake
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """The next, or None when there is none now; raises `ZError` when none will be."""
+        try:
+            return self._held.popleft()
+        except IndexError:
+            if self._closed:
+                raise zenoh.ZError("the session has been closed") from None
+            return None
+
+    def wait(self, seconds: float | None) -> None:
+        """Until something has come, all has ended, or so long."""
+        if not self._held and not self._closed:
+            self._event.wait(seconds)
+        self._event.clear()
+
+    def undeclare(self) -> None:
+        """No more of them."""
+        for one in self.declared:
+            one.undeclare()
 
 
 class Subscription:
@@ -35,15 +84,42 @@ class Subscription:
         """What comes, until nothing has for `timeout` s or the session is closed."""
         quiet_since_ns = clock.mono_ns()
         try:
-            while timeout is None or clock.mono_ns() - quiet_since_ns < timeout * NS_PER_S:
+            while True:
+                try:
+                    sample = self.try_recv()
+                except zenoh.ZError:
+                    return
+                if sample is not None:
+                    yield sample
+                    quiet_since_ns = clock.mono_ns()
+                    continue
+                quiet_s = (clock.mono_ns() - quiet_since_ns) / NS_PER_S
+                left = None if timeout is None else timeout - quiet_s
+                if left is not None and left <= 0:
+                    return
+                self._queue.wait(left)
+        finally:
+            self.undeclare()
+
+    async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
+        """What comes, until the session is closed."""
+        come, loop = asyncio.Event(), asyncio.get_running_loop()
+
+        def wake() -> None:
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(come.set)
+
+        self._queue.wakes(wake)
+        try:
+            while True:
+                come.clear()
                 try:
                     sample = self.try_recv()
                 except zenoh.ZError:
                     return
                 if sample is None:
-                    time.sleep(0.001)
+                    await come.wait()
                     continue
-                quiet_since_ns = clock.mono_ns()
                 yield sample
         finally:
             self.undeclare()
@@ -61,11 +137,15 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
     return str(sample.encoding), sample.payload.to_bytes()
 
 
-def queue_on(session: zenoh.Session, key: str, latched: bool) -> Any:
-    """Subscribe: `try_recv` and `undeclare`; a latched key begins with what is kept of it."""
-    # A ring: a full FIFO would hold up everything else this session receives.
-    queue: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(QUEUED)
-    if not latched:
-        return session.declare_subscriber(key, queue)
-    history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-    return zenoh.ext.declare_advanced_subscriber(session, key, queue, history=history)
+def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
+    """Subscribe; a latched key begins with what is kept of it."""
+    arrivals = Arrivals()
+    handler = zenoh.handlers.Callback(arrivals.take, arrivals.close)
+    for key in keys:
+        if latched:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+            one: Any = zenoh.ext.declare_advanced_subscriber(session, key, handler, history=history)
+        else:
+            one = session.declare_subscriber(key, handler)
+        arrivals.declared.append(one)
+    return arrivals

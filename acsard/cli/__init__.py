@@ -22,6 +22,8 @@ from acsard.cli import (
     door,
     drive,
     echo,
+    fleet,
+    get,
     hz,
     lan,
     mcu,
@@ -33,6 +35,7 @@ from acsard.cli import (
     sim,
     top,
     topics,
+    whoami,
 )
 from acsard.cli.exits import code_of
 from acsard.host.errors import MendableError
@@ -44,10 +47,13 @@ VERBS = (
     check,
     topics,
     echo,
+    get,
     hz,
     top,
+    fleet,
     drive,
     call,
+    whoami,
     bench,
     doctor,
     ports,

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, robot_address
+from acsard.cli.common import MANY, add_bus, robot_address
+from acsard.host.exits import Exit
 from acsard.messages.topics import SERVICES
+
+if TYPE_CHECKING:
+    from acsard.client import Client
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -20,12 +25,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "values", nargs="*", type=float, metavar="X Y YAW", help="for set_pose: m, m, rad"
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
-    add_bus(parser)
+    add_bus(parser, MANY + " (stop only)")
     parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
     """Call and print."""
+    from acsard.bus.fleet import named
     from acsard.client import connect
     from acsard.host.errors import UsageError
     from acsard.messages.encodings import encode
@@ -35,7 +41,43 @@ def main(args: argparse.Namespace) -> int:
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"write: {form}")
     endpoint, robot_id, tls = robot_address(args)
+    if many := named(robot_id):
+        if args.service != "stop":
+            raise UsageError(f"only stop goes to many robots: give {args.service} one --id")
+        with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+            return _stop_all(robot, many, endpoint, as_json=args.json)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
     print(encode(reply, "json").decode() if args.json else reply.message)
     return 0 if reply.success else 1
+
+
+def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bool) -> int:
+    """Stop them all at once, by their exact keys; say who answered what, and who did not."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from acsard.bus.fleet import ALL, present
+    from acsard.cli.echo import of_robot
+    from acsard.host.errors import MendableError
+    from acsard.messages.encodings import encode
+    from acsard.messages.schema import ServiceReply
+
+    # Who is named is told to stop, there or not: nobody waits to find that out first.
+    wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
+
+    def stop(one: str) -> ServiceReply | None:
+        try:
+            return robot.like(one).call("stop")
+        except MendableError:
+            return None
+
+    with ThreadPoolExecutor(len(wanted)) as calls:
+        replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
+    for one, reply in replies.items():
+        if reply is None:
+            reply = ServiceReply(False, "NO ANSWER: go and look, or use its switch")
+        line = encode(reply, "json").decode()
+        print(of_robot(one, line) if as_json else f"{one}: {reply.message}")
+    if None in replies.values():
+        return int(Exit.UNREACHABLE)
+    return int(Exit.OK if all(r.success for r in replies.values() if r) else Exit.FAILURE)

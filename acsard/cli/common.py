@@ -11,7 +11,9 @@ from acsard.bus.address import Address, address_of
 from acsard.config import parsing as configuration
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
+from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
+from acsard.messages.topics import row_of
 
 PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
@@ -28,8 +30,11 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_bus(parser: argparse.ArgumentParser) -> None:
-    """The options of the tools that talk to a running daemon."""
+MANY = "; several with commas, or '*' for all there are"
+
+
+def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """The options of the tools that talk to a running daemon; `more` on `--id`."""
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="where the daemon listens, e.g. tcp/127.0.0.1:7448"
@@ -39,7 +44,7 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
         metavar="DIRECTORY",
         help="your certificate for a tls/ endpoint (else $ACSARD_TLS, or bus.tls)",
     )
-    parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)")
+    parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)" + more)
 
 
 def count(text: str) -> int:
@@ -91,3 +96,31 @@ def robot_address(args: argparse.Namespace) -> Address:
     """Where the robot is that a tool talks to: the options, else the configuration."""
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
+
+
+def require_followed(key: str) -> None:
+    """Raises `UsageError` for a key on which nothing ever comes, with what to type instead."""
+    row = row_of(key)
+    if row is None:
+        return
+    instead = {
+        "query": f"answers when it is asked: acsard get {key}",
+        "service": f"is a service: acsard call {key.removeprefix('srv/')}",
+    }.get(row.direction)
+    if row.key == "alive":
+        instead = "is a token without messages: acsard fleet shows who is there"
+    if instead is not None:
+        raise UsageError(f"nothing is published on {key}: it {instead}")
+
+
+def require_asked(key: str) -> None:
+    """Raises `UsageError` for a key that answers no question, or does something when asked."""
+    row = row_of(key)
+    if row is None:
+        return
+    if row.direction == "service":
+        raise UsageError(f"{key} is a service: acsard call {key.removeprefix('srv/')}")
+    if row.direction == "in":
+        raise UsageError(f"{key} comes in and cannot be asked: acsard echo {key} follows it")
+    if row.key == "alive":
+        raise UsageError("alive is a token and cannot be asked: acsard fleet shows who is there")

@@ -7,21 +7,38 @@ A terminal tells when a key goes down but never when it is let go: each press dr
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
+from acsard.host.extras import install
+from acsard.top.teleop import HELP as TELEOP_HELP
 from acsard.values import REST, Twist
 
 if TYPE_CHECKING:
+    import zenoh
+
     from acsard.client import Client
+    from acsard.messages.schema import RobotState
+    from acsard.top.teleop import Teleop as Seen
 
 HOLD_S = 0.6
 """Longer than a keyboard's delay before its first repeat (0.25 to 0.5 s), or it would stutter."""
 
 ZEROS = 3
-SILENT_S = 1.0
 PERIOD_S = 0.05
+
+OBJECTS_S = 0.5
+"""A key that does not drive for so long is worth a word: the first 0.25 s never count."""
+
+ASK_S = 0.5
+"""Without a state for so long it is asked for: it may be published seldom."""
+
+NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
+"""Without a screen: a line at most so often, while it moves, and while nothing happens."""
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -33,11 +50,7 @@ _SPEEDS = {
     "e": (1.0, 1.1), "c": (1.0, 0.9),
 }  # fmt: skip
 
-HELP = """\
-   u    i    o       q/z  both speeds +/- 10 %
-   j    k    l       w/x  linear only    e/c  angular only
-   m    ,    .       arrows drive too; space or k stops; Ctrl-C leaves
-"""
+HELP = "\n".join(TELEOP_HELP)
 
 
 class Teleop:
@@ -81,7 +94,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "drive",
         help="drive by keyboard",
-        description="Drive by keyboard from this terminal.\n\n" + HELP,
+        description="Drive by keyboard from this terminal, on a screen of its own with the extra "
+        "`top`, else line by line.\n\n" + HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--linear", type=float, default=0.5, metavar="M/S", help="default 0.5")
@@ -93,64 +107,129 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C."""
-    import signal
-    import termios
-    import tty
-
     from acsard.client import connect
-    from acsard.host.errors import UsageError
+    from acsard.host.errors import NotPermittedError, UsageError
 
     if not sys.stdin.isatty():
         raise UsageError("drive reads keys and needs a terminal; use acsard.client")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
-        print(HELP)
-        before = termios.tcgetattr(sys.stdin)
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
-        tty.setcbreak(sys.stdin)
+        if tls and (us := robot.whoami()).role == "viewer":
+            raise NotPermittedError(us.words())
+        ride = _Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
         try:
-            _loop(robot, Teleop(args.linear, args.angular))
+            _show(ride)
         except KeyboardInterrupt:
             pass
         finally:
             for _ in range(ZEROS):
                 robot.send(0.0, 0.0)
-            try:
-                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-                print()
-            except (OSError, termios.error):
-                pass  # the terminal has been closed
     return 0
 
 
-def _loop(robot: Client, teleop: Teleop) -> None:
-    import os
-    import select
-    import time
+def _show(ride: _Ride) -> None:
+    """On a screen of its own where there is one."""
+    dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
+    if dumb or not sys.stdout.isatty():
+        return _plain(ride)
+    try:
+        from acsard.top import terminal
+    except ImportError:
+        print(f"acsard: with the library rich it has a screen of its own: {install('top')}")
+        return _plain(ride)
+    return terminal.drive(ride.step, ride.seen)
 
-    from acsard.bus.subscription import encoded
-    from acsard.messages.encodings import Decoder
-    from acsard.messages.schema import RobotState
 
-    decoder, states = Decoder(RobotState), robot.subscribe("state")
-    shown, heard = "", time.monotonic()
-    while True:
-        ready, _, _ = select.select([sys.stdin], [], [], PERIOD_S)
-        if ready:
-            for key in split(os.read(sys.stdin.fileno(), 64).decode(errors="replace")):
-                teleop.press(key, time.monotonic())
-        wish = teleop.send(time.monotonic())
+def _plain(ride: _Ride) -> None:
+    """A line when there is news, and now and then."""
+    import signal
+
+    from acsard.top.keys import keys
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
+    news = News()
+    print(HELP)
+    with keys() as read:
+        while (typed := read(PERIOD_S)) is not None:
+            ride.step(typed)
+            told = news.tell(ride.seen(), time.monotonic())
+            if told:
+                print(told, flush=True)
+
+
+class News:
+    """Which lines are worth a line where there is no screen; pure."""
+
+    def __init__(self) -> None:
+        self._shown: tuple[object, ...] = ()
+        self._at = -QUIET_S
+
+    def tell(self, seen: Seen, now: float) -> str:
+        """The line to print at `now` s, "" for none."""
+        from acsard.top.teleop import SILENT_S, line
+
+        state = seen.state
+        words = ("", "") if state is None else (state.mode, state.reason)
+        what = (*words, seen.objection, seen.linear, seen.angular, seen.age > SILENT_S)
+        moves = state is not None and (state.linear != 0.0 or state.angular != 0.0)
+        wait = NEWS_S if what != self._shown else SAME_S if moves else QUIET_S
+        if now - self._at < wait:
+            return ""
+        self._shown, self._at = what, now
+        return line(seen)
+
+
+class _Ride:
+    """Between the keys and the robot."""
+
+    def __init__(self, robot: Client, teleop: Teleop, robot_id: str, endpoint: str) -> None:
+        from acsard.messages.encodings import Decoder
+        from acsard.messages.schema import RobotState
+
+        self._robot, self._teleop = robot, teleop
+        self._names = robot_id, endpoint
+        self._decoder, self._states = Decoder(RobotState), robot.subscribe("state")
+        self._state: RobotState | None = None
+        self._heard = self._fine = self._asked = time.monotonic()
+
+    def step(self, typed: str) -> None:
+        """These keys were pressed; send what is to be sent, take what has come."""
+        now = time.monotonic()
+        for key in split(typed):
+            self._teleop.press(key, now)
+        wish = self._teleop.send(now)
         if wish is not None:
-            robot.send(wish.linear, wish.angular)
-        while (sample := states.try_recv()) is not None:
-            heard = time.monotonic()
-            state = decoder.decode(*encoded(sample))
-            shown = f"x {state.x:7.2f}  y {state.y:7.2f}  yaw {state.yaw:6.2f}  {state.reason}"
-        if time.monotonic() - heard > SILENT_S:
-            shown = "no word from the daemon"
-        line = f"{teleop.linear:.2f} m/s {teleop.angular:.2f} rad/s   {shown}"
-        print(f"\r{line[:118]:<118}", end="", flush=True)
+            self._robot.send(wish.linear, wish.angular)
+        if wish in (None, REST):
+            self._fine = now
+        while (sample := self._states.try_recv()) is not None:
+            self._take(sample)
+        if now - max(self._heard, self._asked) > ASK_S:
+            self._asked = now
+            self._robot.ask("state", self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        from acsard.bus.subscription import encoded
+        from acsard.messages.encodings import DecodeError
+
+        with suppress(DecodeError):  # a stranger's
+            self._state = self._decoder.decode(*encoded(sample))
+            self._heard = time.monotonic()
+
+    def seen(self) -> Seen:
+        """What there is to show."""
+        from acsard.driving import objection
+        from acsard.top.teleop import Teleop as Seen
+
+        now, state, robot = time.monotonic(), self._state, self._robot
+        why = ""
+        if state is not None and now - self._fine > OBJECTS_S:
+            why = objection(state, robot.source, robot.sender)
+        speeds = self._teleop.linear, self._teleop.angular
+        return Seen(
+            self._names[0], self._names[1], robot.source, *speeds, state, now - self._heard, why
+        )
 
 
 def split(text: str) -> list[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, count, robot_address
+from acsard.cli.common import MANY, add_bus, count, require_followed, robot_address
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -19,7 +20,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="print the messages on a key as JSON lines",
         description="Print each message on a key as one line of JSON, until Ctrl-C. Any key "
         "below the robot's id works, also `cmd/teleop`. With --csv wheels, gyro and place as one "
-        "file that `acsard calibrate --log` reads: acsard echo wheel_states imu --csv > drive.csv",
+        "file that `acsard calibrate --log` reads: acsard echo wheel_states imu --csv > drive.csv. "
+        "Of several robots (--id) each line says whose it is.",
     )
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
@@ -33,27 +35,36 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--timeout", type=float, metavar="S", help="end after S seconds of silence, with exit 1"
     )
-    add_bus(parser)
+    add_bus(parser, MANY)
     parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
+    from acsard.bus.fleet import follow, named, robot_of
     from acsard.bus.subscription import encoded
     from acsard.client import connect
 
     endpoint, robot_id, tls = robot_address(args)
     if args.csv:
+        if named(robot_id):
+            raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
         with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
             return _record(robot, args.topic, args.n, args.timeout)
     if len(args.topic) > 1:
         raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
-    left, topic = args.n, args.topic[0]
+    left, topic, many = args.n, args.topic[0], named(robot_id)
+    require_followed(topic)
     _hint(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        samples = robot.samples(topic, args.timeout)
+        if many:
+            samples = follow(robot.session, many, topic).until_silence(args.timeout)
+            _say_who(robot, many, endpoint)
         try:
-            for sample in robot.samples(topic, args.timeout):
-                print(json_line(*encoded(sample)), flush=True)
+            for sample in samples:
+                line, whose = json_line(*encoded(sample)), robot_of(str(sample.key_expr))
+                print(of_robot(whose, line) if many else line, flush=True)
                 left = None if left is None else left - 1
                 if left == 0:
                     return 0
@@ -95,10 +106,31 @@ def _record(robot: Client, keys: list[str], most: int | None, timeout: float | N
     return int(Exit.OK)
 
 
+def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
+    """Who is there now: silence looks the same as nobody."""
+    from acsard.bus.fleet import ALL, present
+    from acsard.host.errors import NoAnswerError
+
+    try:
+        there = present(robot.session, ids, endpoint)
+        missing = [one for one in ids if one not in there and one != ALL]
+        words = f"following {', '.join(there) or 'nobody yet'}"
+        words += f"; not there: {', '.join(missing)}" if missing else ""
+    except NoAnswerError as error:
+        words = f"{error} Waiting."
+    print(f"acsard: {words}", file=sys.stderr)
+
+
+def of_robot(whose: str, line: str) -> str:
+    """A line of JSON with whose it is."""
+    import msgspec
+
+    return msgspec.json.encode({"robot": whose, "message": msgspec.Raw(line.encode())}).decode()
+
+
 def _hint(topic: str) -> None:
     """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
     import difflib
-    import sys
 
     from acsard.messages.topics import TOPICS, by_key
 

@@ -8,6 +8,7 @@ from acsard.host.errors import (
     MendableError,
     NoAnswerError,
     NoPortError,
+    NotDrivenError,
     NotPermittedError,
     ReplyError,
     RouterFileError,
@@ -18,6 +19,7 @@ from acsard.host.exits import Exit, ExitError
 
 CODES: dict[type[MendableError], Exit] = {
     ReplyError: Exit.FAILURE,
+    NotDrivenError: Exit.FAILURE,
     UsageError: Exit.USAGE,
     NoPortError: Exit.NO_PORT,
     UnreachableError: Exit.UNREACHABLE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from acsard.cli.common import add_bus, count, robot_address
+from acsard.cli.common import add_bus, count, require_followed, robot_address
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,6 +31,7 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.client import connect
 
+    require_followed(args.topic)
     endpoint, robot_id, tls = robot_address(args)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n

@@ -11,6 +11,7 @@ from acsard.config.validation import write
 from acsard.host.extras import install
 from acsard.host.service import TLS
 from acsard.lan import identities
+from acsard.values import ROLES
 
 MOST_DAYS = 3650
 
@@ -46,7 +47,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     more.add_argument("name", type=_name, metavar="NAME", help="its common name, e.g. laptop-anna")
     more.add_argument(
         "--role",
-        choices=identities.ROLES,
+        choices=ROLES,
         help="what it may do; leave it out for a robot or a router",
     )
     more.set_defaults(main=main_add)

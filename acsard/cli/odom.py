@@ -87,11 +87,11 @@ def _config(robot: Client, path: str | None) -> Config:
     import msgspec
 
     from acsard.config.settings import Config
-    from acsard.host.errors import NoAnswerError
+    from acsard.host.errors import NoAnswerError, NotPermittedError
 
     try:
         return msgspec.convert(robot.get("config"), Config)
-    except (NoAnswerError, msgspec.ValidationError):
+    except (NoAnswerError, NotPermittedError, msgspec.ValidationError):
         where, config = load(path)
         print(
             f"acsard: the robot does not tell its configuration: taken is {where}", file=sys.stderr

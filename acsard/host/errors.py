@@ -31,6 +31,10 @@ class ReplyError(MendableError, RuntimeError):
     """The answer is that it cannot be done, or none that can be read."""
 
 
+class NotDrivenError(MendableError, RuntimeError):
+    """The robot does not follow our commands; the text is the daemon's reason."""
+
+
 class InUseError(MendableError, OSError):
     """Somebody else has the serial port, the bus address or the robot's id."""
 

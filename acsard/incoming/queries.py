@@ -27,12 +27,21 @@ from acsard.messages.schema import (
     ServiceReply,
     TopicInfo,
     Topics,
+    WhoAmI,
 )
-from acsard.messages.topics import JSON_TREE, PUBLISHED, VERBS, full_key, offered
+from acsard.messages.topics import (
+    JSON_TREE,
+    PUBLISHED,
+    VERBS,
+    WHOAMI,
+    full_key,
+    offered,
+    whoami_key,
+)
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.parameters import Parameters
 from acsard.ros.transports import PARAMETERS
-from acsard.values import Answer, Outputs, Request
+from acsard.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
 
@@ -153,6 +162,10 @@ class Queries:
             asked = query.asked.removeprefix("schema/")
             names = list(SCHEMAS) if "*" in asked else [asked]
             return [(f"schema/{n}", "", SCHEMAS[n]) for n in names if n in SCHEMAS]
+        if topic == WHOAMI:
+            found = [role for role in ROLES if whoami_key(role) == query.asked]
+            by = asker(query.via, query.attachment)
+            return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in found]
         if topic == "interfaces":
             return [(topic, "Interfaces", interfaces(self._config, outputs))]
         if topic in self._fixed:

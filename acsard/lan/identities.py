@@ -17,13 +17,12 @@ from acsard.bus.certificates import CA
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
+from acsard.values import ROLES
 
 if TYPE_CHECKING:
-    from acsard.bus.access import Role
     from acsard.lan.authority import Authority
 
 PORT = 7449
-ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """A host name or IP address."""

@@ -216,6 +216,7 @@ class Report:
             gyro=snapshot.gyro.does,
             encoders=list(snapshot.encoders),
             doubt=snapshot.doubt.text,
+            sender=snapshot.sender,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:

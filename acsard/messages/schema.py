@@ -229,6 +229,8 @@ class RobotState(Message, frozen=True):
     """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
     doubt: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
+    sender: str = ""
+    """Which of the senders of `source` is followed, by the name it gives itself."""
 
 
 class DoorState(Message, frozen=True):
@@ -330,6 +332,15 @@ class Topics(Message, frozen=True):
     topics: list[TopicInfo]
 
 
+class WhoAmI(Message, frozen=True):
+    """Who asks, as the daemon sees it."""
+
+    role: str
+    """At least this, by the access rules: `viewer`, `operator` or `maintainer`."""
+    sender: str
+    """The name he gives himself, and the way he came, as the log has it."""
+
+
 MESSAGES: dict[str, type[Message]] = {
     cls.__name__: cls
     for cls in (
@@ -348,6 +359,7 @@ MESSAGES: dict[str, type[Message]] = {
         Info,
         Interfaces,
         Topics,
+        WhoAmI,
     )
 }
 """Every type that crosses the bus by itself, by name: what `schema/<Type>` answers for."""

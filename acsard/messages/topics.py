@@ -19,7 +19,7 @@ Direction = Literal["out", "in", "query", "service"]
 
 
 class Topic(Struct, frozen=True):
-    """One row. `key` may hold `<source>`, `<Type>` or `<key>` where a name goes."""
+    """One row. `key` may hold `<source>`, `<Type>`, `<key>` or `<role>` where a name goes."""
 
     key: str
     direction: Direction
@@ -35,7 +35,8 @@ class Topic(Struct, frozen=True):
     @property
     def pattern(self) -> str:
         """The key with each placeholder as a Zenoh wildcard."""
-        return self.key.replace("<source>", "*").replace("<Type>", "*").replace("<key>", "**")
+        key = self.key.replace("<key>", "**")
+        return key.replace("<source>", "*").replace("<Type>", "*").replace("<role>", "*")
 
 
 SERVICES: tuple[Verb, ...] = get_args(Verb)
@@ -52,6 +53,15 @@ _SERVICE_NOTES: dict[Verb, str] = {
 
 IMU = "imu"
 """What a gyro says; the simulator's own comes in on it as anybody's."""
+
+
+WHOAMI = "whoami/<role>"
+"""A key for each role, that who has less cannot ask: the access rules are the proof."""
+
+
+def whoami_key(role: str) -> str:
+    """The key that answers who has at least this role."""
+    return WHOAMI.replace("<role>", role)
 
 
 def service_key(verb: str) -> str:
@@ -92,6 +102,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("config", "query", "Config", "", "the configuration in force"),
     Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
     Topic("topics", "query", "Topics", "", "this table"),
+    Topic(WHOAMI, "query", "WhoAmI", "", "answers who may do what this role may"),
     Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a type"),
     Topic("alive", "out", "liveliness token", "", "present while the daemon runs"),
 )
@@ -132,3 +143,13 @@ def source_keys(sources: Iterable[str]) -> list[str]:
 def by_key(key: str) -> Topic | None:
     """The row of this key as written in the table, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
+
+
+def row_of(key: str) -> Topic | None:
+    """The row that a key below the robot's id belongs to, as `cmd/app` to `cmd/<source>`."""
+    for topic in TOPICS:
+        head, mark, _ = topic.key.partition("<")
+        name = key.removeprefix(head)
+        if key == topic.key or (mark and name != key and name and "/" not in name):
+            return topic
+    return None

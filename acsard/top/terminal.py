@@ -5,23 +5,36 @@ from __future__ import annotations
 import errno
 import io
 import os
-import select
 import signal
 import sys
-import termios
 import time
-import tty
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
+from rich.text import Text
 
 from acsard.top.feed import Feed
-from acsard.top.view import screen
+from acsard.top.fleet import Fleet
+from acsard.top.keys import keys
+from acsard.top.roster import table
+from acsard.top.teleop import Look, Teleop, lines
+from acsard.top.view import MODES, screen
 from acsard.values import AcsardError
 
 PERIOD_S = 0.25
+
+KEYS_S = 0.05
+"""Who drives is looked after so often."""
+
+LOOKS: dict[Look, str] = {
+    "head": "bold",
+    "mode": "bold",
+    "news": "",
+    "trouble": "bold red",
+    "help": "dim",
+}
 
 ONCE_S = 0.5
 """Rates are taken over this with --once, where a person waits for it."""
@@ -43,13 +56,28 @@ def live(feed: Feed) -> None:
     """Show the screen, and what changes, until a key or a signal."""
     with suppress(AcsardError):  # it may come by itself; the screen says that it waits
         feed.ask()
+    _hold(lambda console, suspend: _watch(feed, console, suspend))
+
+
+def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
+    """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
+    _hold(lambda console, suspend: _drive(step, seen, console, suspend))
+
+
+def roster(fleet: Fleet) -> None:
+    """Show a line for each robot, and what changes, until a key or a signal."""
+    _hold(lambda console, suspend: _roster(fleet, console, suspend))
+
+
+def _hold(shows: Callable[[Console, list[bool]], bool]) -> None:
+    """Have a screen until a signal, or until it is over; `shows` gives True for ^Z."""
     _be_lenient()
     console, suspend = Console(), []
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
     signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
     try:
-        while _watch(feed, console, suspend):
+        while shows(console, suspend):
             suspend.clear()
             os.kill(os.getpid(), signal.SIGSTOP)  # ^Z: the terminal is as it was; fg goes on
     except KeyboardInterrupt:
@@ -62,52 +90,77 @@ def live(feed: Feed) -> None:
 
 
 def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
-    """Show until a key or ^Z; True for ^Z."""
-    with (
-        _keys() as pressed,
-        Live(
-            console=console,
-            screen=True,
-            auto_refresh=False,
-            redirect_stdout=False,
-            redirect_stderr=False,
-        ) as live,
-    ):
+    with keys() as read, _screen(console) as shown:
         while not suspend:
             feed.poll()
             width, height = console.size
-            live.update(screen(feed.seen("q leaves"), width, height), refresh=True)
-            if pressed(PERIOD_S):
+            shown.update(screen(feed.seen("q leaves"), width, height), refresh=True)
+            typed = read(PERIOD_S)
+            if typed is None or "q" in typed.lower():
                 return False
     return True
 
 
-@contextmanager
-def _keys() -> Iterator[Callable[[float], bool]]:
-    """Keys come one by one and unseen; yields what waits for one that means to leave."""
+def _drive(
+    step: Callable[[str], None],
+    seen: Callable[[], Teleop],
+    console: Console,
+    suspend: list[bool],
+) -> bool:
+    with keys() as read, _screen(console) as shown:
+        due = 0.0
+        while not suspend:
+            typed = read(KEYS_S)
+            if typed is None:
+                return False
+            step(typed)
+            if typed or time.monotonic() >= due:
+                due = time.monotonic() + PERIOD_S
+                shown.update(teleop_screen(seen(), *console.size), refresh=True)
+    for letter in ("k", "", ""):
+        step(letter)  # nobody steps while we are stopped
+    return True
 
-    def pressed(seconds: float) -> bool:
-        if not sys.stdin.isatty():
-            time.sleep(seconds)
-            return False
-        ready, _, _ = select.select([sys.stdin], [], [], seconds)
-        if not ready:
-            return False
-        keys = os.read(sys.stdin.fileno(), 64)
-        return not keys or b"q" in keys.lower()
 
-    if not sys.stdin.isatty():
-        yield pressed
-        return
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin)
-    try:
-        yield pressed
-    finally:
-        try:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-        except (OSError, termios.error):
-            pass  # the terminal has been closed
+def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
+    with keys() as read, _screen(console) as shown:
+        while not suspend:
+            rows = fleet.rows()
+            width, height = console.size
+            told = [Text(line, no_wrap=True) for line in table(rows, width, height - 2)]
+            told[0].stylize("bold cyan")
+            for line in told[1:]:
+                if "GONE" in line.plain or "SILENT" in line.plain:
+                    line.stylize("bold red")
+            below = "q leaves" if rows else fleet.hint()
+            shown.update(Group(*told, Text(), Text(below, "dim")), refresh=True)
+            typed = read(PERIOD_S)
+            if typed is None or "q" in typed.lower():
+                return False
+    return True
+
+
+def teleop_screen(seen: Teleop, width: int, height: int) -> Group:
+    """The lines of `teleop.py` in colours."""
+    told = []
+    for look, text in lines(seen, width, height):
+        line = Text(text, LOOKS[look], no_wrap=True)
+        if look == "mode" and seen.state is not None and text.startswith(" "):
+            badge = len(seen.state.mode) + 2
+            line.stylize(MODES.get(seen.state.mode, "reverse"), 0, badge)
+        line.truncate(width, overflow="ellipsis")
+        told.append(line)
+    return Group(*told)
+
+
+def _screen(console: Console) -> Live:
+    return Live(
+        console=console,
+        screen=True,
+        auto_refresh=False,
+        redirect_stdout=False,
+        redirect_stderr=False,
+    )
 
 
 def _be_lenient() -> None:

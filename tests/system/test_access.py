@@ -129,6 +129,9 @@ def _questions() -> Iterator[Try]:
     # By wildcard at the machine only.
     yield from (Try(f"{key}/@adv/**", HERE) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC))
     yield Try(f"{ME}/config", KEEPERS)
+    for role, who in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
+        yield Try(f"{ME}/whoami/{role}", who)
+    yield from (Try(f"{ME}/whoami/{role}", NOBODY) for role in ("*", "admin"))
     yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
     yield from (Try(f"{ME}/{key}", NOBODY) for key in services)

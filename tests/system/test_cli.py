@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pty
+import re
 import select
 import signal
+import struct
 import subprocess
 import sys
 import termios
@@ -34,7 +37,20 @@ from tests.system.harness import (
     until,
 )
 
-VERBS = ("run", "sim", "check", "topics", "echo", "hz", "top", "drive", "call")
+VERBS = (
+    "run",
+    "sim",
+    "check",
+    "topics",
+    "echo",
+    "get",
+    "hz",
+    "top",
+    "fleet",
+    "drive",
+    "call",
+    "whoami",
+)
 
 
 def tool(shared: Daemon, *words: str) -> Finished:
@@ -349,6 +365,37 @@ def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
     assert "faults: mute" in sim.stderr
 
 
+# get
+
+
+def test_get_prints_what_a_query_key_answers_on_one_line_of_json(shared: Daemon) -> None:
+    ended = tool(shared, "get", "info")
+    assert (ended.code, ended.err) == (0, "")
+    (line,) = ended.out.splitlines()
+    assert json.loads(line)["pid"] == shared.pid
+
+
+@pytest.mark.parametrize("key", ["config", "schema/Odometry", "state", "odom"])
+def test_get_answers_on_every_kind_of_key(shared: Daemon, key: str) -> None:
+    ended = tool(shared, "get", key)
+    assert (ended.code, ended.err) == (0, "")
+    assert isinstance(json.loads(ended.out), dict)
+
+
+def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
+    ended = tool(shared, "get", "srv/stop")
+    assert (ended.code, ended.out) == (2, "")
+    assert "acsard call stop" in ended.err
+    assert bus.state()["mode"] != "stopped"
+
+
+@pytest.mark.parametrize("verb", ["echo", "hz"])
+def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None:
+    ended = tool(shared, verb, "info")
+    assert (ended.code, ended.out) == (2, "")
+    assert "acsard get info" in ended.err
+
+
 # drive
 
 
@@ -426,6 +473,99 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
         ) as program:
             until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state on the screen")
             yield terminal, program
+
+
+def screens(terminal: Terminal) -> list[str]:
+    """All whole screens so far, without their colours."""
+    frames = terminal.screen.split("\x1b[H")[1:-1]
+    return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
+
+
+@contextmanager
+def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal of that width that can have a screen."""
+    with Terminal() as terminal:
+        size = struct.pack("HHHH", 24, columns, 0, 0)
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
+        env = environment(TERM="xterm-256color")
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            env.pop(name, None)
+        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
+        with Program(
+            words,
+            shared.config.parent,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
+            yield terminal, program
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
+    shared: Daemon, bus: Bus, columns: int
+) -> None:
+    with screened(shared, columns) as (terminal, _):
+        frames = screens(terminal)
+    shown = next(frame for frame in frames if "no commands" in frame)
+    told = " ".join(shown.split())
+    for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
+        assert text in told
+    assert all(len(line.rstrip()) <= columns for line in shown.split("\r\n"))
+    # Each screen is written over the one before: nothing scrolls.
+    assert "\x1b[?1049h" in terminal.screen
+    assert all(frame.count("\n") < 24 for frame in frames)
+
+
+def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
+    shared: Daemon, bus: Bus
+) -> None:
+    with Terminal() as fresh:
+        usual = fresh.settings
+    with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
+        during = terminal.settings
+        assert during != usual
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.1, 5.0, "moving")
+        suspended = time.monotonic()
+        program.signal(signal.SIGTSTP)
+        until(lambda: terminal.settings == usual, 5.0, "the terminal as it was")
+        commands.find(
+            lambda value: value["twist"]["linear"]["x"] == 0, 2.0, "a zero", after=suspended
+        )
+        bus.at_rest()
+        program.signal(signal.SIGCONT)
+        until(lambda: terminal.settings == during, 5.0, "the screen again")
+        terminal.press("\x03")
+        assert program.ended(3.0) == 0
+
+
+@pytest.mark.slow
+def test_without_a_screen_there_is_a_line_a_second_and_the_help(shared: Daemon, bus: Bus) -> None:
+    with Terminal() as terminal:
+        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
+        with Program(
+            words,
+            shared.config.parent,
+            environment(TERM="dumb"),
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ):
+            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
+            begun = time.monotonic()
+            with held(terminal, "i"):
+                until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some lines")
+            took = time.monotonic() - begun
+    lines = terminal.screen.splitlines()
+    assert any("u  i  o" in line for line in lines)
+    assert terminal.screen.count("driving: ") <= 2 * took + 2
+    assert "yaw" in lines[-1]
+    bus.at_rest()
 
 
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import re
+import signal
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from acsard.bus.subscription import Subscription
 from acsard.client import AsyncClient, Client, connect, connect_async
-from acsard.host.errors import NoAnswerError, ReplyError, UnreachableError, UsageError
+from acsard.host.errors import (
+    NoAnswerError,
+    NotDrivenError,
+    ReplyError,
+    UnreachableError,
+    UsageError,
+)
 from acsard.messages import schema
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -124,6 +134,10 @@ def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
     assert ended.out.startswith("Pose(x=")
     # What comes late is driven on for: 0.5 m/s.
     assert state["x"] == pytest.approx(1.0, abs=0.03 + 0.5 * late)
+    # It prints where the robot came to a stand, not where it still rolled.
+    printed = re.match(r"Pose\(x=([\d.]+),", ended.out)
+    assert printed
+    assert float(printed[1]) == pytest.approx(state["x"], abs=0.01)
     assert state["y"] == pytest.approx(0.0, abs=0.01)
 
 
@@ -275,12 +289,96 @@ def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:
 def test_a_source_that_is_not_listed_is_told_so_in_state(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint, source="stranger") as robot:
         before = fresh.count("command_unknown_source")
-        robot.drive(0.5, seconds=0.2)
+        with pytest.raises(NotDrivenError, match=r"commands\.sources"):
+            robot.drive(0.5, seconds=0.2)
         until(lambda: fresh.count("command_unknown_source") >= before + 4, 3.0, "all are counted")
         state = robot.get("state")
     assert "source stranger" in state.refused
     assert "commands.sources" in state.refused
     assert (state.x, state.linear) == (0.0, 0.0)
+
+
+def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        robot.call("stop")
+        with pytest.raises(NotDrivenError, match="stopped by request"):
+            robot.drive(0.5, seconds=0.2)
+        robot.call("clear")
+        robot.call("deactivate")
+        with pytest.raises(NotDrivenError, match="srv/activate"):
+            robot.drive(0.5, seconds=0.2)
+        robot.call("activate")
+        robot.drive(0.5, seconds=0.2)
+        assert robot.pose().x > 0.02
+
+
+def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
+    shared: Daemon, fresh: Bus
+) -> None:
+    with connect(shared.endpoint) as robot:
+
+        def stop() -> None:
+            until(lambda: fresh.state()["linear"] > 0.1, 5.0, "driving")
+            robot.session.put(robot.key("stop"), b"")
+
+        with ThreadPoolExecutor(1) as other:
+            stopping = other.submit(stop)
+            with pytest.raises(NotDrivenError, match="stopped"):
+                robot.drive(0.3, seconds=30.0)
+            stopping.result()
+        assert robot.call("clear").success
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["teleop", "app"])
+def test_a_drive_behind_another_commander_raises_and_says_who_drives(
+    shared: Daemon, fresh: Bus, source: str
+) -> None:
+    with (
+        connect(shared.endpoint, source=source) as first,
+        connect(shared.endpoint) as robot,
+        ThreadPoolExecutor(1) as other,
+    ):
+        driving = other.submit(lambda: first.drive(0.1, seconds=4.0))
+        until(lambda: fresh.state()["linear"] > 0.05, 5.0, "the first drives")
+        told = first.sender if source == "app" else "teleop has the higher priority"
+        with pytest.raises(NotDrivenError, match=re.escape(told)):
+            robot.drive(0.5, seconds=0.2)
+        driving.result()
+
+
+@pytest.mark.slow
+def test_a_drive_without_its_daemon_raises(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot, Bus(daemon.endpoint) as bus:
+
+        def kill() -> None:
+            until(lambda: bus.state()["linear"] > 0.1, 10.0, "driving")
+            daemon.signal(signal.SIGKILL)
+
+        with ThreadPoolExecutor(1) as other:
+            killing = other.submit(kill)
+            with pytest.raises(NoAnswerError, match="no word from the daemon"):
+                robot.drive(0.3, seconds=30.0)
+            killing.result()
+
+
+def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        looks = 0
+        look = Subscription.try_recv
+
+        def counted(subscription: Subscription) -> Any:
+            nonlocal looks
+            looks += 1
+            return look(subscription)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Subscription, "try_recv", counted)
+            states = robot.messages("state", timeout=5.0)
+            for _ in range(5):
+                next(states)
+    # Polled once a millisecond it would be hundreds for half a second of them.
+    assert looks <= 20
 
 
 def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh: Bus) -> None:

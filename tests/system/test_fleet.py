@@ -26,7 +26,8 @@ from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.exits import Exit
 from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, whoami_key
+from acsard.values import ROLES
 from tests.system.fleet_router import (
     ITS_NAME,
     ROBOT_FILE,
@@ -117,6 +118,9 @@ def _queries() -> Iterator[Try]:
     for key in ("state", "odom", "tf_static"):
         yield Try(f"acsard/*/{key}", NOBODY)
     yield Try(f"{ONE}/config", KEEPERS)
+    for role, who in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
+        yield Try(f"{ONE}/whoami/{role}", who)
+    yield Try(f"{TWO}/whoami/operator", DRIVERS | ITSELF)
     yield Try(f"{TWO}/config", KEEPERS | ITSELF)
     for key in ("*", "**", "srv/*", "srv/**", "srv/ghost", "cmd/app"):
         yield Try(f"{ONE}/{key}", NOBODY)
@@ -495,8 +499,10 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
     keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
     published = set(VALUES)
     assert keys["hear"] == {f"acsard/*/{key}" for key in published}
-    asked = {topic.key for topic in TOPICS if topic.direction == "query"} - {"schema/<Type>"}
-    asked |= {f"schema/{name}" for name in SCHEMAS}
+    asked = {topic.key for topic in TOPICS if topic.direction == "query"}
+    asked -= {"schema/<Type>", WHOAMI}
+    asked |= {f"schema/{name}" for name in SCHEMAS} | {whoami_key("viewer")}
+    least: dict[str, str] = {role: whoami_key(role) for role in ROLES}
     services = {f"srv/{verb}" for verb in SERVICES}
     commands = {f"{kind}/{source}" for kind in ("cmd", "wheel_cmd") for source in SOURCES}
     for robot in ("robot1", "robot2"):
@@ -506,9 +512,11 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
         }
         assert found["see"] | found["keep"] >= published | asked | {"alive"}
         assert set().union(*found.values()) == (
-            published | asked | services | commands | {"alive", "stop", "imu"}
+            published | asked | services | commands | {"alive", "stop", "imu", *least.values()}
         )
         assert found["drive"] >= commands
+        for kind, role in (("see", "viewer"), ("drive", "operator"), ("keep", "maintainer")):
+            assert {key for key in found[kind] if key.startswith("whoami/")} == {least[role]}
         assert not found["see"] & (commands | services - {"srv/stop"})
 
 

@@ -153,9 +153,9 @@ def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> No
     page = "deploy/zenoh/README.md"
     story = [
         (find(page, "echo state", "laptop-anna"), 0, '"mode":"ready"'),
-        (find(page, "call stop", "laptop-anna"), 0, "stopped and latched"),
+        (find(page, "call stop", "--id robot1 ", "laptop-anna"), 0, "stopped and latched"),
         (find(page, "echo state", "viewer"), 0, '"mode":"stopped"'),
-        (find(page, "call clear", "viewer"), 69, ""),
+        (find(page, "call clear", "viewer"), 77, ""),
         (find(page, "call clear", "operator"), 0, "cleared"),
         (find(page, "call stop", "viewer"), 0, "stopped and latched"),
     ]

@@ -8,11 +8,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from acsard import client
@@ -20,23 +18,9 @@ from acsard.client import Client
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.incoming.commands import Arrival, Receiver
-from acsard.values import REST, Command, Twist
+from acsard.values import Command
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-
-
-class Samples:
-    """What comes on a key."""
-
-    def __init__(self, *samples: Any) -> None:
-        self._samples = list(samples)
-        self.undeclared = False
-
-    def try_recv(self) -> Any:
-        return self._samples.pop(0) if self._samples else None
-
-    def undeclare(self) -> None:
-        self.undeclared = True
 
 
 class Session:
@@ -45,17 +29,12 @@ class Session:
     def __init__(self, zid: str) -> None:
         self._zid = zid
         self.heard: list[Command] = []
-        self.states = Samples()
 
     def zid(self) -> str:
         return self._zid
 
     def new_timestamp(self) -> None:
         return None
-
-    def declare_subscriber(self, key: str, queue: Any) -> Samples:
-        assert key == "acsard/acsar/state"
-        return self.states
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
         key = key.removeprefix("acsard/acsar/")
@@ -92,74 +71,6 @@ def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
     for one in (session, other):
         client_of(one).send(0.5)
     assert session.heard[0].sender != other.heard[0].sender
-
-
-def test_a_drive_opens_with_zeros_for_longer_than_a_first_contact_takes(
-    session: Session,
-) -> None:
-    client = client_of(session)
-    client.drive(0.5, 0.2, seconds=0.2)
-    twists = [one.twist for one in session.heard]
-    first = twists.index(Twist(0.5, 0.2))
-    assert set(twists[:first]) == {REST}
-    opened_ns = (session.heard[first].stamp_ns or 0) - (session.heard[0].stamp_ns or 0)
-    assert opened_ns >= 300_000_000
-    assert twists[-1] == REST
-    assert session.states.undeclared
-
-
-def told(waits_for: str, age: float | None = 0.01, mode: str = "ready") -> Any:
-    """A state that says this of our source."""
-    state = {
-        "stamp": {"sec": 1, "nanosec": 0}, "mode": mode, "reason": "", "x": 0, "y": 0, "yaw": 0,
-        "linear": 0, "angular": 0, "wheels": [], "link": "up", "source": "", "refused": "",
-        "sources": [{"name": "app", "priority": 50, "age": age, "waits_for": waits_for}],
-        "counters": {},
-    }  # fmt: skip
-    return Sample(msgspec.json.encode(state))
-
-
-class Sample:
-    """One sample as Zenoh hands it over."""
-
-    encoding = ""
-    key_expr = "acsard/acsar/state"
-
-    def __init__(self, data: bytes) -> None:
-        self.payload = self
-        self._data = data
-
-    def to_bytes(self) -> bytes:
-        return self._data
-
-
-NEUTRAL = "neutral first: app must send a zero"
-
-
-OPENS: list[tuple[str, Any, bool]] = [
-    ("waits for nothing", told(""), True),
-    ("outranked", told("teleop has the higher priority: until it is silent"), True),
-    ("waits for neutral", told(NEUTRAL), False),
-    ("never heard", told("a command", None), False),
-    ("heard long ago", told("a command", 7.0), False),
-    ("stopped", told(NEUTRAL, mode="stopped"), True),
-    ("unreadable", Sample(b"{}"), False),
-]
-
-
-def test_a_drive_begins_when_its_zeros_count_or_never_will() -> None:
-    def opened_s(last: Any) -> float:
-        session = Session("0123456789abcdef")
-        session.states = Samples(*[told(NEUTRAL)] * 45, last)
-        client_of(session).drive(0.5, seconds=0.05)
-        first = [one.twist for one in session.heard].index(Twist(0.5, 0.0))
-        return ((session.heard[first].stamp_ns or 0) - (session.heard[0].stamp_ns or 0)) / 1e9
-
-    # Side by side: each passes two real seconds.
-    with ThreadPoolExecutor(len(OPENS)) as drives:
-        waited = list(drives.map(opened_s, [last for _, last, _ in OPENS]))
-    opened = {case[0]: seconds < 1.5 for case, seconds in zip(OPENS, waited, strict=True)}
-    assert opened == {name: opens for name, _, opens in OPENS}
 
 
 # certificates

@@ -11,7 +11,13 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.bus.access import GRANTS, SERVICE_ROLES, Role, access_control, door_access
+from acsard.bus.access import (
+    GRANTS,
+    SERVICE_ROLES,
+    access_control,
+    door_access,
+    least_role,
+)
 from acsard.config.settings import (
     AccessConfig,
     CommandsConfig,
@@ -22,8 +28,9 @@ from acsard.config.settings import (
     RosConfig,
     Source,
 )
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, full_key
+from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
 from acsard.ros.transports import PARAMETERS, endpoints
+from acsard.values import Role
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)
@@ -77,7 +84,7 @@ FROM: dict[Role, set[str]] = {
 
 def written(key: str) -> str:
     """A row of the table with names in the places for names."""
-    return key.replace("<source>", "app").replace("<Type>", "Twist")
+    return key.replace("<source>", "app").replace("<Type>", "Twist").replace("<role>", "operator")
 
 
 # the roles
@@ -155,6 +162,7 @@ LEAST: dict[str, Role] = {
     "topics": "viewer",
     "interfaces": "viewer",
     "schema/<Type>": "viewer",
+    "whoami/<role>": "operator",
     "config": "maintainer",
     "srv/stop": "viewer",
     "srv/clear": "operator",
@@ -177,6 +185,22 @@ def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic:
     declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
     for who in EVERYBODY:
         assert access.lets(who, declared, access.key(topic.pattern), "egress")
+
+
+@pytest.mark.parametrize("access", [DEFAULT, TRUSTING], ids=["exact", "wildcards"])
+def test_a_role_may_ask_for_its_own_name_and_those_below_and_no_other(access: Access) -> None:
+    for role in ROLES:
+        who = access.who("query", access.key(whoami_key(role)))
+        assert who == FROM[role]
+    assert access.who("query", access.key("whoami/*")) <= FROM["maintainer"]
+
+
+def test_the_least_role_of_a_key_is_the_one_that_the_rules_have() -> None:
+    for topic in TOPICS:
+        if topic.direction != "out" and topic.key not in ("door", WHOAMI):
+            assert least_role(written(topic.key)) == LEAST[topic.key]
+        elif topic.direction == "out":
+            assert least_role(topic.key) == "viewer"
 
 
 def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:

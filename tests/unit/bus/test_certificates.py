@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives import serialization
 
-from acsard.bus.certificates import ends_ns, require_usable
+from acsard.bus.certificates import common_name, ends_ns, require_usable
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
@@ -20,6 +20,16 @@ DAY_NS = 86400 * NS_PER_S
 def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
     Authority.make(where, "test", authority_days).issue(where, "robot", ["localhost"], days)
     return where
+
+
+def test_the_name_in_a_certificate_is_told_and_of_none_that_can_be_used_no_name(
+    tmp_path: Path,
+) -> None:
+    assert common_name(str(made(tmp_path))) == "robot"
+    Authority.load(tmp_path).issue(tmp_path / "anna", "laptop-anna", [], 10)
+    assert common_name(str(tmp_path / "anna")) == "laptop-anna"
+    (tmp_path / "certificate.pem").write_text("junk")
+    assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""
 
 
 def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:

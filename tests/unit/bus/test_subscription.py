@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import zenoh
 
-from acsard.bus.subscription import QUEUED, Subscription
+from acsard.bus.subscription import QUEUED, Subscription, queue_on
 
 KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
 
@@ -22,6 +25,9 @@ class Queue:
 
     def try_recv(self) -> Any:
         return self.held.popleft() if self.held else None
+
+    def wait(self, seconds: float | None) -> None:
+        """Nothing more comes."""
 
     def undeclare(self) -> None:
         self.open = False
@@ -75,3 +81,74 @@ def test_it_ends_when_its_session_is_closed() -> None:
 
 def test_a_closed_one_is_undeclared_without_a_word() -> None:
     Subscription(Closed()).undeclare()
+
+
+# what Zenoh's thread hands over
+
+
+class Session:
+    """Gives what is subscribed to by hand."""
+
+    def __init__(self) -> None:
+        self.handlers: list[Any] = []
+
+    def declare_subscriber(self, key: str, handler: Any) -> Queue:
+        self.handlers.append(handler)
+        return Queue()
+
+
+def declared() -> tuple[Any, Subscription]:
+    session: Any = Session()
+    queue = queue_on(session, KEY, latched=False)
+    return session.handlers[0], Subscription(queue)
+
+
+def sample(number: int) -> Any:
+    return SimpleNamespace(key_expr=KEY, number=number)
+
+
+def test_a_reader_sleeps_until_something_comes_and_ends_when_the_session_is_closed() -> None:
+    handler, subscription = declared()
+    asleep: Any = subscription.until_silence(None)
+
+    def other() -> None:
+        for number in range(3):
+            handler.callback(sample(number))
+        handler.drop()
+
+    looks = 0
+    look = subscription.try_recv
+
+    def counted() -> Any:
+        nonlocal looks
+        looks += 1
+        if looks == 1:
+            # It finds nothing at first, and looks again for what comes alone.
+            threading.Timer(0.2, other).start()
+        return look()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subscription, "try_recv", counted)
+        assert [one.number for one in asleep] == [0, 1, 2]
+    assert looks <= 1 + 2 * 4  # a poll every millisecond would have looked 200 times
+
+
+def test_an_asyncio_reader_is_woken_by_what_comes_and_by_the_end() -> None:
+    handler, subscription = declared()
+
+    async def read() -> list[int]:
+        asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
+        asyncio.get_running_loop().call_later(0.06, handler.drop)
+        return [one.number async for one in subscription.arriving()]  # type: ignore[attr-defined]
+
+    for number in range(2):
+        handler.callback(sample(number))
+    assert asyncio.run(read()) == [0, 1, 2]
+
+
+def test_of_a_flood_the_newest_are_kept() -> None:
+    handler, subscription = declared()
+    for number in range(QUEUED + 5):
+        handler.callback(sample(number))
+    handler.drop()
+    assert numbers(subscription) == list(range(5, QUEUED + 5))

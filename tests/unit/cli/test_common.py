@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import common
-from acsard.cli.common import PLACES, find, load, robot_address
+from acsard.cli.common import PLACES, find, load, require_asked, require_followed, robot_address
 from acsard.config.settings import Config
+from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 
 
@@ -174,3 +175,37 @@ def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
     with pytest.raises(ExitError) as caught:
         robot_address(argparse.Namespace(config=str(file), connect=None, id=None, tls=None))
     assert caught.value.code is Exit.BAD_CONFIG
+
+
+# keys of another kind than was thought
+
+
+@pytest.mark.parametrize(
+    ("key", "instead"),
+    [
+        ("info", "acsard get info"),
+        ("schema/Twist", "acsard get schema/Twist"),
+        ("srv/stop", "acsard call stop"),
+        ("alive", "acsard fleet"),
+    ],
+)
+def test_what_is_never_published_says_what_to_type_instead(key: str, instead: str) -> None:
+    with pytest.raises(UsageError, match=instead):
+        require_followed(key)
+
+
+@pytest.mark.parametrize(
+    ("key", "instead"),
+    [("srv/clear", "call clear"), ("cmd/app", "echo cmd/app"), ("alive", "acsard fleet")],
+)
+def test_what_answers_nothing_or_acts_is_not_asked(key: str, instead: str) -> None:
+    with pytest.raises(UsageError, match=instead):
+        require_asked(key)
+
+
+def test_what_is_published_is_followed_and_asked_and_so_is_what_is_not_in_the_table() -> None:
+    for key in ("odom", "state", "nonsense", "schema", "cmd/app/x"):
+        require_followed(key)
+        require_asked(key)
+    require_followed("cmd/app")
+    require_asked("config")

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.cli.drive import HOLD_S, ZEROS, Teleop, split
+from acsard.cli.drive import HOLD_S, ZEROS, News, Teleop, split
+from acsard.messages.schema import RobotState
 from acsard.values import REST, Twist
+from tests.unit.top.screens import STATE
+from tests.unit.top.test_teleop import SEEN
 
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
@@ -143,3 +150,38 @@ def test_cutting_loses_nothing(text: str) -> None:
 @given(st.lists(st.sampled_from([*"io,k ", UP, DOWN, LEFT, RIGHT])))
 def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
     assert split("".join(keys)) == keys
+
+
+# without a screen
+
+
+def lines_of(states: list[tuple[float, RobotState]]) -> list[str]:
+    """What is printed when these are there at these times, s."""
+    news = News()
+    told = (news.tell(replace(SEEN, state=state), now) for now, state in states)
+    return [line for line in told if line]
+
+
+def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
+    moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
+    assert len(lines_of(moving)) == 10
+    resting = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
+    assert len(lines_of(resting)) == 1
+
+
+def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second() -> None:
+    stopped = replace(STATE, mode="stopped", reason="stopped by request")
+    told = lines_of([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
+    assert [line.partition(":")[0] for line in told] == ["driving", "stopped", "driving"]
+    flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
+    assert len(lines_of(flickering)) <= 20
+
+
+def test_without_the_library_of_the_screen_the_rest_is_there() -> None:
+    words = (
+        "import sys; sys.modules['rich'] = None\n"
+        "import acsard.cli.drive, acsard.top.fleet, acsard.top.keys, acsard.top.roster\n"
+        "try:\n    import acsard.top.terminal\nexcept ImportError:\n    print('no screen')"
+    )
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("no screen\n", "")

@@ -21,7 +21,7 @@ from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.transports import PARAMETER_SERVICES, TRIGGERS
-from acsard.values import Answer, Outputs, Pose, Request
+from acsard.values import ROLES, Answer, Outputs, Pose, Request
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
@@ -146,6 +146,20 @@ def test_config_is_the_configuration_in_force(form: Format) -> None:
         msgspec.json.encode(effective(CONFIG))
     )
     assert reply.encoding == encoding_name(form)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
+    sender = msgspec.msgpack.encode({"sender": "joe@laptop"})
+    asked = f"whoami/{role}"
+    reply = answer(query("whoami/<role>", asked, attachment=sender))
+    assert reply.key == asked
+    assert msgspec.json.decode(reply.payload) == {"role": role, "sender": "joe@laptop (native)"}
+
+
+@pytest.mark.parametrize("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
+def test_nobody_is_told_a_role_that_was_not_asked_for_by_its_name(asked: str) -> None:
+    assert answers(query("whoami/<role>", asked)) == []
 
 
 def test_topics_is_the_whole_table_with_full_keys() -> None:

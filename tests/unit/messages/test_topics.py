@@ -17,6 +17,7 @@ from acsard.messages.topics import (
     json_key,
     offered,
     published,
+    row_of,
     source_keys,
 )
 
@@ -46,6 +47,7 @@ PROMISED = [
     ("interfaces", "query", "Interfaces"),
     ("topics", "query", "Topics"),
     ("schema/<Type>", "query", "JSON Schema"),
+    ("whoami/<role>", "query", "WhoAmI"),
     ("alive", "out", "liveliness token"),
 ]
 """DESIGN section 3, and what the door tells the daemon."""
@@ -135,3 +137,16 @@ def test_a_published_key_is_in_the_json_tree_by_its_whole_name() -> None:
 def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
     assert by_key("odometry") is None
     assert by_key("cmd/teleop") is None
+
+
+def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
+    for topic in TOPICS:
+        filled = (
+            topic.key.replace("<source>", "app")
+            .replace("<Type>", "Twist")
+            .replace("<role>", "viewer")
+        )
+        assert row_of(filled) is topic
+        assert row_of(topic.key) is topic
+    for key in ("", "cmd", "cmd/", "cmd/app/x", "schema/", "odometry", "srv/ghost"):
+        assert row_of(key) is None

@@ -1,0 +1,74 @@
+"""`acsard fleet`: a line for each robot, live."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import MANY, add_bus, robot_address
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+
+if TYPE_CHECKING:
+    from acsard.top.fleet import Fleet
+
+GATHER_S = 1.5
+"""All who are there have said so by then."""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "fleet",
+        help="a line for each robot, live",
+        description="Show mode, speed, link, version and why of every robot that the bus or router "
+        "at --connect knows, live; q or Ctrl-C leaves. By TLS a role may use exact keys only: "
+        "name the robots there, --id robot1,robot2. Into a pipe, or with --once, print one table. "
+        f"The live screen needs an extra: {install('top')}.",
+    )
+    parser.add_argument("--once", action="store_true", help="print one table and end")
+    add_bus(parser, MANY + " (the default)")
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Show until told otherwise."""
+    from acsard.bus.fleet import ALL, named
+    from acsard.client import connect
+    from acsard.top.fleet import Fleet
+
+    endpoint, robot_id, tls = robot_address(args)
+    ids = (named(robot_id) or (robot_id,)) if args.id else (ALL,)
+    dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        fleet = Fleet(robot, ids, endpoint)
+        if args.once or dumb or not sys.stdout.isatty():
+            return _once(fleet)
+        try:
+            from acsard.top import terminal
+        except ImportError:
+            raise ExitError(
+                Exit.FAILURE, f"needs the library rich; use --once, or run: {install('top')}"
+            ) from None
+        terminal.roster(fleet)
+    return int(Exit.OK)
+
+
+def _once(fleet: Fleet) -> int:
+    """One table; exit 69 when nobody is there."""
+    from acsard.top.roster import table
+
+    end = time.monotonic() + GATHER_S
+    while time.monotonic() < end:
+        fleet.rows()
+        time.sleep(0.1)
+    rows = fleet.rows()
+    if not any(row.here or row.state for row in rows):
+        raise ExitError(Exit.UNREACHABLE, fleet.hint())
+    width = shutil.get_terminal_size((160, 24)).columns
+    print("\n".join(table(rows, width)))
+    return int(Exit.OK)

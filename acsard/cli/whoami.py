@@ -1,0 +1,38 @@
+"""`acsard whoami`: what we may do on this bus, and by which certificate."""
+
+from __future__ import annotations
+
+import argparse
+
+from acsard.cli.common import add_bus, robot_address
+from acsard.host.exits import Exit
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "whoami",
+        help="what you may do there: role, certificate, sender",
+        description="Ask the robot which role it gives us: viewer, operator or maintainer. By TLS "
+        "the certificate decides, at the machine itself everybody is maintainer. Exit 77 when we "
+        "have no role.",
+    )
+    parser.add_argument("--json", action="store_true", help="print it as JSON")
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Ask and print."""
+    import msgspec
+
+    from acsard.client import connect
+
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        us = robot.whoami()
+    if args.json:
+        print(msgspec.json.encode(us).decode())
+    else:
+        print(f"{us.words()}\nsender {us.sender}")
+    return int(Exit.OK if us.role else Exit.NO_PERMISSION)

@@ -1,0 +1,110 @@
+"""What `acsard fleet` knows: who is there by its token, and what its state says."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from threading import Lock
+
+import zenoh
+
+from acsard.bus.fleet import ALL, follow, nobody, robot_of
+from acsard.bus.subscription import QUEUED, encoded
+from acsard.client import Client
+from acsard.messages.encodings import DecodeError, Decoder
+from acsard.messages.schema import Info, RobotState
+from acsard.messages.topics import full_key
+from acsard.top.roster import Row
+from acsard.top.seen import SILENT_S
+
+ASK_S = 2.0
+"""A robot that is there and says nothing is asked again so often."""
+
+MOST = 1000
+"""Robots; a stranger may invent names."""
+
+
+class _Known:
+    """What is known of one robot."""
+
+    def __init__(self) -> None:
+        self.here = False
+        self.state: RobotState | None = None
+        self.heard = self.asked = 0.0
+        self.version = ""
+
+
+class Fleet:
+    """Follows the robots of these ids, or all there are; callbacks come on threads of Zenoh's."""
+
+    def __init__(self, robot: Client, ids: Sequence[str], endpoint: str) -> None:
+        self._robot, self._ids, self._endpoint = robot, ids, endpoint
+        self._lock = Lock()
+        self._known = {one: _Known() for one in ids if one != ALL}
+        self._states, self._infos = Decoder(RobotState), Decoder(Info)
+        self._samples = follow(robot.session, ids, "state")
+        liveliness = robot.session.liveliness()
+        for one in ids:
+            liveliness.declare_subscriber(full_key(one, "alive"), self._token, history=True)
+
+    def rows(self) -> list[Row]:
+        """What is known now, after taking what has come; asks who has not said anything."""
+        for _ in range(QUEUED):
+            sample = self._samples.try_recv()
+            if sample is None:
+                break
+            self._state(sample)
+        now = time.monotonic()
+        with self._lock:
+            known = list(self._known.items())
+        for name, one in known:
+            if now - max(one.heard, one.asked) > ASK_S or (one.here and not one.version):
+                self._ask(name, one, now)
+        return [
+            Row(name, one.here, one.state, max(0.0, now - one.heard), one.version, SILENT_S + ASK_S)
+            for name, one in known
+        ]
+
+    def hint(self) -> str:
+        """Why there may be nobody to show."""
+        return nobody(self._endpoint) if ALL in self._ids else "none of these robots is there"
+
+    def _ask(self, name: str, one: _Known, now: float) -> None:
+        if now - one.asked < ASK_S / 2:
+            return
+        one.asked = now
+        other = self._robot.like(name)
+        other.ask("state", self._state)
+        other.ask("info", self._info)
+
+    def _of(self, sample: zenoh.Sample) -> _Known | None:
+        name = robot_of(str(sample.key_expr))
+        with self._lock:
+            if name not in self._known and name and len(self._known) < MOST:
+                self._known[name] = _Known()
+            return self._known.get(name)
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is not None:
+            one.here = sample.kind == zenoh.SampleKind.PUT
+            if not one.here:
+                one.version = ""  # it may come back as another
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        try:
+            state = self._states.decode(*encoded(sample))
+        except DecodeError:
+            return  # of another version: shown as silent
+        one = self._of(sample)
+        if one is not None:
+            one.state, one.heard = state, time.monotonic()
+
+    def _info(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        try:
+            version = self._infos.decode(*encoded(sample)).version
+        except DecodeError:
+            version = "?"
+        if one is not None:
+            one.version = version

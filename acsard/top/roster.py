@@ -1,0 +1,83 @@
+"""A line for each robot of a fleet, for any width; pure, and without a library."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from acsard.messages.schema import RobotState
+from acsard.top.teleop import printable, reason
+
+SILENT_S = 2.0
+
+HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")
+
+ROOM = (12, 8, 6, 7, 10, 6)
+"""At most so wide each but the last, which has what is left."""
+
+NARROW = (0, 1, 2, 5, 6)
+"""The columns that a narrow terminal has, below `WIDE`."""
+
+WIDE = 72
+
+
+class Row(Struct, frozen=True):
+    """What is known of one robot."""
+
+    robot_id: str
+    here: bool
+    """Its daemon runs."""
+    state: RobotState | None
+    age: float
+    """Since `state` came, s."""
+    version: str
+    silence: float = SILENT_S
+    """The age from which on it is no news any more, s."""
+
+
+def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
+    """Heads and a line for each robot, at most `width` long and `height` many."""
+    shown = range(len(HEADS)) if width >= WIDE else NARROW
+    cells = [HEADS, *map(told, sorted(rows, key=lambda row: row.robot_id))]
+    rooms = [min(ROOM[n], max(len(row[n]) for row in cells)) for n in range(len(ROOM))]
+    lines = [
+        "  ".join([*(row[n][: rooms[n]].ljust(rooms[n]) for n in shown[:-1]), row[-1]]).rstrip()
+        for row in cells
+    ]
+    cut = [line if len(line) <= width else f"{line[: width - 1]}…" for line in lines]
+    if height is None or len(cut) <= height:
+        return cut
+    return [*cut[: max(1, height - 1)], f"and {len(cut) - height + 1} more"[:width]][:height]
+
+
+def told(row: Row) -> tuple[str, ...]:
+    """Its cells, in the order of `HEADS`."""
+    name = printable(row.robot_id)
+    if row.state is None:
+        why = "waiting for its state" if row.here else "not there"
+        return (name, "-", "-", "-", printable(row.version) or "-", "never", why)
+    state, why = row.state, reason(row.state)
+    if not row.here:
+        why = f"GONE, was: {why}"
+    elif row.age > row.silence:
+        why = f"SILENT, was: {why}"
+    return (
+        name,
+        printable(state.mode),
+        f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?",
+        printable(state.link),
+        printable(row.version) or "-",
+        _age(row.age),
+        why,
+    )
+
+
+def _age(seconds: float) -> str:
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    for size, unit in ((1.0, "s"), (60.0, "min"), (3600.0, "h")):
+        if seconds < 99.5 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:.0f} d"

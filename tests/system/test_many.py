@@ -1,0 +1,205 @@
+"""Many robots behind one router: who is there, what they say, and all of them stopped at once."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tests.system.fleet_router import ROBOT_FILE, certified, router
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Finished,
+    Program,
+    Tables,
+    acsard,
+    client_config,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+)
+from tests.system.identities import free_tls_endpoint
+from tests.system.test_cli import ON_TERMINAL, Terminal, screens
+
+ONE, TWO = "robot1", "robot2"
+
+
+class Robots:
+    """Two of them, and where their router is."""
+
+    def __init__(self, where: Path, endpoint: str, daemons: dict[str, Daemon]) -> None:
+        self.where, self.endpoint, self.daemons = where, endpoint, daemons
+
+    def words(self, *words: str, who: str = "*") -> list[str]:
+        return acsard(*words, "--connect", self.endpoint, "--id", who)
+
+    def tool(self, *words: str, who: str = "*") -> Finished:
+        ended = finish(self.words(*words, who=who), self.where)
+        assert "Traceback" not in ended.err, ended.err
+        return ended
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
+    where, endpoint = tmp_path_factory.mktemp("many"), free_endpoint()
+    with ExitStack() as stack:
+        stack.enter_context(zenoh.open(client_config(endpoint, "router")))
+        daemons = {}
+        for name in (ONE, TWO):
+            here = free_endpoint()
+            own: Tables = {
+                "robot": {"id": name},
+                "bus": {"listen": [here], "connect": [endpoint]},
+            }
+            daemons[name] = stack.enter_context(Daemon(where, config=own, name=name))
+            with Bus(here, robot_id=name) as bus:
+                bus.linked()
+        yield Robots(where, endpoint, daemons)
+
+
+def heard(program: Program) -> list[Any]:
+    """What it has printed so far."""
+    return [json.loads(line) for line in program.out]
+
+
+def messages(program: Program) -> list[Any]:
+    """What it has printed so far."""
+    return [json.loads(line) for line in program.out]
+
+
+def test_echo_of_all_robots_says_whose_each_message_is(robots: Robots) -> None:
+    with Program(robots.words("echo", "state"), robots.where) as program:
+        until(lambda: {one["robot"] for one in messages(program)} >= {ONE, TWO}, 10.0, "both")
+    assert all(one["message"]["link"] for one in messages(program))
+    assert "following robot1, robot2" in program.stderr
+
+
+def test_get_of_named_robots_says_whose_each_answer_is(robots: Robots) -> None:
+    ended = robots.tool("get", "info", who=f"{TWO},{ONE}")
+    assert (ended.code, ended.err) == (0, "")
+    found = [json.loads(line) for line in ended.out.splitlines()]
+    assert [one["robot"] for one in found] == [ONE, TWO]
+    assert [one["message"]["id"] for one in found] == [ONE, TWO]
+
+
+def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots) -> None:
+    ended = robots.tool("fleet", "--once")
+    assert (ended.code, ended.err) == (0, "")
+    head, *rows = ended.out.splitlines()
+    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY"]
+    assert [row.split()[0] for row in rows] == [ONE, TWO]
+    for row in rows:
+        assert re.search(r"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +no commands", row), row
+
+
+@pytest.mark.slow
+def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> None:
+    third: Tables = {
+        "robot": {"id": "robot3"},
+        "bus": {"listen": [free_endpoint()], "connect": [robots.endpoint]},
+    }
+    env = environment(TERM="xterm-256color", COLUMNS="100", LINES="24")
+    words = [sys.executable, "-c", ON_TERMINAL, "fleet", "--connect", robots.endpoint]
+    with Terminal() as terminal:
+        with Program(
+            words,
+            robots.where,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+
+            def line(of: str, says: str) -> bool:
+                rows = screens(terminal)[-1:]
+                return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
+
+            until(lambda: line(ONE, "no commands") and line(TWO, "no commands"), 10.0, "both")
+            with Daemon(robots.where, config=third, name="third") as daemon:
+                until(lambda: line("robot3", "ready"), 10.0, "the third, that came later")
+                daemon.signal(signal.SIGKILL)
+                until(lambda: line("robot3", "GONE, was: "), 10.0, "that it has gone")
+            terminal.press("q")
+            assert program.ended(3.0) == 0
+        assert "Traceback" not in terminal.screen + program.stderr
+
+
+@pytest.mark.slow
+def test_a_named_robot_that_is_not_there_is_said(robots: Robots) -> None:
+    ended = robots.tool("fleet", "--once", who=f"{ONE},robot9")
+    assert re.search(r"^robot9 +- .* not there$", ended.out, re.M)
+    assert robots.tool("fleet", "--once", who="robot8,robot9").code == 69
+
+
+def test_stop_of_all_stops_each_and_says_who_answered(robots: Robots) -> None:
+    ended = robots.tool("call", "stop")
+    assert (ended.code, ended.err) == (0, "")
+    assert [line.partition(":")[0] for line in ended.out.splitlines()] == [ONE, TWO]
+    modes = {}
+    for name in (ONE, TWO):
+        (line,) = robots.tool("get", "state", who=name).out.splitlines()
+        modes[name] = json.loads(line)["mode"]
+        assert robots.tool("call", "clear", who=name).code == 0
+    assert set(modes.values()) == {"stopped"}
+
+
+def test_stop_of_several_says_who_gave_no_answer_and_ends_with_69(robots: Robots) -> None:
+    ended = robots.tool("call", "stop", who=f"{ONE},robot9")
+    assert ended.code == 69
+    assert re.search(rf"^{ONE}: stopped", ended.out, re.M)
+    assert "robot9: NO ANSWER" in ended.out
+    assert robots.tool("call", "clear", who=ONE).code == 0
+
+
+def test_nothing_but_stop_goes_to_many(robots: Robots) -> None:
+    for service in ("clear", "activate"):
+        ended = robots.tool("call", service)
+        assert ended.code == 2
+        assert "only stop" in ended.err
+
+
+@pytest.mark.slow
+def test_nobody_there_is_said_with_69(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with zenoh.open(client_config(endpoint, "router")):
+        nobody = Robots(tmp_path, endpoint, {})
+        for words in (("fleet", "--once"), ("call", "stop"), ("get", "info")):
+            ended = nobody.tool(*words)
+            assert (ended.code, ended.out) == (69, "")
+            assert "no robot is seen" in ended.err
+
+
+@pytest.mark.slow
+@pytest.mark.network
+def test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do(tmp_path: Path) -> None:
+    endpoint = free_tls_endpoint()
+    certified(tmp_path, "router.local", ONE, "viewer")
+    with router(tmp_path, endpoint) as program:
+        until(lambda: "routing" in program.stdout, 20.0, "the router")
+        own: Any = tomllib.loads(ROBOT_FILE.read_text())
+        own["robot"]["id"] = ONE
+        own["bus"] |= {"connect": [endpoint], "tls": str(tmp_path / ONE)}
+        with Daemon(tmp_path, config=own, name=ONE, ready=False):
+            viewer = Robots(tmp_path, endpoint, {})
+            by = ("--tls", str(tmp_path / "viewer"))
+            until(lambda: viewer.tool("fleet", "--once", *by, who=ONE).code == 0, 30.0, "the robot")
+            for words in (("fleet", "--once"), ("call", "stop"), ("get", "info")):
+                ended = viewer.tool(*words, *by)
+                assert ended.code == 69
+                assert "over TLS only exact keys pass" in ended.err
+            stopped = viewer.tool("call", "stop", *by, who=f"{ONE},{TWO}")
+            assert f"{ONE}: stopped" in stopped.out
+            assert f"{TWO}: NO ANSWER" in stopped.out

@@ -1,0 +1,151 @@
+"""A role that may not is told so: who one is, by the access rules, in every tool."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.client import connect, connect_async
+from acsard.host.errors import NotPermittedError
+from acsard.values import ROLES
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Finished,
+    Program,
+    acsard,
+    finish,
+    free_endpoint,
+    until,
+)
+from tests.system.identities import Certificates, Identity, free_tls_endpoint
+from tests.system.test_cli import ON_TERMINAL, Terminal
+
+pytestmark = pytest.mark.network
+
+
+class Robot:
+    """A daemon with a door, and the certificates of its roles."""
+
+    def __init__(self, where: Path) -> None:
+        self.certificates, self.tls = Certificates(where), free_tls_endpoint()
+        self.plain = free_endpoint()
+        bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
+        self.daemon = Daemon(where, config={"bus": bus}, endpoint=self.plain)
+
+    def own(self, who: Identity) -> str:
+        return str(self.certificates.own(who))
+
+    def tool(self, who: Identity, *words: str) -> Finished:
+        link = ("--connect", self.tls, "--tls", self.own(who))
+        ended = finish(acsard(*words, *link), self.daemon.config.parent)
+        assert "Traceback" not in ended.err, ended.err
+        return ended
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    robot = Robot(tmp_path_factory.mktemp("whoami"))
+    with robot.daemon, Bus(robot.plain) as bus:
+        bus.linked()
+        until(lambda: robot.tool("viewer", "get", "info").code == 0, 10.0, "the door")
+        yield robot
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_each_certificate_is_told_its_role_and_name(robot: Robot, role: Identity) -> None:
+    with connect(robot.tls, tls=robot.own(role)) as client:
+        us = client.whoami()
+        assert (us.role, us.certificate, us.sender) == (role, role, client.sender)
+
+
+def test_without_a_certificate_one_is_what_the_machine_is(robot: Robot) -> None:
+    with connect(robot.plain) as client:
+        us = client.whoami()
+    assert (us.role, us.certificate) == ("maintainer", "")
+
+
+def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
+    ended = robot.tool("viewer", "whoami")
+    assert (ended.code, ended.err) == (0, "")
+    assert "your certificate viewer is viewer: it may follow and stop, not drive" in ended.out
+    assert re.search(r"^sender \S+/\d+/", ended.out, re.M)
+    found = json.loads(robot.tool("operator", "whoami", "--json").out)
+    assert (found["role"], found["certificate"]) == ("operator", "operator")
+
+
+@pytest.mark.slow
+def test_a_certificate_of_no_list_is_told_so_with_77(robot: Robot) -> None:
+    ended = robot.tool("unlisted", "whoami")
+    assert ended.code == 77
+    assert "your certificate unlisted is in no list of [access]" in ended.out
+
+
+@pytest.mark.slow
+def test_a_drive_of_a_viewer_raises_what_his_certificate_may(robot: Robot) -> None:
+    with (
+        connect(robot.tls, tls=robot.own("viewer")) as client,
+        pytest.raises(NotPermittedError, match=r"certificate viewer is viewer: .* not drive"),
+    ):
+        client.drive(0.3, seconds=1.0)
+
+
+async def _drive(robot: Robot) -> None:
+    async with connect_async(robot.tls, tls=robot.own("viewer")) as client:
+        await client.drive(0.3, seconds=1.0)
+
+
+@pytest.mark.slow
+def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
+    import asyncio
+
+    with pytest.raises(NotPermittedError, match="is viewer"):
+        asyncio.run(_drive(robot))
+
+
+def test_the_keyboard_of_a_viewer_is_told_before_a_key_is_pressed(robot: Robot) -> None:
+    link = ["--connect", robot.tls, "--tls", robot.own("viewer")]
+    with Terminal() as terminal:
+        words = [sys.executable, "-c", ON_TERMINAL, "drive", *link]
+        where = robot.daemon.config.parent
+        with Program(
+            words,
+            where,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            assert program.ended(10.0) == 77
+    assert "your certificate viewer is viewer: it may follow and stop, not drive" in program.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "least"),
+    [
+        (("call", "clear"), "operator"),
+        (("call", "set_pose", "0", "0", "0"), "maintainer"),
+        (("get", "config"), "maintainer"),
+    ],
+    ids=["clear", "set_pose", "config"],
+)
+def test_what_a_viewer_may_not_ask_is_told_with_the_role_it_takes(
+    robot: Robot, words: tuple[str, ...], least: str
+) -> None:
+    ended = robot.tool("viewer", *words)
+    assert (ended.code, ended.out) == (77, "")
+    assert "certificate viewer is viewer" in ended.err
+    assert f"for a certificate that is {least}" in ended.err
+
+
+def test_an_operator_drives_over_tls_and_stands_where_it_says(robot: Robot) -> None:
+    with connect(robot.tls, tls=robot.own("operator")) as client:
+        before = client.pose().x
+        client.drive(0.3, seconds=0.5)
+        assert client.pose().x > before + 0.02

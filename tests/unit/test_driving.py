@@ -1,0 +1,256 @@
+"""A drive of the client, step by step in virtual time: it follows `state` and ends by it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+from msgspec.structs import replace
+
+from acsard import driving
+from acsard.driving import DEAD_S, GRACE_S, OPENED_S, SETTLED_S, UnheardError, drive, objection
+from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
+from acsard.messages.encodings import encode, encoding_name
+from acsard.messages.schema import RobotState, SourceState, Time
+
+US, OTHER = "joe/1/aa", "ann/2/bb"
+NEUTRAL = "neutral first: app must send a zero"
+
+
+def source(waits_for: str = "", age: float | None = 0.01, name: str = "app") -> SourceState:
+    return SourceState(name, 50, age, waits_for)
+
+
+FOLLOWED = RobotState(
+    stamp=Time(1), mode="driving", reason="commanded by app", x=0, y=0, yaw=0, linear=0.0,
+    angular=0.0, wheels=[], link="up", source="app", sources=[source()], refused="", counters={},
+    sender=US,
+)  # fmt: skip
+STOPPED = replace(FOLLOWED, mode="stopped", reason="stopped by request", source="")
+OPENING = replace(
+    FOLLOWED, mode="ready", reason=NEUTRAL, source="app", sources=[source(NEUTRAL)], sender=""
+)
+HIGHER = replace(
+    FOLLOWED,
+    source="teleop",
+    reason="commanded by teleop",
+    sources=[source("teleop has the higher priority: until it is silent")],
+)
+
+Says = Callable[[float, float, list[float]], RobotState | None]
+"""What the daemon says at a time, s, with the last command for m/s, and all of them."""
+
+
+class World:
+    """A robot, a clock and a daemon that says its state ten times a second."""
+
+    source, sender = "app", US
+
+    def __init__(self, says: Says) -> None:
+        self.now = 100.0
+        self.sent: list[float] = []
+        self.asked = 0
+        self.subscribed = self.answers = True
+        self.published = True
+        self._says, self._told = says, 100.0
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        self.sent.append(linear)
+
+    def subscribe(self, name: str) -> Any:
+        assert name == "state"
+        return self
+
+    def undeclare(self) -> None:
+        self.subscribed = False
+
+    def try_recv(self) -> Any:
+        if not self.published or self.now < self._told:
+            return None
+        self._told = self.now + 0.1
+        return self._sample()
+
+    def ask(self, name: str, take: Any) -> None:
+        self.asked += 1
+        sample = self._sample()
+        if self.answers and sample is not None:
+            take(sample)
+
+    def _sample(self) -> Any:
+        state = self._says(self.now - 100.0, self.sent[-1] if self.sent else 0.0, self.sent)
+        if state is None:
+            return None
+        payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
+        return SimpleNamespace(encoding=encoding_name("msgpack", "RobotState"), payload=payload)
+
+    def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
+        """How long a drive of 0.5 m/s takes, s."""
+        monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: self.now))
+        robot: Any = self
+        with closing(drive(robot, 0.5, 0.0, seconds)) as steps:
+            for pause in steps:
+                self.now += pause
+        return self.now - 100.0
+
+
+def followed(t: float, last: float, sent: list[float]) -> RobotState:
+    """Neutral is known after 0.3 s; it rolls on for 0.4 s after the last command."""
+    if t < 0.3:
+        return OPENING
+    return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
+
+
+def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    took = world.drive(monkeypatch)
+    first = world.sent.index(0.5)
+    assert set(world.sent[:first]) == {0.0}
+    assert first >= 40
+    assert world.sent.count(0.5) in (20, 21)  # the last may be of a rest of the time
+    assert world.sent[-1] == 0.0
+    assert 1.8 <= took < 2.1
+    assert not world.subscribed
+    assert world.asked == 0
+
+
+def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(followed)
+    world.published = False
+    assert world.drive(monkeypatch) < 2.6
+    assert world.sent.count(0.5) in (20, 21)
+    assert world.asked < 12
+
+
+def test_a_robot_that_something_else_moves_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3))
+    assert 2.3 < world.drive(monkeypatch) < 3.0
+
+
+def test_a_long_ramp_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(lambda t, last, sent: replace(FOLLOWED, linear=max(0.0, 0.5 - t / 20)))
+    assert 9.7 < world.drive(monkeypatch) < 10.2
+
+
+def after(seconds: float, state: RobotState | None) -> Says:
+    return lambda t, last, sent: followed(t, last, sent) if t < seconds else state
+
+
+AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
+    ("stopped", after(0, STOPPED), NotDrivenError, "stopped by request", SETTLED_S, False),
+    ("stopped on the way", after(0.9, STOPPED), NotDrivenError, "by request", 0.9, True),
+    ("in fault", after(0, replace(STOPPED, mode="fault", reason="fault: rear_left wheel is stuck")),
+     NotDrivenError, "rear_left wheel is stuck", SETTLED_S, False),
+    ("switched off", after(0, replace(STOPPED, mode="inactive", reason="switched off")),
+     NotDrivenError, "switched off", SETTLED_S, False),
+    ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), NotDrivenError,
+     "app is not one of commands.sources: nav", SETTLED_S, False),
+    ("no link", after(0, replace(STOPPED, mode="waiting", reason="waiting for the first lines")),
+     NotDrivenError, "first lines", OPENED_S, False),
+    ("link lost", after(1.0, replace(STOPPED, mode="waiting", reason="no line for 0.3 s")),
+     NotDrivenError, "no line", 1.0 + GRACE_S, True),
+    ("unheard", after(0, replace(STOPPED, mode="ready", sources=[source("a command", None)])),
+     UnheardError, "hears no command of source app", OPENED_S, False),
+    ("outranked", after(0, HIGHER), NotDrivenError, "higher priority", OPENED_S, False),
+    ("outranked on the way", after(0.9, HIGHER), NotDrivenError, "higher", 0.9 + GRACE_S, True),
+    ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER, OPENED_S,
+     False),
+    ("dead", after(0, None), NoAnswerError, "no word", DEAD_S, False),
+    ("killed on the way", after(1.0, None), NoAnswerError, "no word", 0.9 + DEAD_S, True),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("says", "error", "words", "took", "moved"),
+    [c[1:] for c in AGAINST],
+    ids=[c[0] for c in AGAINST],
+)
+def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
+    monkeypatch: pytest.MonkeyPatch,
+    says: Says,
+    error: type[Exception],
+    words: str,
+    took: float,
+    moved: bool,
+) -> None:
+    world = World(says)
+    with pytest.raises(error, match=words):
+        world.drive(monkeypatch, 60.0)
+    assert took - 0.02 <= world.now - 100.0 <= took + 0.3
+    assert (0.5 in world.sent) == moved
+    assert world.sent[-1] == 0.0
+    assert not world.subscribed
+
+
+def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    held_up = replace(FOLLOWED, mode="ready", reason="no commands", source="")
+
+    def says(t: float, last: float, sent: list[float]) -> RobotState:
+        return held_up if 0.9 < t < 1.2 else followed(t, last, sent)
+
+    world = World(says)
+    world.drive(monkeypatch)
+    assert world.sent.count(0.5) in (20, 21)
+
+
+def test_a_daemon_of_another_version_is_told_from_a_dead_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    payload = SimpleNamespace(to_bytes=lambda: b"{}")
+    unreadable = SimpleNamespace(encoding="application/json", payload=payload)
+    monkeypatch.setattr(world, "_sample", lambda: unreadable)
+    with pytest.raises(NoAnswerError, match="another version"):
+        world.drive(monkeypatch)
+
+
+def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(followed)
+    monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: world.now))
+    robot: Any = world
+    steps = drive(robot, 0.5, 0.0, 1.0)
+    next(steps)
+
+    def closed() -> None:
+        raise zenoh.ZError("closed")
+
+    monkeypatch.setattr(world, "try_recv", closed)
+    with pytest.raises(NoAnswerError, match="closed"):
+        next(steps)
+
+
+def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
+    world: Any = World(followed)
+    with pytest.raises(UsageError, match="finite"):
+        next(drive(world, float("nan"), 0.0, 1.0))
+    assert world.sent == []
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (FOLLOWED, ""),
+        (replace(FOLLOWED, sender=""), ""),  # of a daemon that does not tell
+        (replace(FOLLOWED, sources=[source("1 more of its senders: the first")]), ""),
+        (replace(FOLLOWED, sender=OTHER), f"another program drives as app, {OTHER}"),
+        (OPENING, NEUTRAL),
+        (HIGHER, "teleop has the higher priority"),
+        (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "hears no command"),
+        (replace(STOPPED, mode="ready", sources=[source("app may be late")]), "may be late"),
+    ],
+)
+def test_the_objection_is_in_the_words_of_the_daemon(state: RobotState, words: str) -> None:
+    found = objection(state, "app", US)
+    assert (
+        found.startswith(words)
+        if words != "may be late" and words != "hears no command"
+        else (words in found)
+    )
+    assert bool(found) == bool(words)

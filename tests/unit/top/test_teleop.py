@@ -1,0 +1,88 @@
+"""What `acsard drive` shows: all of the reason, units, and help that stays, at any width."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.drive.modes import Mode
+from acsard.top.teleop import HELP, NARROWEST, Teleop, line, lines
+from tests.unit.top.screens import STATE
+
+SEEN = Teleop("acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, STATE, 0.1)
+
+LONG = (
+    "teleop may be late: its delays must be steady for 0.25 s if its clock is new here, for 1.5 s "
+    "if that was set; the microcontroller's lines come 0.50 s apart; if it reports by its own "
+    "clock, set mcu.reply_period = 0.50, and look at the cable"
+)
+WIDTHS = (NARROWEST, 57, 80, 118, 160)
+
+
+def of(**what: object) -> Teleop:
+    return replace(SEEN, state=replace(STATE, **what))
+
+
+def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
+    return [text for _, text in lines(seen, width, height)]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_at_every_width_the_reason_is_whole_the_pose_has_units_and_the_help_is_there(
+    width: int,
+) -> None:
+    shown = texts(of(mode="waiting", reason=LONG, x=1.5, y=-2.25, yaw=1.0), width)
+    assert max(map(len, shown)) <= width
+    assert len(shown) < 24
+    words = " ".join(" ".join(shown).split())
+    for told in (LONG, "WAITING", "x +1.500 m", "y -2.250 m", "yaw +57.3°", "m/s", "rad/s"):
+        assert told in words
+    assert shown[-len(HELP) :] == list(HELP)
+
+
+def test_the_screen_does_not_move_while_figures_change() -> None:
+    still = texts(of(x=0.0, y=0.0, yaw=0.0, linear=0.0, angular=0.0), 80)
+    moved = texts(of(x=-123.456, y=99.9, yaw=-3.1, linear=-0.55, angular=1.25), 80)
+    assert [len(one) for one in still] == [len(one) for one in moved]
+
+
+def test_help_stays_on_a_screen_of_few_lines() -> None:
+    shown = texts(of(reason=LONG), 40, 10)
+    assert len(shown) == 10
+    assert shown[-len(HELP) :] == list(HELP)
+
+
+def test_keys_that_do_not_drive_are_told() -> None:
+    why = "app, of the same priority, came first: until it is silent"
+    seen = replace(SEEN, objection=why)
+    assert why in " ".join(" ".join(texts(seen, 40)).split())
+    assert why in line(seen)
+
+
+def test_a_silence_is_told_with_its_length() -> None:
+    for seen in (replace(SEEN, age=7.0), replace(SEEN, state=None, age=7.0)):
+        assert "no word from the daemon for 7 s" in " ".join(texts(seen, 80))
+        assert "no word from the daemon for 7 s" in line(seen)
+    assert "first state" in texts(replace(SEEN, state=None), 80)[1]
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_the_mode_is_said_once(mode: Mode) -> None:
+    seen = of(mode=mode.value, reason=f"{mode.value}: because")
+    assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
+    assert line(seen).startswith(f"{mode.value}: because; ")
+
+
+@given(
+    st.text(max_size=300),
+    st.floats(),
+    st.integers(20, 200),
+    st.integers(1, 60),
+)
+def test_it_holds_whatever_comes(text: str, number: float, width: int, height: int) -> None:
+    seen = of(mode=text[:9], reason=text, x=number, linear=number, yaw=0.0)
+    shown = texts(replace(seen, robot_id=text, objection=text), width, height)
+    assert len(shown) <= height
+    assert all(len(one) <= width and one.isprintable() for one in shown)
