@@ -156,7 +156,7 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_dropped", "wheels_turned", "wheels_doubted", "gyro", "imu_refused",
-    "bus_stuck",
+    "bus_stuck", "router_missing", "router_found",
     "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
@@ -240,6 +240,13 @@ class WheelsStatus(Struct, frozen=True):
     """`left`, `right`: now, or half a second ago."""
     differ: tuple[float, float] = (0.0, 0.0)
     """By which share the front wheel turns more than the rear one, left and right, always."""
+
+
+class RoutersStatus(Struct, frozen=True):
+    """What `bus.connect` names; both are empty where that is."""
+
+    connected: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 class GyroSample(Struct, frozen=True):
@@ -371,3 +378,4 @@ class Snapshot(Struct, frozen=True):
     """Which check the serial lines have, in words."""
     encoders: tuple[int, ...] = ()
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
+    routers: RoutersStatus = RoutersStatus()
