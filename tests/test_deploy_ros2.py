@@ -462,3 +462,17 @@ def test_the_toml_of_the_readme_is_accepted() -> None:
             known = {field.name for field in msgspec.structs.fields(kind)}
             assert set(values) <= known
             msgspec.convert(values, kind)
+
+
+def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
+    """Without, the bridge shows nothing of a robot that has one, and over the network each has."""
+    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", (FILES / "README.md").read_text(), re.M)
+    assert lines
+    assert all(" -n /robot1" in line for line in lines)
+
+
+def test_drive_py_begins_and_ends_with_zeros() -> None:
+    """By a bridge a zero counts a second after the last speed, so they go on for longer."""
+    text = (FILES / "drive.py").read_text()
+    (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
+    assert float(zeros) > CONFIG.commands.pause + min(TIMEOUTS)
