@@ -6,7 +6,6 @@ Zenoh connects again by itself and says nothing of it; nobody would know that a 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable
 from threading import Event, Thread
 
 import zenoh
@@ -58,40 +57,38 @@ class Links:
                 self._status, self._news = status, True
 
     def _look(self) -> RoutersStatus:
-        info, endpoints = self._session.info, self._bus.connect
+        endpoints = self._bus.connect
         try:
-            ends = {str(link.dst) for link in info.links()}
-            routers = len(info.routers_zid())
+            ends = {str(link.dst) for link in self._session.info.links()}
         except zenoh.ZError:  # it is being closed
             return self._status or RoutersStatus()
-        missing = unreached(self._bus.mode, endpoints, ends, routers)
+        missing = unreached(self._bus.mode, endpoints, ends)
         return RoutersStatus(tuple(one for one in endpoints if one not in missing), missing)
 
 
-def unreached(
-    mode: str, endpoints: tuple[str, ...], ends: Iterable[str], routers: int
-) -> tuple[str, ...]:
-    """Which endpoints no link leads to, by the far `ends` of the links and the number of routers.
+def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
+    """Which endpoints no link leads to, by the far `ends` of the links.
 
-    A client has one link only: with that none is missing. Names are looked up, which may block.
+    A client has one link only: with that none is missing. Who has dialled us (the door, a bridge, a
+    ROS node) has a port of its own there. Names are looked up, which may block.
     """
     if mode == "client":
-        return () if routers or ends else endpoints
-    if routers >= len(endpoints):
-        return ()
-    ends = set(ends)
-    return tuple(one for one in endpoints if not ends & _places(one))
+        return () if ends else endpoints
+    return tuple(one for one in endpoints if not _leads_there(one, ends))
 
 
-def _places(endpoint: str) -> set[str]:
-    """The endpoint as Zenoh has it of a link: with an address for a name."""
-    protocol, _, place = endpoint.partition("?")[0].partition("#")[0].partition("/")
+def _leads_there(endpoint: str, ends: set[str]) -> bool:
+    """Zenoh has addresses of its links where the configuration may have names."""
+    bare = endpoint.partition("?")[0].partition("#")[0]
+    protocol, _, place = bare.partition("/")
     host, _, port = place.rpartition(":")
+    if bare in ends:
+        return True
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
-    except (OSError, ValueError):
-        return {f"{protocol}/{place}"}
+    except (OSError, ValueError):  # its name is lost, which does not end a link
+        return bool(port) and any(
+            end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
+        )
     hosts = (str(one[4][0]) for one in found)
-    return {
-        f"{protocol}/[{one}]:{port}" if ":" in one else f"{protocol}/{one}:{port}" for one in hosts
-    }
+    return any(f"{protocol}/{f'[{one}]' if ':' in one else one}:{port}" in ends for one in hosts)
