@@ -117,6 +117,8 @@ class Command(Struct, frozen=True):
     """Its number among those of its sender: none is missing unless it was sent and lost."""
     shared: bool = False
     """Several programs may look like this sender: it came by a bridge."""
+    ros: bool = False
+    """It came from ROS, whose tools send no zero by themselves."""
     stamp_replaced: bool = False
     """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
 
@@ -160,12 +162,12 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_dropped", "wheels_turned", "wheels_doubted", "gyro", "imu_refused",
-    "bus_stuck",
+    "bus_stuck", "router_missing", "router_found",
     "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
-    "mode", "commander", "command_refused", "fault",
+    "mode", "commander", "kept_waiting", "command_refused", "fault",
 ]  # fmt: skip
 """All that the log can be asked for; `deploy/systemd/README.md` says what each means."""
 
@@ -208,13 +210,20 @@ class Estimate(Struct, frozen=True):
 class Wait(Struct, frozen=True):
     """What a source waits for, and what `drive/words.py` needs to say it."""
 
-    what: Literal["nothing", "command", "proof", "neutral", "higher", "equal", "senders"]
+    what: Literal["nothing", "command", "proof", "neutral", "zeros", "higher", "equal", "senders"]
     source: str = ""
-    """Who must be neutral or prove its clock; of higher or equal priority, who has the robot."""
+    """Who must be neutral or prove its clock; who sends nothing but zeros; of higher or equal
+    priority, who has the robot."""
     seconds: float = 0.0
     """s of silence that are neutral, or of steady delays that are a proof."""
     senders: int = 0
     """How many wait while another sender of the same source is followed."""
+    lasts: float = 0.0
+    """s that it has lasted at the least, one of a few: it must not change each step."""
+    kept: str = ""
+    """The source that sends speeds meanwhile and is kept waiting."""
+    ros: bool = False
+    """Who must be neutral sends from ROS."""
 
 
 class SourceStatus(Struct, frozen=True):
@@ -237,6 +246,13 @@ class WheelsStatus(Struct, frozen=True):
     """`left`, `right`: now, or half a second ago."""
     differ: tuple[float, float] = (0.0, 0.0)
     """By which share the front wheel turns more than the rear one, left and right, always."""
+
+
+class RoutersStatus(Struct, frozen=True):
+    """What `bus.connect` names; both are empty where that is."""
+
+    connected: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 class GyroSample(Struct, frozen=True):
@@ -370,3 +386,4 @@ class Snapshot(Struct, frozen=True):
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
     sender: str = ""
     """Whose command counts, of the senders of one source; "" when nobody's does."""
+    routers: RoutersStatus = RoutersStatus()

@@ -114,7 +114,7 @@ CALIBRATE = "tests/unit/cli/test_calibrate.py"
 CLIENTS = "tests/system/test_languages.py"
 GUIDED = "tests/system/test_calibrate.py"
 
-NO_ROS = Shown("needs ROS 2; the page says that it was not tried")
+NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
 TWO_MACHINES = Shown("needs a second machine")
 BY_ROOT = Shown("makes places for a user of the system that only zenohd's package has")
 PYTEST = Collected()
@@ -263,6 +263,12 @@ COMMANDS: dict[str, How] = {
         "tests/system/test_ros_bridge.py",
         "test_the_real_bridge_carries_odometry_commands_transforms_and_services",
         "only where that program is on the PATH",
+    ),
+    f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE} -e tcp/ROBOT:7448 -n /robot1": TWO_MACHINES,
+    "python3 deploy/ros2/drive.py 0.2 0.0 3": Elsewhere(
+        "tests/system/test_ros_drive.py",
+        "test_the_line_of_the_pages_drives",
+        "by stand-ins for rclpy and the messages",
     ),
     f"{_RMW_ROUTER} ros2 run rmw_zenoh_cpp rmw_zenohd": NO_ROS,
     "ssh -N -L 7448:127.0.0.1:7448 USER@ROBOT": TWO_MACHINES,

@@ -307,11 +307,8 @@ def test_the_launch_file_has_its_arguments_and_no_broadcaster() -> None:
     assert "joint_state_broadcaster" not in texts
 
 
-@pytest.mark.parametrize(("namespace", "prefix"), [("", ""), ("robot1", "/robot1")])
-def test_the_launch_file_puts_the_namespace_before_every_topic(
-    namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Run with stand-ins for `launch` and `launch_ros`, which come with ROS only."""
+def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
+    """The nodes, by executable; run with stand-ins for `launch` and `launch_ros` of ROS."""
     modules = ("launch", "launch.actions", "launch.conditions", "launch.substitutions")
     for module in (*modules, "launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, module, MagicMock())
@@ -325,21 +322,58 @@ def test_the_launch_file_puts_the_namespace_before_every_topic(
     )
     launch = runpy.run_path(str(FILES / "acsar.launch.py"))
     launch["generate_launch_description"]()
-    nodes = {node["executable"]: node for node in launch["nodes"](MagicMock())}
+    return {node["executable"]: node for node in launch["nodes"](MagicMock())}
+
+
+def hardware(nodes: dict[str, dict[str, Any]]) -> dict[str | None, str | None]:
+    """The parameters of the hardware plugin in the description that is published."""
+    text = nodes["robot_state_publisher"]["parameters"][0]["robot_description"]
+    return {p.get("name"): p.text for p in ET.fromstring(text).findall("ros2_control//param")}
+
+
+def resolved(topic: str, namespace: str, remappings: list[tuple[str, str]]) -> str:
+    """What ROS makes of a topic in a process with these remappings: they hold for every node."""
+
+    def full(name: str) -> str:
+        return name if name.startswith("/") else f"{namespace and '/' + namespace}/{name}"
+
+    return next((full(to) for name, to in remappings if full(name) == full(topic)), full(topic))
+
+
+SPACES = pytest.mark.parametrize(("namespace", "prefix"), [("", ""), ("robot1", "/robot1")])
+
+
+@SPACES
+def test_the_launch_file_puts_the_namespace_before_every_topic(
+    namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes = launched(namespace, monkeypatch)
     assert set(nodes) == {"robot_state_publisher", "ros2_control_node", "spawner", "rviz2"}
     assert {node["namespace"] for node in nodes.values()} == {namespace}
     assert {name for name, node in nodes.items() if "condition" not in node} == {
         "robot_state_publisher"
     }
-    description = ET.fromstring(
-        nodes["robot_state_publisher"]["parameters"][0]["robot_description"]
-    )
-    parameters = {p.get("name"): p.text for p in description.findall("ros2_control//param")}
+    parameters = hardware(nodes)
     assert parameters["joint_commands_topic"] == f"{prefix}/joint_commands"
     assert parameters["joint_states_topic"] == f"{prefix}/joint_states"
     remappings = nodes["spawner"]["arguments"][-1]
     assert f"~/cmd_vel:={prefix}/cmd_vel" in remappings
     assert f"~/odom:={prefix}/odom" not in remappings
+
+
+@SPACES
+def test_the_hardware_of_ros2_control_hears_and_commands_the_robot(
+    namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It lives in the process of ros2_control_node, and the remappings of that are its own."""
+    nodes = launched(namespace, monkeypatch)
+    manager, parameters = nodes["ros2_control_node"], hardware(nodes)
+    ours = {f"{prefix}/{row.name}": row.direction for row in ros_names(RosConfig())}
+    for parameter, direction in (("joint_states_topic", "out"), ("joint_commands_topic", "in")):
+        topic = resolved(str(parameters[parameter]), namespace, manager["remappings"])
+        assert ours.get(topic) == direction, topic
+    for topic in ("/tf", "/tf_static"):
+        assert resolved(topic, namespace, manager["remappings"]) == f"{prefix}{topic}"
 
 
 # acsar.rviz
@@ -428,3 +462,17 @@ def test_the_toml_of_the_readme_is_accepted() -> None:
             known = {field.name for field in msgspec.structs.fields(kind)}
             assert set(values) <= known
             msgspec.convert(values, kind)
+
+
+def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
+    """Without, the bridge shows nothing of a robot that has one, and over the network each has."""
+    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", (FILES / "README.md").read_text(), re.M)
+    assert lines
+    assert all(" -n /robot1" in line for line in lines)
+
+
+def test_drive_py_begins_and_ends_with_zeros() -> None:
+    """By a bridge a zero counts a second after the last speed, so they go on for longer."""
+    text = (FILES / "drive.py").read_text()
+    (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
+    assert float(zeros) > CONFIG.commands.pause + min(TIMEOUTS)

@@ -13,6 +13,7 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.bus.inbox import Inbox
+from acsard.bus.links import Links
 from acsard.bus.outlets import Outlets, direct
 from acsard.bus.replies import Replies
 from acsard.bus.session import daemon_session
@@ -61,7 +62,7 @@ class ZenohBus:
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
         self._inbox = Inbox(prefix, self._replies, sources, waker)
-        self._outlets = Outlets()
+        self._outlets, self._links = Outlets(), Links(bus)
         self._session: zenoh.Session
         self._kept: list[object] = []
         """Declared entities: Zenoh undeclares what is no longer referred to."""
@@ -76,6 +77,9 @@ class ZenohBus:
     def take(self, queries: int) -> BusInput:
         """What came in since the last call, at most so many queries."""
         got = self._inbox.take(queries)
+        routers = self._links.news()
+        if routers is not None:
+            got = replace(got, routers=routers)
         if not self._outlets.behind:
             return got
         dropped, stuck = self._outlets.losses(clock.mono_ns())
@@ -124,6 +128,7 @@ class ZenohBus:
         for token in (self._alive, *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
         self._outlets.start()
+        self._links.start(session)
         return session
 
     def _declare_native(self, session: zenoh.Session) -> None:
@@ -186,6 +191,7 @@ class ZenohBus:
 
     def _close(self) -> None:
         self._outlets.stop(CLOSE_TIMEOUT_S)
+        self._links.stop()
         self._session.close()
 
 

@@ -9,9 +9,10 @@ from acsard.bus.address import address_of
 from acsard.bus.session import reachable
 from acsard.client import connect
 from acsard.config.settings import Config
-from acsard.doctor.finding import Finding, Level
+from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.drive.gyro import WORDS
 from acsard.host import clock
+from acsard.messages.schema import DiagnosticStatus
 from acsard.values import NS_PER_S, AcsardError
 
 APART_S = 0.4
@@ -26,12 +27,20 @@ GYRO_MENDS = {
 }
 """By what `state` says of the gyro; nothing where all is well."""
 
+ROUTER = "acsard: router"
+"""The row of its diagnostics."""
+
 SIGN = "commands signed as the README says need no common clock"
 
 
+START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
+
+
 def routers(config: Config) -> Iterator[Finding]:
-    """Whom does it lend its rights to?"""
+    """Are they there, and whom does it lend its rights to?"""
     for endpoint in config.bus.connect:
+        if not _answers(endpoint):
+            yield Finding("router", "warning", f"nobody listens at {endpoint}", START_ROUTER)
         if endpoint.startswith("tls/"):
             continue
         text = f"connects to {endpoint}: everyone behind that router has the rights of this machine"
@@ -42,12 +51,18 @@ def daemon(config: Config) -> Iterator[Finding]:
     """Is there a daemon, and what does it say?"""
     endpoint, _, tls = address_of(config)
     if not _answers(endpoint):
+        if config.bus.mode == "client":
+            text = f"cannot be asked: the router at {endpoint}, by which it is reached, is missing"
+            yield Finding(
+                "daemon", "warning", text, "the router first; see `systemctl status acsard`"
+            )
+            return
         mend = "systemctl status acsard; or start it: acsard run"
         yield Finding("daemon", "warning", f"nobody listens at {endpoint}", mend)
         return
     try:
         with connect(endpoint, robot_id=config.robot.id, tls=tls) as robot:
-            state = robot.get("state")
+            state, rows = robot.get("state"), robot.get("diagnostics").status
     except AcsardError as error:
         yield Finding("daemon", "failure", str(error), "is another program on that port?")
         return
@@ -56,6 +71,7 @@ def daemon(config: Config) -> Iterator[Finding]:
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
     yield from gyro(state.gyro, state.counters)
+    yield from linked({row.name: row for row in rows})
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"
         yield Finding("door", "warning", text, "take his certificate from [access], or his program")
@@ -90,6 +106,14 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
         mend = "the log says by whom (imu_refused); one gyro, rad/s, z up, finite values"
         yield Finding("gyro", "warning", f"samples on imu that did not count: {told}", mend)
+
+
+def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
+    """Is it connected to its routers, as its diagnostics say? Nothing where it has none."""
+    row = rows.get(ROUTER)
+    if row is not None:
+        mend = START_ROUTER if row.level else ""
+        yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 
 def door(config: Config) -> Iterator[Finding]:

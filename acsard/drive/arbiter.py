@@ -3,8 +3,9 @@
 The rules (SAFETY): the live source of the highest priority is heard; among equals the one who
 came first keeps the robot until it falls silent, and so among the senders of one source; a source
 that may not drive yet (`neutral.py`) holds its place with zero, so that nobody below it drives
-past it. Every refusal has a name to be counted under; `words.py` says it and all else in words.
-Source, sender, clock: see `values.Command`.
+past it. So does one that sends zeros, however long: a person who holds the robot still and a
+controller that has failed look the same. But it is told. Every refusal has a name to be counted
+under; `words.py` says it and all else in words. Source, sender, clock: see `values.Command`.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from msgspec import Struct
 from acsard.config.settings import CommandsConfig, Source
 from acsard.drive.freshness import LONGEST_PROOF_NS, Freshness
 from acsard.drive.neutral import Sender, State
-from acsard.values import NS_PER_S, Command, SourceStatus, Twist, Wait
+from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
 """Senders remembered of one source; nobody pushes out one that is live and may drive."""
 
 Objection = Literal["", "unknown_source", "not_finite", "crowded", "unproven", "stale"]
 """What a command is refused for; "" when it counts."""
+
+LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
+"""s after which it is said that somebody holds the robot still, or waits, for so long."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -165,8 +169,21 @@ class Arbiter:
         source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
         self._holder = source
         if sender.state != "free":
-            return Choice(source.name, None, source.neutral)
-        return Choice(source.name, sender.twist, NOTHING, sender.arrived_ns, sender.name)
+            lasts = _lasts(now_ns - sender.came_ns)
+            wait = Wait("neutral", source.name, source.neutral.seconds, lasts=lasts, ros=sender.ros)
+            return Choice(source.name, None, wait, sender=sender.name)
+        wait = NOTHING
+        if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
+            wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
+        return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
+
+    def _kept(self, holder: _Source, now_ns: int) -> str:
+        """Who sends speeds while the holder sends zeros, "" for nobody."""
+        for source in self._ranking:
+            senders = source.live(now_ns)[source is holder :]
+            if any(sender.twist != REST for sender in senders):
+                return f"another sender of {source.name}" if source is holder else source.name
+        return ""
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
         """What each source is doing and waiting for, highest priority first."""
@@ -186,3 +203,8 @@ class Arbiter:
         if holder is None or source is holder:
             return Wait("senders", senders=len(live) - 1) if len(live) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
+
+
+def _lasts(ns: int) -> float:
+    """The largest of `LASTING_S` that this is; 0.0 for none."""
+    return max((seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S), default=0.0)

@@ -48,6 +48,10 @@ class Sender:
         """Its last command that counted, since neutral was last required."""
         self.came_ns = 0
         """First command since it was last silent: who came first."""
+        self.zeros_ns: int | None = None
+        """First of the zeros that it has sent without a speed since; None when it sent one."""
+        self.ros = False
+        """It sends from ROS."""
         self.noticed_ns = 0
         """Last sign of it, whether that counted or not."""
         self.doubted_ns: int | None = None
@@ -99,8 +103,14 @@ class Sender:
         if not counts:
             self.doubted_ns = now_ns
             return
-        if not self.live(now_ns):
+        live = self.live(now_ns)
+        if not live:
             self.came_ns = now_ns
+        if not is_zero(command):
+            self.zeros_ns = None
+        elif self.zeros_ns is None or not live:
+            self.zeros_ns = now_ns
+        self.ros = command.ros
         self._sure, self.name = self.state, command.sender
         self.twist, self.arrived_ns, self.doubted_ns = command.twist, now_ns, None
 

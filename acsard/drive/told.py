@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from acsard.drive.arbiter import Choice
 from acsard.drive.modes import Mode
-from acsard.drive.words import chosen
+from acsard.drive.words import chosen, waiting
 from acsard.values import Event, Refusal
 
 MAX_SENDER = 40
@@ -28,6 +28,8 @@ class Told:
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
+        self._kept = ""
+        """Who sends speeds in vain, as far as that has been told."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
         """Another mode, and `why`; another commander than the last, however long ago that was."""
@@ -41,7 +43,20 @@ class Told:
         if self._commander != last:
             by = _name(self._commander)
             events.append(Event("commander", "", by=by, kind=f"{_name(last)} -> {by}"))
-        return events
+        return events + self._kept_waiting(mode, choice)
+
+    def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
+        """Somebody sends speeds that do not move the robot, and that lasts: told once."""
+        wait, kept = choice.wait, ""
+        if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
+            self._kept = ""
+        elif wait.lasts:
+            kept = wait.source if wait.what == "neutral" else wait.kept
+        if not kept or kept == self._kept:
+            return []
+        self._kept = kept
+        by = _name((choice.source, choice.sender))
+        return [Event("kept_waiting", waiting(wait), "warning", by, kept)]
 
 
 def _name(commander: tuple[str, str]) -> str:

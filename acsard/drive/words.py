@@ -16,6 +16,11 @@ REFUSED = {
 """What a command is refused for."""
 
 
+ROS_NEVER = (
+    ' (`ros2 topic pub` of a speed never does that: "Drive" in deploy/ros2/README.md has what does)'
+)
+
+
 def chosen(choice: Choice) -> str:
     """Whose command is followed, or why nobody's is."""
     if choice.wait.what == "command":
@@ -36,13 +41,26 @@ def waiting(wait: Wait) -> str:
                 "its clock is new here, for 1.5 s if that was set"
             )
         case "neutral":
+            lasts = f", and sends speeds for over {_long(wait.lasts)}" if wait.lasts else ""
             return (
                 f"neutral first: {wait.source} must send a zero, or pause for "
-                f"{wait.seconds:g} s, before it can drive"
+                f"{wait.seconds:g} s, before it can drive{lasts}{ROS_NEVER if wait.ros else ''}"
             )
+        case "zeros":
+            kept = f"; {wait.kept} sends speeds and is kept waiting" if wait.kept else ""
+            zeros = f"nothing but zeros for over {_long(wait.lasts)}"
+            return f"held by {wait.source}, which sends {zeros}{kept}"
         case "higher":
             return f"{wait.source} has the higher priority: until it is silent"
         case "equal":
             return f"{wait.source}, of the same priority, came first: until it is silent"
         case "senders":
             return f"{wait.senders} more of its senders: the first until it is silent"
+
+
+def _long(seconds: float) -> str:
+    """A time to the unit that people would say it in."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:g} {unit}"
+    return f"{seconds:g} s"

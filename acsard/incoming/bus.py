@@ -10,6 +10,7 @@ from msgspec import Struct
 from acsard.incoming.commands import Arrival
 from acsard.incoming.queries import Query, Reply
 from acsard.messages.schema import Message
+from acsard.values import RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
@@ -23,6 +24,8 @@ class BusInput(Struct, frozen=True):
     """Messages of ours dropped because the bus did not take them in time."""
     stuck: bool = False
     """The bus has just been found not to take them at all."""
+    routers: RoutersStatus | None = None
+    """What is connected of `bus.connect`, if that has changed."""
 
 
 NOTHING = BusInput()

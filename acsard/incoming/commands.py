@@ -110,6 +110,7 @@ class Receiver:
             cancelled,
             said.sequence,
             shared=arrival.via == "bridge" and not said.signed,
+            ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
         )
 

@@ -47,6 +47,7 @@ from acsard.values import (
     GyroStatus,
     Instant,
     Outputs,
+    RoutersStatus,
     Snapshot,
     WheelsStatus,
 )
@@ -278,6 +279,7 @@ class Report:
             ),
             ("wheels", *_wheels(snapshot.doubt, counters)),
             *self._gyro(snapshot.gyro),
+            *_routers(snapshot.routers),
             *([("certificate", *certificate, {})] if certificate[1] else []),
         )
         return DiagnosticArray(
@@ -299,6 +301,14 @@ def _found(encoders: tuple[int, ...]) -> dict[str, str]:
     """What the serial link's row says of the encoders: nothing, where nothing was found."""
     named = zip(WHEELS, encoders, strict=False)
     return {f"counts_{name}": str(counts) for name, counts in named if counts}
+
+
+def _routers(routers: RoutersStatus) -> list[tuple[str, int, str, dict[str, str]]]:
+    """The row of what `bus.connect` names, none where it names nothing."""
+    missing, connected = routers.missing, routers.connected
+    values = dict.fromkeys(connected, "connected") | dict.fromkeys(missing, "not connected")
+    words = f"not connected to {', '.join(missing)}" if missing else "connected"
+    return [("router", int(bool(missing)), words, values)] if values else []
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> tuple[int, str, dict[str, str]]:

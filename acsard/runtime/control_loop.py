@@ -20,6 +20,7 @@ from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import Queries
+from acsard.incoming.routers import RoutersTold
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
@@ -90,6 +91,7 @@ class ControlLoop:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
+        self._routers = RoutersTold()
         self._turn_rates: list[GyroSample] = []
         """What a gyro said since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
@@ -173,6 +175,8 @@ class ControlLoop:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
             self.robot.counters["bus_dropped"] += got.dropped
+        if got.routers is not None:
+            self._routers.hear(got.routers, self.robot.counters, self._others)
         if got.stuck:
             self.robot.counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)
@@ -261,4 +265,5 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        return replace(self.robot.snapshot(now_ns), figures=self._stopwatch.measured(now_ns))
+        figures, routers = self._stopwatch.measured(now_ns), self._routers.status
+        return replace(self.robot.snapshot(now_ns), figures=figures, routers=routers)

@@ -64,13 +64,15 @@ def nodes(context: LaunchContext) -> list[Node]:
             remappings=TF,
             output="both",
         ),
-        # Takes the URDF from the topic robot_description, as it does since Jazzy.
+        # Takes the URDF from the topic robot_description, as it does since Jazzy. The hardware's
+        # node lives in this process, and what is remapped here is remapped for it too: never
+        # joint_states, from which it has the wheels.
         Node(
             package="controller_manager",
             executable="ros2_control_node",
             namespace=namespace,
             parameters=[str(CONTROLLERS)],
-            remappings=[*TF, ("joint_states", "ros2_control/joint_states")],
+            remappings=TF,
             output="both",
             condition=with_control,
         ),

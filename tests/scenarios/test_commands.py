@@ -12,7 +12,7 @@ from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import Attachment
 from acsard.values import NS_PER_S
-from tests.scenarios.speakers import Speaker
+from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
 
 
@@ -224,6 +224,49 @@ def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> N
     world.run(0.5)
     ahead.open()
     assert world.state.counters["stamps_replaced"] == 40
+
+
+def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(world: World) -> None:
+    """What ros2_control's hardware sends for ever, while Nav2 goes on."""
+    world.send(0.0, source="nav")
+    world.send(0.0, source="ros2_control")
+    world.run(0.3)
+    world.drive(0.3, seconds=1.0, source="nav")
+    for second in range(1, 13):
+        for _ in range(20):
+            world.send(0.0, source="ros2_control")
+            world.send(0.3, source="nav")
+            world.run(0.05)
+        assert ("held by ros2_control" in world.state.reason) == (second >= 3)
+    assert world.state.linear == 0.0  # it may be a person that holds it: nobody drives past
+    assert world.state.reason == (
+        "driving: held by ros2_control, which sends nothing but zeros for over 10 s; nav sends "
+        "speeds and is kept waiting"
+    )
+    (told,) = [event.text for event in world.events if event.name == "kept_waiting"]
+    assert "held by ros2_control" in told
+    assert "nav sends speeds" in told
+    world.run(0.3)
+    world.drive(0.3, seconds=0.5, source="nav")
+    assert world.state.reason == "driving: commanded by nav"
+    assert world.state.linear > 0.0
+
+
+@pytest.mark.parametrize("way", ["rmw", "bridge"])
+def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way) -> None:
+    """`ros2 topic pub -r 10 /cmd_vel`: a speed from the first message on."""
+    Speaker(world, way).hold(0.5, 5.0, hz=10.0)
+    assert world.state.x == 0.0
+    assert "neutral first: app must send a zero" in world.state.reason
+    assert "`ros2 topic pub` of a speed never does" in world.state.reason
+    (told,) = [event for event in world.events if event.name == "kept_waiting"]
+    assert told.text == f"app: {world.state.reason}"
+
+
+def test_who_is_not_of_ros_is_not_told_of_its_tools(world: World) -> None:
+    Speaker(world, "signed").hold(0.5, 5.0)
+    assert "neutral first" in world.state.reason
+    assert "ros2" not in world.state.reason
 
 
 def test_the_wall_clock_may_step_without_changing_the_path() -> None:

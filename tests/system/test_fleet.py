@@ -469,6 +469,12 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
     two.at_rest()
 
 
+def test_robots_say_that_their_router_is_there_by_whatever_name(fleet: Fleet) -> None:
+    for daemon in fleet.daemons:
+        until(partial(daemon.events, "router_found"), 5.0, "it is told")
+        assert daemon.events("router_missing") == []
+
+
 def test_a_second_robot_with_the_same_id_ends_at_once(fleet: Fleet) -> None:
     with fleet.robot("robot1", "twin", ready=False) as twin:
         assert twin.ended(10.0) == Exit.IN_USE

@@ -8,7 +8,7 @@ import pytest
 
 from acsard.config.settings import Source
 from acsard.drive.arbiter import Choice
-from acsard.values import REST, SourceStatus, Twist, Wait
+from acsard.values import REST, Command, SourceStatus, Twist, Wait
 from tests.unit.drive.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
 
 # one source
@@ -424,6 +424,67 @@ def test_the_crowd_of_one_source_is_none_of_another() -> None:
         bench.send(HIGH, REST, f"stranger {number}")
     bench.wait(300).send(LOW, GO, "a")
     assert bench.driver() == "low"
+
+
+# what does not move the robot, and lasts
+
+
+def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
+    """Send that ten times a second, for so long; what is said then."""
+    for _ in range(round(10 * seconds)):
+        bench.wait(100).send(source, twist)
+    return bench.choice().wait
+
+
+def test_zeros_alone_hold_the_robot_and_that_is_said_after_a_while() -> None:
+    bench = Bench(HIGH)
+    assert held(bench, HIGH, 3.0) == Wait("nothing")
+    assert held(bench, HIGH, 0.2) == Wait("zeros", "high", lasts=3.0)
+    assert bench.choice().twist == REST
+    assert held(bench, HIGH, 60.0) == Wait("zeros", "high", lasts=60.0)
+    assert bench.status(HIGH).waits_for == Wait("nothing")
+
+
+def test_a_speed_among_the_zeros_or_silence_begins_anew() -> None:
+    bench = Bench(HIGH)
+    held(bench, HIGH, 5.0)
+    bench.wait(100).send(HIGH, GO)
+    assert bench.choice().wait == Wait("nothing")
+    assert held(bench, HIGH, 2.9) == Wait("nothing")
+    bench.wait(300)
+    assert held(bench, HIGH, 2.9) == Wait("nothing")
+    assert held(bench, HIGH, 0.3).what == "zeros"
+
+
+def test_wheels_that_cancel_out_are_no_zeros() -> None:
+    bench = Bench(HIGH)
+    for _ in range(40):
+        command = Command("high", REST, bench.wait(100).now_ns, cancelled=True)
+        assert bench.arbiter.accept(command) == ""
+    assert bench.choice().wait == Wait("nothing")
+
+
+def test_zeros_keep_a_lower_source_waiting_for_ever_and_say_whom() -> None:
+    bench = Bench(HIGH, LOW)
+    for _ in range(100):
+        bench.wait(100).send(HIGH, REST)
+        bench.send(LOW, GO)
+    assert bench.driver() == "high"
+    assert bench.choice().wait == Wait("zeros", "high", lasts=3.0, kept="low")
+
+
+def test_zeros_keep_another_sender_of_the_same_source_waiting_and_say_so() -> None:
+    bench = Bench(HIGH)
+    for _ in range(50):
+        bench.wait(100).send(HIGH, REST, "a")
+        bench.send(HIGH, GO, "b")
+    assert bench.choice().wait.kept == "another sender of high"
+
+
+def test_who_must_be_neutral_and_sends_on_is_told_that_it_lasts() -> None:
+    bench = Bench(HIGH, armed=False)
+    assert held(bench, HIGH, 3.0, GO) == Wait("neutral", "high", 1.0)
+    assert held(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
 
 
 # what state shows

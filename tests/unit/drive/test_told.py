@@ -55,6 +55,41 @@ def test_who_sends_to_a_stopped_robot_commands_nothing() -> None:
     assert told.changes(Mode.STOPPED, choice, "stopped") == []
 
 
+def test_who_sends_speeds_that_must_wait_is_told_once_it_lasts() -> None:
+    told = Told(Mode.READY)
+    early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
+    assert told.changes(Mode.READY, early, "") == []
+    late = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0, ros=True), sender="joe")
+    (event,) = told.changes(Mode.READY, late, "")
+    assert (event.name, event.level, event.by) == ("kept_waiting", "warning", "nav (joe)")
+    assert "ros2 topic pub" in event.text
+    later = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=10.0, ros=True), sender="joe")
+    assert told.changes(Mode.READY, later, "") == []
+    told.changes(Mode.READY, NOBODY, "")
+    assert len(told.changes(Mode.READY, late, "")) == 1
+
+
+def test_who_is_held_up_by_zeros_is_told_once_however_often_he_pauses() -> None:
+    told = Told(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+
+    def zeros(kept: str) -> list[Event]:
+        choice = Choice("app", REST, Wait("zeros", "app", lasts=3.0, kept=kept), 1, "joe")
+        return told.changes(Mode.DRIVING, choice, "")
+
+    assert zeros("") == []
+    (event,) = zeros("nav")
+    assert (event.name, event.by, event.kind) == ("kept_waiting", "app (joe)", "nav")
+    assert event.text.startswith("held by app, which sends nothing but zeros for over 3 s; nav")
+    assert zeros("") + zeros("nav") == []
+    assert [event.kind for event in zeros("teleop")] == ["teleop"]
+
+
+def test_who_sends_to_a_stopped_robot_is_not_told_to_wait() -> None:
+    choice = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0), sender="joe")
+    assert Told(Mode.STOPPED).changes(Mode.STOPPED, choice, "stopped") == []
+
+
 def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
     event = refused(Refusal("stale", "source app: late", "app", "joe" * 100))
     assert event == Event(

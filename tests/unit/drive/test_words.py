@@ -22,6 +22,19 @@ SENTENCES = [
         "neutral first: high must send a zero, or pause for 0.5 s, before it can drive",
     ),
     (
+        Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
+        "neutral first: nav must send a zero, or pause for 1 s, before it can drive, and sends "
+        'speeds for over 3 s (`ros2 topic pub` of a speed never does that: "Drive" in '
+        "deploy/ros2/README.md has what does)",
+    ),
+    (Wait("zeros", "app", lasts=3.0), "held by app, which sends nothing but zeros for over 3 s"),
+    (
+        Wait("zeros", "ros2_control", lasts=600.0, kept="nav"),
+        "held by ros2_control, which sends nothing but zeros for over 10 min; nav sends speeds "
+        "and is kept waiting",
+    ),
+    (Wait("zeros", "app", lasts=3600.0), "held by app, which sends nothing but zeros for over 1 h"),
+    (
         Wait("proof", "high", 0.25),
         "high may be late: its delays must be steady for 0.25 s if its clock is new here, for "
         "1.5 s if that was set",

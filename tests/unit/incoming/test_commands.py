@@ -665,7 +665,7 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
     gid = GID.hex()
     assert command == Command(
-        "nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, gid, gid, sequence=1, shared=False
+        "nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, gid, gid, sequence=1, ros=True
     )
 
 

@@ -44,7 +44,16 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.messages.topics import PUBLISHED
-from acsard.values import Estimate, GyroDoes, GyroStatus, Instant, Outputs, Snapshot, WheelsStatus
+from acsard.values import (
+    Estimate,
+    GyroDoes,
+    GyroStatus,
+    Instant,
+    Outputs,
+    RoutersStatus,
+    Snapshot,
+    WheelsStatus,
+)
 from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
@@ -428,6 +437,33 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
         "command_stale": "3",
     }
     assert status("commands", source="").message == "no commands"
+
+
+@pytest.mark.parametrize(
+    ("routers", "level", "message", "shown"),
+    [
+        (RoutersStatus(("a",)), 0, "connected", {"a": "connected"}),
+        (
+            RoutersStatus(("a",), ("b",)),
+            1,
+            "not connected to b",
+            {"a": "connected", "b": "not connected"},
+        ),
+    ],
+)
+def test_a_router_that_is_missing_is_a_warning(
+    routers: RoutersStatus, level: int, message: str, shown: dict[str, str]
+) -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, ALL, look))
+    array = report.current("diagnostics", lambda: replace(SNAPSHOT, routers=routers))
+    assert isinstance(array, DiagnosticArray)
+    (row,) = (one for one in array.status if one.name == "acsard: router")
+    assert (row.level, row.message, values(row)) == (level, message, shown)
+
+
+def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
+    assert "acsard: router" not in {one.name for one in published()["diagnostics"].status}
 
 
 # only what somebody listens to

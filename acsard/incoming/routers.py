@@ -1,0 +1,32 @@
+"""What is connected of `bus.connect` -> what the log and the counters are told."""
+
+from __future__ import annotations
+
+from collections.abc import MutableMapping
+
+from acsard.values import Event, RoutersStatus
+
+
+class RoutersTold:
+    """Follows the routers that this daemon is to be connected to."""
+
+    def __init__(self) -> None:
+        self.status = RoutersStatus()
+
+    def hear(
+        self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
+    ) -> None:
+        """What is connected now; each that went or came is told."""
+        before, self.status = self.status, status
+        gone = [one for one in status.missing if one not in before.missing]
+        come = [one for one in status.connected if one not in before.connected]
+        if gone:
+            counters["router_missing"] = counters.get("router_missing", 0) + len(gone)
+            events.append(Event("router_missing", _words("not connected to", gone), "warning"))
+        if come:
+            events.append(Event("router_found", _words("connected to", come)))
+
+
+def _words(what: str, endpoints: list[str]) -> str:
+    tried = "; tried again until it answers, driving goes on" if what.startswith("not") else ""
+    return f"{what} {', '.join(endpoints)}{tried}"

@@ -1,0 +1,51 @@
+"""Drive the robot from a ROS machine: zeros first, then one speed for a while, then zeros.
+
+`ros2 topic pub` sends a speed from its first message on, which acsard does not follow: a publisher
+that has not let go yet may be one that nobody watches. This is the line that it does follow.
+
+    python3 drive.py [LINEAR m/s] [ANGULAR rad/s] [SECONDS] [--ros-args -r __ns:=/robot1]
+"""
+
+import sys
+import time
+
+import rclpy
+from geometry_msgs.msg import Twist
+from rclpy.utilities import remove_ros_args
+
+PERIOD_S = 0.05
+PATIENCE_S = 10.0
+"""How long to wait for somebody who listens; a bridge makes its route only now."""
+ZEROS_S = 1.5
+"""By a bridge, a zero counts a second after the last speed of whomever."""
+
+
+def main(argv: list[str]) -> None:
+    given = [float(word) for word in remove_ros_args(argv)[1:]]
+    linear, angular, seconds = given + [0.2, 0.0, 3.0][len(given) :]
+    rclpy.init(args=argv)
+    node = rclpy.create_node("acsar_drive")
+    publisher = node.create_publisher(Twist, "cmd_vel", 10)
+    deadline = time.monotonic() + PATIENCE_S
+    while not publisher.get_subscription_count():
+        if time.monotonic() > deadline:
+            sys.exit("nobody listens on cmd_vel: see Trouble in deploy/ros2/README.md")
+        time.sleep(PERIOD_S)
+
+    def hold(linear: float, angular: float, seconds: float) -> None:
+        twist = Twist()
+        twist.linear.x, twist.angular.z = linear, angular
+        for _ in range(round(seconds / PERIOD_S)):
+            publisher.publish(twist)
+            time.sleep(PERIOD_S)
+
+    hold(0.0, 0.0, ZEROS_S)
+    try:
+        hold(linear, angular, seconds)
+    finally:
+        hold(0.0, 0.0, 2 * PERIOD_S)
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main(sys.argv)

@@ -1,0 +1,79 @@
+"""A router that is missing, goes or comes back is told: by the log, `diagnostics` and `doctor`."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.harness import Bus, Daemon, Program, free_endpoint, until
+from tests.system.strangers import ROUTER, words
+from tests.system.test_doctor import examined
+
+pytestmark = pytest.mark.network
+
+
+def router(where: Path, endpoint: str) -> Program:
+    return Program(words(ROUTER, endpoint), where)
+
+
+def row(bus: Bus) -> Any:
+    """What `diagnostics` says of the router."""
+    rows = [one for one in bus.get("diagnostics")["status"] if one["name"] == "acsard: router"]
+    return rows[0] if rows else None
+
+
+def told(daemon: Daemon, name: str, times: int) -> str:
+    """The words of the log at so many lines of that event."""
+    until(lambda: len(daemon.events(name)) >= times, 5.0, f"{name}, {times} times")
+    return str(daemon.events(name)[times - 1]["text"])
+
+
+def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_path: Path) -> None:
+    meeting = free_endpoint()
+    config = {"bus": {"connect": [meeting]}}
+    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
+        assert meeting in told(daemon, "router_missing", 1)
+        until(lambda: row(bus) is not None, 2.0, "diagnostics say it")
+        assert (row(bus)["level"], row(bus)["message"]) == (1, f"not connected to {meeting}")
+        toml = f'[bus]\nlisten = ["{daemon.endpoint}"]\nconnect = ["{meeting}"]\n'
+        _, found = examined(tmp_path, toml)
+        says = [(one["level"], one["text"]) for one in found["router"]]
+        assert ("warning", f"nobody listens at {meeting}") in says
+        assert ("warning", f"the daemon is not connected to {meeting}") in says
+        with router(tmp_path, meeting) as there:
+            assert told(daemon, "router_found", 1) == f"connected to {meeting}"
+            until(lambda: row(bus)["level"] == 0, 2.0, "diagnostics say it")
+            _, found = examined(tmp_path, toml)
+            says = [(one["level"], one["text"]) for one in found["router"]]
+            assert says == [("ok", "the daemon is connected")]
+            there.signal(signal.SIGKILL)
+            told(daemon, "router_missing", 2)
+        assert bus.count("router_missing") == 2
+        assert bus.state()["link"] == "up"  # local driving does not care
+
+
+def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> None:
+    meeting = free_endpoint()
+    config = {"bus": {"mode": "client", "connect": [meeting]}}
+    toml = f'[bus]\nmode = "client"\nconnect = ["{meeting}"]\n'
+    with Daemon(tmp_path, config=config, ready=False) as daemon:
+        until(lambda: daemon.events("connecting"), 20.0, "it waits for its router")
+        _, found = examined(tmp_path, toml)
+        assert found["router"][0]["text"] == f"nobody listens at {meeting}"
+        assert "the router" in found["daemon"][0]["text"]
+        with router(tmp_path, meeting):
+            told(daemon, "router_found", 1)
+        told(daemon, "router_missing", 1)
+        with router(tmp_path, meeting):
+            told(daemon, "router_found", 2)
+            with Bus(meeting) as bus:
+                until(lambda: row(bus)["message"] == "connected", 2.0, "diagnostics say it")
+
+
+def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        assert row(bus) is None
+        assert daemon.events("router_missing") == []
