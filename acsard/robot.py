@@ -88,6 +88,7 @@ class Robot:
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (lines that were superseded, the bus)."""
         self._refused = ""
+        self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         self._dropped = Dropped()
         self._tally = Tally()
@@ -100,7 +101,7 @@ class Robot:
 
     def snapshot(self, now_ns: int) -> Snapshot:
         """What `state` and `diagnostics` show; costs too much for every step."""
-        session = self.session
+        session, since = self.session, self._refused_ns
         counters = {"lines": session.good_lines}
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         counters |= self._odometry.missed()
@@ -111,6 +112,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
+            refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
             gyro=GyroStatus() if self._gyro is None else self._gyro.status,
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
@@ -304,8 +306,9 @@ class Robot:
     # commands
 
     def _hear(self, inputs: Inputs, events: list[Event]) -> None:
+        now_ns = inputs.now.mono_ns
         for refusal in inputs.refusals:
-            self._refuse(refusal, events)
+            self._refuse(refusal, now_ns, events)
             if refusal.source:
                 self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
@@ -314,12 +317,15 @@ class Robot:
             reason = self._arbiter.accept(command)
             if reason:
                 text = f"source {command.source}: {REFUSED[reason]}"
-                self._refuse(Refusal(reason, text, command.source, command.sender), events)
+                refusal = Refusal(reason, text, command.source, command.sender)
+                self._refuse(refusal, now_ns, events)
             else:
                 self.counters["commands"] += 1
 
-    def _refuse(self, refusal: Refusal, events: list[Event]) -> None:
+    def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         self.counters[f"command_{refusal.reason}"] += 1
+        if refusal.reason != "unproven":  # so begins every sender with a clock of its own
+            self._refused_ns = now_ns
         self._refused = refusal.text[:MAX_TEXT]
         events.append(refused(refusal))
 

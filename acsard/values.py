@@ -354,6 +354,10 @@ class Snapshot(Struct, frozen=True):
     counters: dict[str, int]
     refused: str
     """The last command that was refused and why, "" when none was."""
+    refused_age_s: float | None = None
+    """s since one was refused for more than that its sender is new here, None when none was."""
+    missed_last_minute: int = 0
+    """Periods without a step."""
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `runtime/figures.py`."""
     gyro: GyroStatus = GyroStatus()

@@ -128,7 +128,7 @@ class ControlLoop:
         """One step at `now`, at the end of a period or between two."""
         ended, missed = period.expired > 0, max(0, period.expired - 1)
         if ended:
-            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns)
+            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self._pace
         inputs = Inputs(
@@ -261,4 +261,8 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        return replace(self.robot.snapshot(now_ns), figures=self._stopwatch.measured(now_ns))
+        return replace(
+            self.robot.snapshot(now_ns),
+            figures=self._stopwatch.measured(now_ns),
+            missed_last_minute=self._stopwatch.missed(now_ns),
+        )
