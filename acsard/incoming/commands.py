@@ -1,7 +1,7 @@
 """A sample from the bus -> a `Command` or a `Request`, or the reason it is refused.
 
 Refused whole, never in part: a command that cannot be decoded, is too big, holds NaN or infinity
-in any field, or came by a wildcard key or a DELETE refreshes nothing.
+in any field that is for us, or came by a wildcard key or a DELETE refreshes nothing.
 """
 
 from __future__ import annotations
@@ -134,17 +134,23 @@ class Receiver:
 
     def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
         got = _wheels.decode(arrival.encoding, arrival.payload)
-        if sorted(got.name) != sorted(self._joints) or len(got.velocity) != 4:
+        named, count = [got.name.count(joint) for joint in self._joints], len(got.name)
+        if named != [1] * 4 or len(got.velocity) != count:
             raise DecodeError(
-                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}"
+                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}, once"
             )
-        if not all(map(math.isfinite, (*got.velocity, *got.position, *got.effort))):
+        places = [got.name.index(joint) for joint in self._joints]
+        # What is told of other joints, say of an arm, is not for us.
+        velocity, position, effort = (
+            [told[place] for place in places] if len(told) == count else told
+            for told in (got.velocity, got.position, got.effort)
+        )
+        if not all(map(math.isfinite, (*velocity, *position, *effort))):
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
-        speed = dict(zip(got.name, got.velocity, strict=True))
-        twist = self._kinematics.twist(WheelSpeeds(*(speed[joint] for joint in self._joints)))
+        twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "wheel speeds beyond all numbers")
-        return twist, got.header, twist == REST and any(got.velocity)
+        return twist, got.header, twist == REST and any(velocity)
 
     @staticmethod
     def request(

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.incoming.asker import asker
-from acsard.incoming.commands import Receiver, Via
+from acsard.incoming.commands import MAX_COMMAND_BYTES, Receiver, Via
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
 from acsard.messages.schema import (
@@ -30,11 +30,13 @@ from acsard.messages.schema import (
 )
 from acsard.messages.topics import PUBLISHED, VERBS, full_key, offered
 from acsard.ros.attachments import Attachment, unpack
-from acsard.ros.parameters import Parameters
-from acsard.ros.transports import PARAMETERS
+from acsard.ros.parameters import MAX_REQUEST_BYTES, Parameters, failure
+from acsard.ros.transports import PARAMETERS, in_ros_words
 from acsard.values import Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
+
+BUSY = "busy: too many queries at once; ask again"
 
 
 class Query(Struct, frozen=True):
@@ -79,14 +81,15 @@ class Queries:
         }
         self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
         self._parameters = Parameters(effective(config))
-        self._waiting: dict[int, tuple[str, Format, Attachment | None]] = {}
+        self._waiting: dict[int, tuple[str, Format, Attachment | None, bool]] = {}
+        """By ticket: key and encoding of the reply, whom to echo, and whether ROS asked."""
 
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
         """The replies to a query, none when it is not for us; a `Request` when it is a service.
 
-        Raises `DecodeError` for a ROS request that cannot be answered: ROS clients hear no errors.
+        Raises `DecodeError` for a ROS request that cannot be served; `refused` has its reply.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -107,8 +110,9 @@ class Queries:
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
-        key, form, asked = waiting
-        payload = encode(ServiceReply(answer.success, answer.message), form)
+        key, form, asked, ros = waiting
+        message = in_ros_words(answer.message, self._config.ros) if ros else answer.message
+        payload = encode(ServiceReply(answer.success, message), form)
         encoding = encoding_name(form, "ServiceReply")
         return Reply(answer.id, key, payload, encoding, attachment=_echo(asked, wall_ns))
 
@@ -117,9 +121,11 @@ class Queries:
         asked = unpack(query.attachment) if query.via == "rmw" else None
         verb = VERBS.get(query.topic)
         if verb is not None:
-            self._waiting[query.ticket] = (query.topic, "cdr", asked)
+            self._waiting[query.ticket] = (query.topic, "cdr", asked, True)
             by = asker(query.via, query.attachment)
             return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
+        if len(query.payload) > MAX_REQUEST_BYTES:
+            raise DecodeError("too_big", f"over {MAX_REQUEST_BYTES} bytes")
         try:
             service = query.topic.removeprefix(PARAMETERS)
             payload = self._parameters.answer(service, query.payload)
@@ -143,7 +149,7 @@ class Queries:
             message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
-        self._waiting[query.ticket] = (query.topic, form, None)
+        self._waiting[query.ticket] = (query.topic, form, None, False)
         return replace(request, by=asker(query.via, query.attachment))
 
     def _values(
@@ -161,6 +167,30 @@ class Queries:
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
         value = current(topic)
         return [] if value is None else [(topic, type(value).__name__, value)]
+
+
+def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
+    """The reply to a query that is not served; None where no reply would find its caller.
+
+    ROS clients hear no errors: theirs is an answer that says no.
+    """
+    if query.via == "native":
+        return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
+    try:
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+    except DecodeError:
+        return None
+    if query.topic in VERBS:
+        payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
+    else:
+        payload, name = failure(query.topic.removeprefix(PARAMETERS), why), ""
+    encoding = encoding_name("cdr", name)
+    return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
+
+
+def most_bytes(topic: str) -> int:
+    """How much of a query's payload is worth keeping."""
+    return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:

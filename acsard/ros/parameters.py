@@ -20,6 +20,11 @@ Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
 """All parameters at once are fewer; a request of more takes too long to answer in one step."""
+Many = Annotated[list[T], Meta(max_length=256)]
+"""Of what is quicker to read: names alone."""
+
+MAX_REQUEST_BYTES = 16384
+"""As many of the longest names."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 DOUBLE_ARRAY, STRING_ARRAY = 8, 9
@@ -90,7 +95,7 @@ class SetParametersResult(Struct, frozen=True):
 class ListRequest(Struct, frozen=True):
     """`depth` 0 is any depth; no prefixes are all."""
 
-    prefixes: Some[str]
+    prefixes: Many[str]
     depth: Unsigned64
 
 
@@ -104,7 +109,7 @@ class ListReply(Struct, frozen=True):
 class Names(Struct, frozen=True):
     """The request of get, types and describe."""
 
-    names: Some[str]
+    names: Many[str]
 
 
 class Values(Struct, frozen=True):
@@ -144,6 +149,24 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 REFUSED = SetParametersResult(False, "read-only: change acsard.toml and start acsard anew")
+
+
+def failure(service: str, why: str) -> bytes:
+    """The reply to a request that is not served: as rclcpp, nothing where there is no room for why.
+
+    A client without any reply would wait for ever.
+    """
+    refused = SetParametersResult(False, why)
+    replies: dict[str, Struct] = {
+        "list_parameters": ListReply([], []),
+        "get_parameters": Values([]),
+        "get_parameter_types": Types([]),
+        "describe_parameters": Descriptors([]),
+        "set_parameters": SetReply([refused]),
+        "set_parameters_atomically": SetAtomicallyReply(refused),
+    }
+    reply = replies[service]
+    return Cdr(type(reply)).encode(reply)
 
 
 class Parameters:

@@ -19,7 +19,7 @@ from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
-from acsard.incoming.queries import Queries
+from acsard.incoming.queries import Queries, refused
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
@@ -210,7 +210,8 @@ class ControlLoop:
                 served = self._queries.serve(query, self._current, self.outputs)
             except DecodeError as error:
                 refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
-                served = []
+                reply = refused(query, str(error), now.wall_ns)
+                served = [] if reply is None else [reply]
             if isinstance(served, Request):
                 requests.append(served)
                 continue

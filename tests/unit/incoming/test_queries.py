@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import Config, JointsConfig, RobotConfig
-from acsard.incoming.queries import Queries, Query, Reply
+from acsard.config.settings import Config, JointsConfig, RobotConfig, RosConfig
+from acsard.incoming.queries import BUSY, Queries, Query, Reply, most_bytes, refused
 from acsard.messages.cdr import Cdr
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.messages.report import Report
@@ -28,6 +28,7 @@ NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics
 
 CONFIG = Config(robot=RobotConfig("r7"))
 WALL_NS = 1_700_000_000_000_000_000
+NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
@@ -442,11 +443,88 @@ def test_the_parameter_services_tell_the_configuration(via: str) -> None:
         assert reply.attachment == b""
 
 
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
 @pytest.mark.parametrize("service", PARAMETER_SERVICES)
-def test_a_parameter_request_that_cannot_be_read_is_not_answered(service: str) -> None:
+def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
+    service: str, via: str
+) -> None:
+    asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
     with pytest.raises(DecodeError) as caught:
-        queries().serve(ros_query(f"parameters/{service}", payload=b"\x00"), nothing, OUTPUTS)
+        queries().serve(asked, nothing, OUTPUTS)
     assert caught.value.reason == "malformed"
+    reply = refused(asked, str(caught.value), WALL_NS)
+    assert reply is not None
+    kinds: dict[str, tuple[type[Any], Any]] = {
+        "list_parameters": (rcl.ListReply, rcl.ListReply([], [])),
+        "get_parameters": (rcl.Values, rcl.Values([])),
+        "get_parameter_types": (rcl.Types, rcl.Types([])),
+        "describe_parameters": (rcl.Descriptors, rcl.Descriptors([])),
+        "set_parameters": (rcl.SetReply, rcl.SetReply([NO])),
+        "set_parameters_atomically": (rcl.SetAtomicallyReply, rcl.SetAtomicallyReply(NO)),
+    }
+    kind, expected = kinds[service]
+    assert Cdr(kind).decode(reply.payload) == expected
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert (reply.ok, reply.attachment) == (True, echo if via == "rmw" else b"")
+
+
+def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
+    names = ["robot.id"] * 256
+    payload = Cdr(rcl.Names).encode(rcl.Names(names))
+    (reply,) = reply_to(ros_query("parameters/get_parameters", payload=payload))
+    values = Cdr(rcl.Values).decode(reply.payload).values
+    assert [value.string_value for value in values] == ["r7"] * 256
+    for more, reason in ((names + names[:1], "malformed"), (["x" * 20_000], "too_big")):
+        payload = Cdr(rcl.Names).encode(rcl.Names(more))[: most_bytes("parameters/") + 1]
+        with pytest.raises(DecodeError) as caught:
+            queries().serve(ros_query("parameters/get_parameters", payload=payload), nothing, None)
+        assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_a_trigger_that_is_turned_away_hears_so(via: str) -> None:
+    reply = refused(ros_query("srv/clear", via), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.key, reply.ticket) == (True, "srv/clear", 7)
+    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(False, BUSY)
+
+
+def test_who_asks_natively_is_turned_away_with_an_error() -> None:
+    reply = refused(query("odom"), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.payload) == (False, BUSY.encode())
+
+
+def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> None:
+    assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize(
+    ("namespace", "clear", "activate"),
+    [
+        ("", "/acsard/clear", "/acsard/activate"),
+        ("robot1", "/robot1/acsard/clear", "/robot1/acsard/activate"),
+    ],
+)
+def test_to_ros_the_services_are_called_as_ros_calls_them(
+    via: str, namespace: str, clear: str, activate: str
+) -> None:
+    made = queries(replace(CONFIG, ros=RosConfig(namespace=namespace)))
+    made.serve(ros_query("srv/stop", via), nothing, OUTPUTS)
+    words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
+    reply = made.answered(Answer(7, True, words), WALL_NS)
+    assert reply is not None
+    told = Cdr(ServiceReply).decode(reply.payload).message
+    assert told == f"call {clear} first; {activate} switches it on, not srv/clearance"
+
+
+def test_to_others_the_services_are_called_by_their_keys() -> None:
+    made = queries()
+    made.serve(query("srv/stop"), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
 
 
 def reply_to(asked: Query) -> list[Reply]:
