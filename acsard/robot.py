@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from acsard.config.live import changed
+from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.dropped import Dropped
@@ -28,6 +30,7 @@ from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
     NS_PER_S,
+    REST,
     STILL,
     Answer,
     Estimate,
@@ -35,6 +38,7 @@ from acsard.values import (
     GyroStatus,
     Inputs,
     Outputs,
+    Plain,
     Pose,
     Refusal,
     Request,
@@ -61,6 +65,8 @@ class Robot:
     """One robot base: its link, pose, mode and commanders."""
 
     def __init__(self, config: Config) -> None:
+        self.config = config
+        """In force; another one after a step that was asked to `set` something."""
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(
@@ -268,7 +274,7 @@ class Robot:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
         if asked != self._asked or request.asked_ns is None:
-            news = self._life.mode is not before
+            news = self._life.mode is not before or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
         return Answer(request.id, True, message)
@@ -297,6 +303,22 @@ class Robot:
                 self._odometry.set_pose(request.pose or Pose())
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
+            case "set":
+                return self._set(request.settings, now_ns)
+
+    def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
+        """Change settings in the middle of whatever the robot does."""
+        before, at_rest = self.config, self._speeds == STILL and self._limiter.twist == REST
+        try:
+            self.config, news = changed(before, settings, at_rest)
+        except ConfigError as error:
+            raise RefusedError(str(error)) from None
+        self._limiter.use(self.config.limits)
+        self._odometry.use(self.config.odometry)
+        if self.config.commands != before.commands:
+            self._arbiter = Arbiter(self.config.commands)
+            self._arbiter.require_neutral(now_ns)
+        return news or "nothing new: all of it is so already"
 
     def _fault(self, why: str, now_ns: int, events: list[Event]) -> None:
         if self._life.fault(why, now_ns):

@@ -115,7 +115,10 @@ class Command(Struct, frozen=True):
     """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
 
 
-Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose"]
+Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
+
+Plain = bool | int | float | str | list[float | str]
+"""The value of a setting, as who asks for it writes it."""
 
 
 class Request(Struct, frozen=True):
@@ -128,6 +131,8 @@ class Request(Struct, frozen=True):
     """When it arrived, monotonic: a clear must not undo a stop that came after it."""
     by: str = ""
     """Who asked, as `incoming/asker.py` puts it."""
+    settings: dict[str, Plain] = {}
+    """What `set` is to set, by key as in `config/live.py`."""
 
 
 class Answer(Struct, frozen=True):
@@ -158,7 +163,7 @@ EventName = Literal[
     "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
-    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
+    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
     "mode", "commander", "command_refused", "fault",
 ]  # fmt: skip
 """All that the log can be asked for; `deploy/systemd/README.md` says what each means."""

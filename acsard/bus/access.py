@@ -35,6 +35,7 @@ SERVICE_ROLES: dict[Verb, Role] = {
     "deactivate": "operator",
     "reset_odometry": "operator",
     "set_pose": "maintainer",
+    "set": "maintainer",
 }
 """The least role that may call each service: whoever sees the robot may stop it."""
 

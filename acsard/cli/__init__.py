@@ -34,6 +34,7 @@ from acsard.cli import (
     top,
     topics,
 )
+from acsard.cli import set as setting
 from acsard.cli.exits import code_of
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
@@ -48,6 +49,7 @@ VERBS = (
     top,
     drive,
     call,
+    setting,
     bench,
     doctor,
     ports,

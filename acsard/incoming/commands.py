@@ -15,7 +15,15 @@ from acsard.config.settings import JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
-from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
+from acsard.messages.schema import (
+    Header,
+    JointState,
+    SetPose,
+    Settings,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
 from acsard.ros.attachments import GID_BYTES, unpack
 from acsard.ros.transports import Transport
 from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
@@ -71,6 +79,13 @@ STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
 _poses = Decoder(SetPose)
+_settings = Decoder(Settings)
+
+EXAMPLES: dict[Verb, str] = {
+    "set_pose": '{"x": 0, "y": 0, "yaw": 0}',
+    "set": '{"settings": {"limits.linear_speed": 0.8}}',
+}
+"""The payload of each service that has one."""
 
 
 class Receiver:
@@ -157,10 +172,13 @@ class Receiver:
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
         """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
-        if verb != "set_pose":
+        if verb not in EXAMPLES:
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
+        if verb == "set":
+            wished = _settings.decode(encoding, payload).settings
+            return Request(verb, ticket, asked_ns=asked_ns, settings=wished)
         got = _poses.decode(encoding, payload)
         if (
             not all(map(math.isfinite, (got.x, got.y, got.yaw)))

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.incoming.asker import asker
-from acsard.incoming.commands import MAX_COMMAND_BYTES, Receiver, Via
+from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
 from acsard.messages.schema import (
@@ -30,7 +30,14 @@ from acsard.messages.schema import (
 )
 from acsard.messages.topics import PUBLISHED, VERBS, full_key, offered
 from acsard.ros.attachments import Attachment, unpack
-from acsard.ros.parameters import MAX_REQUEST_BYTES, Parameters, failure
+from acsard.ros.parameters import (
+    MAX_REQUEST_BYTES,
+    SETTING,
+    Parameters,
+    failure,
+    outcome,
+    wished,
+)
 from acsard.ros.transports import PARAMETERS, in_ros_words
 from acsard.values import Answer, Outputs, Request
 
@@ -69,6 +76,17 @@ class Reply(Struct, frozen=True):
     attachment: bytes = b""
 
 
+class _Waiting(Struct, frozen=True):
+    """Who waits for the robot's answer: the key and encoding of the reply, and whom to echo."""
+
+    key: str
+    form: Format
+    asked: Attachment | None
+    ros: bool = False
+    wish: bytes = b""
+    """The request to set parameters that it is, which the reply has to fit."""
+
+
 class Queries:
     """Answers queries from what it was given at the start and the present values."""
 
@@ -81,8 +99,14 @@ class Queries:
         }
         self._schemas = {name: schema(cls) for name, cls in MESSAGES.items()}
         self._parameters = Parameters(effective(config))
-        self._waiting: dict[int, tuple[str, Format, Attachment | None, bool]] = {}
-        """By ticket: key and encoding of the reply, whom to echo, and whether ROS asked."""
+        self._waiting: dict[int, _Waiting] = {}
+        """By ticket."""
+
+    def use(self, config: Config) -> None:
+        """Tell of this configuration from now on."""
+        self._config = config
+        self._fixed["config"] = effective(config)
+        self._parameters = Parameters(effective(config))
 
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
@@ -110,24 +134,36 @@ class Queries:
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
-        key, form, asked, ros = waiting
-        message = in_ros_words(answer.message, self._config.ros) if ros else answer.message
-        payload = encode(ServiceReply(answer.success, message), form)
-        encoding = encoding_name(form, "ServiceReply")
-        return Reply(answer.id, key, payload, encoding, attachment=_echo(asked, wall_ns))
+        key, form, message, name = waiting.key, waiting.form, answer.message, "ServiceReply"
+        if waiting.ros:
+            message = in_ros_words(message, self._config.ros)
+        if waiting.wish:
+            service, name = key.removeprefix(PARAMETERS), ""
+            payload = outcome(service, waiting.wish, answer.success, message)
+        else:
+            payload = encode(ServiceReply(answer.success, message), form)
+        attachment = _echo(waiting.asked, wall_ns)
+        return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
         """A std_srvs/Trigger, or one of the parameter services."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
+        by = asker(query.via, query.attachment)
         verb = VERBS.get(query.topic)
         if verb is not None:
-            self._waiting[query.ticket] = (query.topic, "cdr", asked, True)
-            by = asker(query.via, query.attachment)
+            self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
             return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
         if len(query.payload) > MAX_REQUEST_BYTES:
             raise DecodeError("too_big", f"over {MAX_REQUEST_BYTES} bytes")
         try:
             service = query.topic.removeprefix(PARAMETERS)
+            if service in SETTING:
+                wish = wished(query.payload)
+                self._waiting[query.ticket] = _Waiting(
+                    query.topic, "cdr", asked, True, query.payload
+                )
+                ticket, at_ns = query.ticket, query.arrived_ns
+                return Request("set", ticket, asked_ns=at_ns, by=by, settings=wish)
             payload = self._parameters.answer(service, query.payload)
         except CdrError as error:
             raise DecodeError("malformed", str(error)) from None
@@ -146,10 +182,10 @@ class Queries:
                 query.arrived_ns,
             )
         except DecodeError as error:
-            message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
+            message = ServiceReply(False, f"{error}; send {EXAMPLES[VERBS[query.topic]]}")
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
-        self._waiting[query.ticket] = (query.topic, form, None, False)
+        self._waiting[query.ticket] = _Waiting(query.topic, form, None)
         return replace(request, by=asker(query.via, query.attachment))
 
     def _values(

@@ -73,13 +73,17 @@ class Report:
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
     ) -> None:
-        self._config = config
         self.certificate_ends_ns = certificate_ends_ns
         """Wall-clock time; the door tells it where the daemon may not read it."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
+        self.use(config)
+
+    def use(self, config: Config) -> None:
+        """By this configuration from now on."""
+        self._config = config
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
         self._covariances = Covariances(config.odometry)
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from acsard.values import NS_PER_S
+from acsard.values import NS_PER_S, Plain
 
 # What `cdr.py` has to know: the width of an int in CDR, the length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -274,6 +274,12 @@ class SetPose(Message, frozen=True):
     yaw: float
 
 
+class Settings(Message, frozen=True):
+    """What is to be set: values by their keys in `acsard.toml`, tables and key joined by dots."""
+
+    settings: Annotated[dict[str, Plain], FEW]
+
+
 class Info(Message, frozen=True):
     """Who is this daemon."""
 
@@ -337,6 +343,7 @@ MESSAGES: dict[str, type[Message]] = {
         DiagnosticArray,
         ServiceReply,
         SetPose,
+        Settings,
         Info,
         Interfaces,
         Topics,

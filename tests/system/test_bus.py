@@ -42,7 +42,7 @@ PUBLISHED = {
     "diagnostics": "DiagnosticArray",
     "sim/pose": "PoseStamped",
 }
-SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose")
+SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set")
 FIELDS = {
     "odom": {"header", "child_frame_id", "pose", "twist"},
     "tf": {"transforms"},
@@ -184,7 +184,7 @@ def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
     assert all(answer.ok for answer in answers)
     types = [answer.key.removeprefix("schema/") for answer in answers]
     assert len(types) == len(set(types))
-    assert {*PUBLISHED.values(), "ServiceReply", "Twist", "SetPose"} <= set(types)
+    assert {*PUBLISHED.values(), "ServiceReply", "Twist", "SetPose", "Settings"} <= set(types)
 
 
 def test_a_schema_that_does_not_exist_is_no_answer_at_once(bus: Bus) -> None:

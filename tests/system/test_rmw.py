@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -641,6 +642,32 @@ def test_of_many_calls_at_once_every_one_is_answered(
         )
     assert [answers.get(timeout=20.0) for _ in asked] == [True] * count
     bus.state()
+
+
+@pytest.mark.parametrize("way", ["rmw", "bridge"])
+def test_a_parameter_is_set_by_both_ways_as_by_anybody(bus: Bus, way: str) -> None:
+    client: Client = RmwClient(bus.session) if way == "rmw" else BridgeHalf(bus.session)
+
+    def ask(value: float) -> Any:
+        none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
+        lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
+        none |= {f"{kind}_value": np.array([]) for kind in lists}
+        double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
+        wish = make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
+        request = encode(make("rcl_interfaces/msg/SetRequest", parameters=[wish]))
+        name = "acsard/set_parameters"
+        (reply,) = client.call(name, SERVICES[name], request).replies
+        return decode("rcl_interfaces/msg/SetReply", reply.payload).results[0]
+
+    before = bus.get("config")["limits"]["linear_speed"]
+    try:
+        assert ask(0.6).successful
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+        refused = ask(60.0)
+        assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+    finally:
+        assert ask(before).successful
 
 
 def test_a_query_on_all_keys_of_ros_stops_nothing(bus: Bus, ros: RmwClient) -> None:

@@ -10,7 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import Config, JointsConfig, RobotConfig, RosConfig
+from acsard.config.settings import Config, JointsConfig, LimitsConfig, RobotConfig, RosConfig
+from acsard.incoming.commands import EXAMPLES
 from acsard.incoming.queries import BUSY, Queries, Query, Reply, most_bytes, refused
 from acsard.messages.cdr import Cdr
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
@@ -20,7 +21,7 @@ from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.transports import PARAMETER_SERVICES, TRIGGERS
-from acsard.values import Answer, Outputs, Pose, Request
+from acsard.values import Answer, Outputs, Plain, Pose, Request
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
@@ -243,17 +244,20 @@ def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
 # services
 
 POSE = encode({"x": 1.0, "y": 2.0, "yaw": 3.0}, "json")
+SETTINGS = encode({"settings": {"limits.linear_speed": 0.8, "log.level": "debug"}}, "json")
 
 
 def payload_for(verb: str) -> bytes:
-    return POSE if verb == "set_pose" else b""
+    return {"set_pose": POSE, "set": SETTINGS}.get(verb, b"")
 
 
 @pytest.mark.parametrize("verb", SERVICES)
 def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
-    assert got == Request(verb, 7, pose, by="unnamed (native)")
+    told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
+    settings = told if verb == "set" else {}
+    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings)
 
 
 @pytest.mark.parametrize("asked", WILDCARDS)
@@ -335,7 +339,7 @@ def test_a_service_asked_in_cdr_answers_as_a_ros_trigger_does() -> None:
     assert reply.payload == bytes.fromhex("00010000 01000000 03000000 6f6b00")
 
 
-@pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb != "set_pose"])
+@pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb not in EXAMPLES])
 def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
     assert isinstance(got, Request)
@@ -525,6 +529,41 @@ def test_to_others_the_services_are_called_by_their_keys() -> None:
     reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
     assert reply is not None
     assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
+    service: str, via: str
+) -> None:
+    value = rcl.ParameterValue(rcl.DOUBLE, double_value=0.7)
+    payload = Cdr(rcl.SetRequest).encode(
+        rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
+    )
+    made = queries()
+    got = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
+    assert isinstance(got, Request)
+    assert (got.verb, got.id, got.settings) == ("set", 7, {"limits.linear_speed": 0.7})
+    reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    no = rcl.SetParametersResult(False, "call /acsard/clear first")
+    if service == "set_parameters":
+        assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no])
+    else:
+        assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert reply.attachment == (echo if via == "rmw" else b"")
+
+
+def test_what_is_set_is_what_config_and_parameters_tell() -> None:
+    made = queries()
+    made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
+    (told,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
+    assert from_builtins(msgspec.json.decode(told.payload)).limits.linear_speed == 0.7
+    payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
+    asked = ros_query("parameters/get_parameters", "bridge", payload)
+    (reply,) = made.serve(asked, nothing, OUTPUTS)  # type: ignore[misc]
+    assert Cdr(rcl.Values).decode(reply.payload).values[0].double_value == 0.7
 
 
 def reply_to(asked: Query) -> list[Reply]:
