@@ -31,7 +31,7 @@ import asyncio
 import os
 import platform
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import aclosing, asynccontextmanager, closing, contextmanager
 from functools import partial
 from typing import Any
@@ -61,7 +61,7 @@ from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
 from acsard.messages.topics import by_key, full_key, service_key
-from acsard.values import AcsardError, Pose
+from acsard.values import AcsardError, Plain, Pose
 
 __all__ = (
     "AcsardError",
@@ -137,6 +137,13 @@ class Client:
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
+        return self._call(service, fields)
+
+    def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
+        """Change settings until the next start: `{"limits.linear_speed": 0.8}`; all or none."""
+        return self._call("set", {"settings": settings})
+
+    def _call(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         payload = msgspec.json.encode(fields) if fields else None
         replies = self._ask(service_key(service), payload)
         return Decoder(schema.ServiceReply).decode(*replies[0])
@@ -282,6 +289,10 @@ class AsyncClient:
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, as `Client.call`."""
         return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
+
+    async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
+        """Change settings, as `Client.set`."""
+        return await in_thread(lambda: self._client.set(settings), 2 * REPLY_TIMEOUT_S)
 
     async def get(self, name: str) -> Any:
         """The last value of a key, as `Client.get`."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from acsard.config.live import changed
+from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
 from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.dropped import Dropped
@@ -28,6 +30,7 @@ from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import (
     NS_PER_S,
+    REST,
     STILL,
     Answer,
     Estimate,
@@ -35,6 +38,7 @@ from acsard.values import (
     GyroStatus,
     Inputs,
     Outputs,
+    Plain,
     Pose,
     Refusal,
     Request,
@@ -60,6 +64,8 @@ class Robot:
     """One robot base: its link, pose, mode and commanders."""
 
     def __init__(self, config: Config) -> None:
+        self.config = config
+        """In force; another one after a step that was asked to `set` something."""
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(
@@ -87,6 +93,7 @@ class Robot:
         """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
         adds what it alone sees (lines that were superseded, the bus)."""
         self._refused = ""
+        self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         self._dropped = Dropped()
         self._tally = Tally()
@@ -99,7 +106,7 @@ class Robot:
 
     def snapshot(self, now_ns: int) -> Snapshot:
         """What `state` and `diagnostics` show; costs too much for every step."""
-        session = self.session
+        session, since = self.session, self._refused_ns
         counters = {"lines": session.good_lines}
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         counters |= self._odometry.missed()
@@ -110,6 +117,7 @@ class Robot:
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
+            refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
             gyro=GyroStatus() if self._gyro is None else self._gyro.status,
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
@@ -255,7 +263,7 @@ class Robot:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
         if asked != self._asked or request.asked_ns is None:
-            news = self._life.mode is not before
+            news = self._life.mode is not before or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
         return Answer(request.id, True, message)
@@ -284,6 +292,22 @@ class Robot:
                 self._odometry.set_pose(request.pose or Pose())
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
+            case "set":
+                return self._set(request.settings, now_ns)
+
+    def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
+        """Change settings in the middle of whatever the robot does."""
+        before, at_rest = self.config, self._speeds == STILL and self._limiter.twist == REST
+        try:
+            self.config, news = changed(before, settings, at_rest)
+        except ConfigError as error:
+            raise RefusedError(str(error)) from None
+        self._limiter.use(self.config.limits)
+        self._odometry.use(self.config.odometry)
+        if self.config.commands != before.commands:
+            self._arbiter = Arbiter(self.config.commands)
+            self._arbiter.require_neutral(now_ns)
+        return news or "nothing new: all of it is so already"
 
     def _fault(self, why: str, now_ns: int, events: list[Event]) -> None:
         if self._life.fault(why, now_ns):
@@ -293,8 +317,9 @@ class Robot:
     # commands
 
     def _hear(self, inputs: Inputs, events: list[Event]) -> None:
+        now_ns = inputs.now.mono_ns
         for refusal in inputs.refusals:
-            self._refuse(refusal, events)
+            self._refuse(refusal, now_ns, events)
             if refusal.source:
                 self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
         for command in inputs.commands:
@@ -303,12 +328,15 @@ class Robot:
             reason = self._arbiter.accept(command)
             if reason:
                 text = f"source {command.source}: {REFUSED[reason]}"
-                self._refuse(Refusal(reason, text, command.source, command.sender), events)
+                refusal = Refusal(reason, text, command.source, command.sender)
+                self._refuse(refusal, now_ns, events)
             else:
                 self.counters["commands"] += 1
 
-    def _refuse(self, refusal: Refusal, events: list[Event]) -> None:
+    def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         self.counters[f"command_{refusal.reason}"] += 1
+        if refusal.reason != "unproven":  # so begins every sender with a clock of its own
+            self._refused_ns = now_ns
         self._refused = refusal.text[:MAX_TEXT]
         events.append(refused(refusal))
 

@@ -123,7 +123,10 @@ class Command(Struct, frozen=True):
     """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
 
 
-Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose"]
+Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
+
+Plain = bool | int | float | str | list[float | str]
+"""The value of a setting, as who asks for it writes it."""
 
 
 class Request(Struct, frozen=True):
@@ -136,6 +139,8 @@ class Request(Struct, frozen=True):
     """When it arrived, monotonic: a clear must not undo a stop that came after it."""
     by: str = ""
     """Who asked, as `incoming/asker.py` puts it."""
+    settings: dict[str, Plain] = {}
+    """What `set` is to set, by key as in `config/live.py`."""
 
 
 class Answer(Struct, frozen=True):
@@ -166,7 +171,7 @@ EventName = Literal[
     "missed_periods",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
-    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
+    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
     "mode", "commander", "kept_waiting", "command_refused", "fault",
 ]  # fmt: skip
 """All that the log can be asked for; `deploy/systemd/README.md` says what each means."""
@@ -376,6 +381,10 @@ class Snapshot(Struct, frozen=True):
     counters: dict[str, int]
     refused: str
     """The last command that was refused and why, "" when none was."""
+    refused_age_s: float | None = None
+    """s since one was refused for more than that its sender is new here, None when none was."""
+    missed_last_minute: int = 0
+    """Periods without a step."""
     figures: dict[str, Measured] = {}
     """What the daemon measures of itself, by the names in `runtime/figures.py`."""
     gyro: GyroStatus = GyroStatus()

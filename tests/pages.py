@@ -283,6 +283,8 @@ COMMANDS: dict[str, How] = {
     "ros2 service call /acsard/clear std_srvs/srv/Trigger": NO_ROS,
     "ros2 param list /acsard": NO_ROS,
     "ros2 param get /acsard drive.wheel_radius": NO_ROS,
+    "ros2 param describe /acsard limits.linear_speed": NO_ROS,
+    "ros2 param set /acsard limits.linear_speed 0.8": NO_ROS,
     "ros2 run teleop_twist_keyboard teleop_twist_keyboard --ros-args "
     "-r cmd_vel:=cmd_vel_teleop": NO_ROS,
     f"ros2 launch {_LAUNCH_FILE} use_rviz:=true": LAUNCH,

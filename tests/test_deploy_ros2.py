@@ -404,13 +404,13 @@ def test_the_bridge_is_a_client_of_the_daemon_where_it_listens() -> None:
 
 def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
     allow = bridge_setting("plugins/ros2dds/allow")
-    triggers = {
-        f"/{row.name}" for row in ros_names(RosConfig()) if row.type == "std_srvs/srv/Trigger"
+    services = {
+        f"/{row.name}" for row in ros_names(RosConfig()) if row.direction in ("service", "query")
     }
     wanted = {
         "publishers": published_names("in"),
         "subscribers": published_names("out"),
-        "service_clients": triggers,
+        "service_clients": services,
         "service_servers": set(),
         "action_servers": set(),
         "action_clients": set(),
@@ -424,7 +424,7 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
         "/imu/data",
     }
     assert len(wanted["subscribers"]) == 6
-    assert len(triggers) == 5
+    assert len(services) == 11
 
 
 # README.md

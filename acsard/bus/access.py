@@ -36,6 +36,7 @@ SERVICE_ROLES: dict[Verb, Role] = {
     "deactivate": "operator",
     "reset_odometry": "operator",
     "set_pose": "maintainer",
+    "set": "maintainer",
 }
 """The least role that may call each service: whoever sees the robot may stop it."""
 

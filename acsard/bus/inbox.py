@@ -15,7 +15,7 @@ from acsard.bus.replies import Replies
 from acsard.host import clock
 from acsard.incoming.bus import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
-from acsard.incoming.queries import Query, Reply
+from acsard.incoming.queries import BUSY, Query, most_bytes, refused
 from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, JSON_TREE, VERBS, service_key, source_keys
 from acsard.ros.transports import Endpoint
@@ -34,8 +34,9 @@ OTHERS = ""
 STOPS = 16
 """Stops held, apart from all else: no flood of anything can push one out."""
 
-QUERIES = 64
-"""Queries held, and as many service calls; the next one is turned away with an error."""
+QUERIES = 256
+"""Queries held, as many service calls, and as many of ROS for parameters, of which one is answered
+in a step: the last of so many 2.6 s late. The next one is told to ask again."""
 
 ATTACHMENT_BYTES = 256
 """An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
@@ -157,35 +158,34 @@ class Inbox:
         return self._questions if via == "native" else self._slow
 
     def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
-        arrived_ns = clock.now().mono_ns
+        arrived = clock.now()
         if topic == STOP:
             # The stop itself never waits in a line with other questions, nor is it turned away.
             by = _bytes(query.attachment, ATTACHMENT_BYTES)
-            self._stop(Arrival("stop", True, b"", "", arrived_ns, None, "", via, by))
+            self._stop(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
             return
+        encoding = query.encoding
+        held = Query(
+            ticket,
+            topic,
+            asked,
+            query.parameters.get("fmt", "") or "",
+            _bytes(query.payload, most_bytes(topic)),
+            str(encoding) if encoding else "",
+            arrived.mono_ns,
+            via,
+            _bytes(query.attachment, ATTACHMENT_BYTES),
+        )
         waiting = self._line_for(topic, via)
         if len(waiting) >= QUERIES:
-            if via == "native":  # a ROS client hears no errors
-                busy = b"busy: too many queries at once; ask again"
-                self._replies.send(Reply(ticket, topic, busy, "text/plain", ok=False))
+            busy = refused(held, BUSY, arrived.wall_ns)
+            if busy is not None:
+                self._replies.send(busy)
             self._replies.retire(ticket)
             return
-        encoding = query.encoding
-        waiting.append(
-            Query(
-                ticket,
-                topic,
-                asked,
-                query.parameters.get("fmt", "") or "",
-                _bytes(query.payload, MAX_COMMAND_BYTES),
-                str(encoding) if encoding else "",
-                arrived_ns,
-                via,
-                _bytes(query.attachment, ATTACHMENT_BYTES),
-            )
-        )
+        waiting.append(held)
         self._any = True
 
 

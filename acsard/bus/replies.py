@@ -15,7 +15,7 @@ import zenoh
 
 from acsard.incoming.queries import Reply
 
-TICKETS = 512
+TICKETS = 1024
 """Queries whose replies are still being sent; more are let go unanswered."""
 
 

@@ -37,6 +37,7 @@ from acsard.cli import (
     topics,
     whoami,
 )
+from acsard.cli import set as setting
 from acsard.cli.exits import code_of
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
@@ -54,6 +55,7 @@ VERBS = (
     drive,
     call,
     whoami,
+    setting,
     bench,
     doctor,
     ports,

@@ -11,16 +11,18 @@ from acsard.messages.topics import SERVICES
 
 if TYPE_CHECKING:
     from acsard.client import Client
+CALLED = tuple(service for service in SERVICES if service != "set")
+"""`acsard set` calls that one, and knows what can be set."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb."""
     parser = verbs.add_parser(
         "call",
-        help="call a service: " + ", ".join(SERVICES),
+        help="call a service: " + ", ".join(CALLED),
         description="Call a service and print its answer; exit 1 when it was refused.",
     )
-    parser.add_argument("service", choices=SERVICES, metavar="SERVICE", help=", ".join(SERVICES))
+    parser.add_argument("service", choices=CALLED, metavar="SERVICE", help=", ".join(CALLED))
     parser.add_argument(
         "values", nargs="*", type=float, metavar="X Y YAW", help="for set_pose: m, m, rad"
     )

@@ -34,6 +34,16 @@ class Limiter:
     """Remembers the twist it last allowed and moves it by the limits."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
+        self._kinematics = kinematics
+        self.state = _State(REST, 0.0, 0.0)
+        """All it remembers; put back to undo a step whose line did not go out."""
+        self.use(limits)
+
+    def use(self, limits: LimitsConfig) -> None:
+        """By these limits from now on; what is too fast for them falls by its deceleration.
+
+        Not so where a wheel's limit is lowered, which holds at once: that is for a robot at rest.
+        """
         self._linear = _Axis(
             limits.linear_speed,
             limits.linear_acceleration,
@@ -49,9 +59,6 @@ class Limiter:
             limits.angular_jerk,
         )
         self._wheel_speed = limits.wheel_speed
-        self._kinematics = kinematics
-        self.state = _State(REST, 0.0, 0.0)
-        """All it remembers; put back to undo a step whose line did not go out."""
 
     @property
     def twist(self) -> Twist:

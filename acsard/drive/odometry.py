@@ -114,6 +114,11 @@ class Odometry:
         self.travelled = 0.0
         """m since the start, forwards and backwards."""
 
+    def use(self, odometry: OdometryConfig) -> None:
+        """With these variances from now on."""
+        self._uncertainty.use(odometry)
+        self._twist_uncertainty.use(odometry)
+
     def set_pose(self, pose: Pose) -> None:
         """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
         self._path.set(pose)

@@ -42,14 +42,19 @@ class TwistUncertainty:
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
         """`counts` of the encoders per wheel turn, 0 if unknown."""
-        self._lateral = odometry.twist_covariance_diagonal[1]
-        self._noise = Noise(odometry, kinematics)
+        self._kinematics = kinematics
+        self.use(odometry)
         self._effects = columns(odometry, kinematics)
         self._count = math.tau / counts if counts else 0.0
         # Of four independent wheels' errors: each side is the mean of two.
         self._to_linear = kinematics.radius**2 / 4 / 12
         self._to_angular = kinematics.radius**2 / kinematics.track**2 / 12
         self._period = PERIOD
+
+    def use(self, odometry: OdometryConfig) -> None:
+        """With this noise from now on."""
+        self._lateral = odometry.twist_covariance_diagonal[1]
+        self._noise = Noise(odometry, self._kinematics)
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
         """Of a report that came `dt` s after the one before; 0 if that is unknown.

@@ -55,9 +55,9 @@ class PoseUncertainty:
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
         """`counts` of the encoders per wheel turn, 0 if unknown."""
-        self._start = odometry.pose_covariance_diagonal
+        self._kinematics = kinematics
         self._half = kinematics.track / 2
-        self._noise = Noise(odometry, kinematics)
+        self.use(odometry)
         self._parameters = columns(odometry, kinematics)
         # A side is the mean of two wheels, each of which may stand anywhere within a count.
         count = kinematics.radius * math.tau / (counts or COARSE_COUNTS)
@@ -67,6 +67,12 @@ class PoseUncertainty:
         self._dx = self._dy = self._rolled = 0.0
         """m in odom, and of the wheels' way, since the last look at what is of second order."""
         self.set(0.0)
+
+    def use(self, odometry: OdometryConfig) -> None:
+        """With this noise from now on, and so certain where the pose is set; the parameters and
+        how certain they are stay."""
+        self._start = odometry.pose_covariance_diagonal
+        self._noise = Noise(odometry, self._kinematics)
 
     def set(self, yaw: float) -> None:
         """The pose is as certain as at the start, with its heading at `yaw`."""

@@ -91,14 +91,19 @@ class Log:
             except OSError:
                 form = "json"  # no journal here, or a sandbox without it
         self._writer = Writer(stream)
+        self._form = form
+        self.use(settings)
+
+    def use(self, settings: LogConfig) -> None:
+        """Tell from this level on; where it goes and how stays as it began."""
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
                 structlog.processors.add_log_level,
-                structlog.processors.TimeStamper(fmt="iso", utc=form != "console"),
+                structlog.processors.TimeStamper(fmt="iso", utc=self._form != "console"),
                 _in_order,
                 _printable,
-                _renderer(form),
+                _renderer(self._form),
             ],
             wrapper_class=structlog.make_filtering_bound_logger(
                 logging.getLevelNamesMapping()[settings.level.upper()]

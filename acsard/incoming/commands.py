@@ -1,7 +1,7 @@
 """A sample from the bus -> a `Command` or a `Request`, or the reason it is refused.
 
 Refused whole, never in part: a command that cannot be decoded, is too big, holds NaN or infinity
-in any field, or came by a wildcard key or a DELETE refreshes nothing.
+in any field that is for us, or came by a wildcard key or a DELETE refreshes nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ from acsard.config.settings import JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
-from acsard.messages.schema import Header, JointState, SetPose, Twist, TwistStamped, Vector3
+from acsard.messages.schema import (
+    Header,
+    JointState,
+    SetPose,
+    Settings,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
 from acsard.ros.attachments import GID_BYTES, unpack
 from acsard.ros.transports import Transport
 from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
@@ -71,6 +79,13 @@ STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
 _poses = Decoder(SetPose)
+_settings = Decoder(Settings)
+
+EXAMPLES: dict[Verb, str] = {
+    "set_pose": '{"x": 0, "y": 0, "yaw": 0}',
+    "set": '{"settings": {"limits.linear_speed": 0.8}}',
+}
+"""The payload of each service that has one."""
 
 
 class Receiver:
@@ -135,27 +150,36 @@ class Receiver:
 
     def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
         got = _wheels.decode(arrival.encoding, arrival.payload)
-        if sorted(got.name) != sorted(self._joints) or len(got.velocity) != 4:
+        named, count = [got.name.count(joint) for joint in self._joints], len(got.name)
+        if named != [1] * 4 or len(got.velocity) != count:
             raise DecodeError(
-                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}"
+                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}, once"
             )
-        if not all(map(math.isfinite, (*got.velocity, *got.position, *got.effort))):
+        places = [got.name.index(joint) for joint in self._joints]
+        # What is told of other joints, say of an arm, is not for us.
+        velocity, position, effort = (
+            [told[place] for place in places] if len(told) == count else told
+            for told in (got.velocity, got.position, got.effort)
+        )
+        if not all(map(math.isfinite, (*velocity, *position, *effort))):
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
-        speed = dict(zip(got.name, got.velocity, strict=True))
-        twist = self._kinematics.twist(WheelSpeeds(*(speed[joint] for joint in self._joints)))
+        twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "wheel speeds beyond all numbers")
-        return twist, got.header, twist == REST and any(got.velocity)
+        return twist, got.header, twist == REST and any(velocity)
 
     @staticmethod
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
         """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
-        if verb != "set_pose":
+        if verb not in EXAMPLES:
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
+        if verb == "set":
+            wished = _settings.decode(encoding, payload).settings
+            return Request(verb, ticket, asked_ns=asked_ns, settings=wished)
         got = _poses.decode(encoding, payload)
         if (
             not all(map(math.isfinite, (got.x, got.y, got.yaw)))

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.incoming.asker import asker
-from acsard.incoming.commands import Receiver, Via
+from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
 from acsard.messages.json_schema import SCHEMAS
@@ -39,11 +39,20 @@ from acsard.messages.topics import (
     whoami_key,
 )
 from acsard.ros.attachments import Attachment, unpack
-from acsard.ros.parameters import Parameters
-from acsard.ros.transports import PARAMETERS
+from acsard.ros.parameters import (
+    MAX_REQUEST_BYTES,
+    SETTING,
+    Parameters,
+    failure,
+    outcome,
+    wished,
+)
+from acsard.ros.transports import PARAMETERS, in_ros_words
 from acsard.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
+
+BUSY = "busy: too many queries at once; ask again"
 
 
 class Query(Struct, frozen=True):
@@ -76,6 +85,17 @@ class Reply(Struct, frozen=True):
     attachment: bytes = b""
 
 
+class _Waiting(Struct, frozen=True):
+    """Who waits for the robot's answer: the key and encoding of the reply, and whom to echo."""
+
+    key: str
+    form: Format
+    asked: Attachment | None
+    ros: bool = False
+    wish: bytes = b""
+    """The request to set parameters that it is, which the reply has to fit."""
+
+
 class Queries:
     """Answers queries from what it was given at the start and the present values."""
 
@@ -87,14 +107,21 @@ class Queries:
             "topics": topic_table(config),
         }
         self._parameters = Parameters(effective(config))
-        self._waiting: dict[int, tuple[str, Format, Attachment | None]] = {}
+        self._waiting: dict[int, _Waiting] = {}
+        """By ticket."""
+
+    def use(self, config: Config) -> None:
+        """Tell of this configuration from now on."""
+        self._config = config
+        self._fixed["config"] = effective(config)
+        self._parameters = Parameters(effective(config))
 
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
         """The replies to a query, none when it is not for us; a `Request` when it is a service.
 
-        Raises `DecodeError` for a ROS request that cannot be answered: ROS clients hear no errors.
+        Raises `DecodeError` for a ROS request that cannot be served; `refused` has its reply.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -115,21 +142,36 @@ class Queries:
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
-        key, form, asked = waiting
-        payload = encode(ServiceReply(answer.success, answer.message), form)
-        encoding = encoding_name(form, "ServiceReply")
-        return Reply(answer.id, key, payload, encoding, attachment=_echo(asked, wall_ns))
+        key, form, message, name = waiting.key, waiting.form, answer.message, "ServiceReply"
+        if waiting.ros:
+            message = in_ros_words(message, self._config.ros)
+        if waiting.wish:
+            service, name = key.removeprefix(PARAMETERS), ""
+            payload = outcome(service, waiting.wish, answer.success, message)
+        else:
+            payload = encode(ServiceReply(answer.success, message), form)
+        attachment = _echo(waiting.asked, wall_ns)
+        return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
         """A std_srvs/Trigger, or one of the parameter services."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
+        by = asker(query.via, query.attachment)
         verb = VERBS.get(query.topic)
         if verb is not None:
-            self._waiting[query.ticket] = (query.topic, "cdr", asked)
-            by = asker(query.via, query.attachment)
+            self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
             return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
+        if len(query.payload) > MAX_REQUEST_BYTES:
+            raise DecodeError("too_big", f"over {MAX_REQUEST_BYTES} bytes")
         try:
             service = query.topic.removeprefix(PARAMETERS)
+            if service in SETTING:
+                wish = wished(query.payload)
+                self._waiting[query.ticket] = _Waiting(
+                    query.topic, "cdr", asked, True, query.payload
+                )
+                ticket, at_ns = query.ticket, query.arrived_ns
+                return Request("set", ticket, asked_ns=at_ns, by=by, settings=wish)
             payload = self._parameters.answer(service, query.payload)
         except CdrError as error:
             raise DecodeError("malformed", str(error)) from None
@@ -148,10 +190,10 @@ class Queries:
                 query.arrived_ns,
             )
         except DecodeError as error:
-            message = ServiceReply(False, f'{error}; send {{"x": 0, "y": 0, "yaw": 0}}')
+            message = ServiceReply(False, f"{error}; send {EXAMPLES[VERBS[query.topic]]}")
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
-        self._waiting[query.ticket] = (query.topic, form, None)
+        self._waiting[query.ticket] = _Waiting(query.topic, form, None)
         return replace(request, by=asker(query.via, query.attachment))
 
     def _values(
@@ -173,6 +215,30 @@ class Queries:
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
         value = current(topic.removeprefix(JSON_TREE))
         return [] if value is None else [(topic, type(value).__name__, value)]
+
+
+def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
+    """The reply to a query that is not served; None where no reply would find its caller.
+
+    ROS clients hear no errors: theirs is an answer that says no.
+    """
+    if query.via == "native":
+        return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
+    try:
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+    except DecodeError:
+        return None
+    if query.topic in VERBS:
+        payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
+    else:
+        payload, name = failure(query.topic.removeprefix(PARAMETERS), why), ""
+    encoding = encoding_name("cdr", name)
+    return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
+
+
+def most_bytes(topic: str) -> int:
+    """How much of a query's payload is worth keeping."""
+    return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:

@@ -18,13 +18,14 @@ from acsard.messages.schema import (
     Imu,
     JointState,
     SetPose,
+    Settings,
     Twist,
     TwistStamped,
 )
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = (Twist, SetPose, DoorState)
+ONLY_IN = (Twist, SetPose, Settings, DoorState)
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {

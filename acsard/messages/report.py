@@ -11,18 +11,15 @@ from collections.abc import Callable, Collection, Iterator
 from msgspec.structs import asdict
 
 from acsard.config.settings import Config
-from acsard.config.wire_time import wire_use
-from acsard.drive.gyro import WORDS
 from acsard.drive.words import waiting
 from acsard.messages.covariances import Covariances
+from acsard.messages.diagnostics import diagnostics
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
-    DiagnosticStatus,
     Figure,
     Header,
     JointState,
-    KeyValue,
     Message,
     Odometry,
     Pose,
@@ -42,14 +39,10 @@ from acsard.messages.schema import (
 )
 from acsard.values import (
     NS_PER_S,
-    WHEELS,
     Estimate,
-    GyroStatus,
     Instant,
     Outputs,
-    RoutersStatus,
     Snapshot,
-    WheelsStatus,
 )
 from acsard.values import Spread as Measurements
 from acsard.values import Twist as BodyTwist
@@ -80,13 +73,17 @@ class Report:
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
     ) -> None:
-        self._config = config
         self.certificate_ends_ns = certificate_ends_ns
         """Wall-clock time; the door tells it where the daemon may not read it."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
+        self.use(config)
+
+    def use(self, config: Config) -> None:
+        """By this configuration from now on."""
+        self._config = config
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
         self._covariances = Covariances(config.odometry)
 
@@ -226,102 +223,8 @@ class Report:
             return 0, ""
         return expiry(self.certificate_ends_ns, now.wall_ns)
 
-    def _gyro(self, gyro: GyroStatus) -> list[tuple[str, int, str, dict[str, str]]]:
-        """The row of the gyro, none without one."""
-        if gyro.does == "off":
-            return []
-        values = {"delay_s": f"{gyro.delay:.3f}"}
-        if gyro.bias is not None:
-            values["bias_rad_s"] = f"{gyro.bias:.5f}"
-        if gyro.track is not None:
-            configured = self._config.drive.wheel_separation_multiplier
-            values["wheel_separation_multiplier"] = f"{configured:.3f}"
-            values["learned_multiplier"] = f"{configured * gyro.track:.3f}"
-        level = int(gyro.does not in ("used", "waiting for rest"))
-        return [("gyro", level, WORDS[gyro.does], values)]
-
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
-        config, counters, figures = self._config, snapshot.counters, snapshot.figures
-        ok, warning, error = 0, 1, 2
-        use = wire_use(config.rate_hz, config.mcu.baud_rate, config.mcu.line_bytes)
-        certificate = self._certificate(outputs.now)
-        periods = figures["period_lateness"].since_start.count if figures else 0
-        missed = counters.get("missed_periods", 0)
-        mode_level = error if outputs.mode == "fault" else ok
-        statuses = (
-            ("mode", mode_level, outputs.reason, {"mode": outputs.mode, "source": outputs.source}),
-            (
-                "serial link",
-                ok if outputs.link == "up" else error,
-                outputs.link,
-                {"port": config.mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
-                | _found(snapshot.encoders)
-                | {k: str(v) for k, v in counters.items() if k.startswith("line")},
-            ),
-            (
-                "control loop",
-                warning if missed > 0.01 * max(1, periods) else ok,
-                f"{missed} of {periods} periods missed",
-                {
-                    f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
-                    for name, one in figures.items()
-                    for when, spread in (("", one.since_start), ("_minute", one.last_minute))
-                    for share in ("p50", "p99", "max")
-                }
-                | {k: str(v) for k, v in counters.items() if k.startswith("bus")},
-            ),
-            (
-                "commands",
-                ok,
-                f"commanded by {outputs.source}" if outputs.source else "no commands",
-                {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
-                | {k: str(v) for k, v in counters.items() if k.startswith("command")},
-            ),
-            ("wheels", *_wheels(snapshot.doubt, counters)),
-            *self._gyro(snapshot.gyro),
-            *_routers(snapshot.routers),
-            *([("certificate", *certificate, {})] if certificate[1] else []),
-        )
-        return DiagnosticArray(
-            Header(Time.from_ns(outputs.now.wall_ns)),
-            [
-                DiagnosticStatus(
-                    level,
-                    f"acsard: {name}",
-                    message,
-                    config.robot.id,
-                    [KeyValue(key, value) for key, value in values.items()],
-                )
-                for name, level, message, values in statuses
-            ],
-        )
-
-
-def _found(encoders: tuple[int, ...]) -> dict[str, str]:
-    """What the serial link's row says of the encoders: nothing, where nothing was found."""
-    named = zip(WHEELS, encoders, strict=False)
-    return {f"counts_{name}": str(counts) for name, counts in named if counts}
-
-
-def _routers(routers: RoutersStatus) -> list[tuple[str, int, str, dict[str, str]]]:
-    """The row of what `bus.connect` names, none where it names nothing."""
-    missing, connected = routers.missing, routers.connected
-    values = dict.fromkeys(connected, "connected") | dict.fromkeys(missing, "not connected")
-    words = f"not connected to {', '.join(missing)}" if missing else "connected"
-    return [("router", int(bool(missing)), words, values)] if values else []
-
-
-def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> tuple[int, str, dict[str, str]]:
-    """How bad, in words, and what front and rear say of each other."""
-    left, right = doubt.differ
-    values = {
-        "left_out": ", ".join(doubt.left_out),
-        "slipping": ", ".join(doubt.slipping),
-        "front_more_left": f"{left:.3f}",
-        "front_more_right": f"{right:.3f}",
-    }
-    told = {k: str(v) for k, v in counters.items() if k.startswith("wheels")}
-    return int(bool(doubt.text)), doubt.text or "front and rear agree", values | told
+        return diagnostics(self._config, outputs, snapshot, self._certificate(outputs.now))
 
 
 def _spread(spread: Measurements) -> Spread:

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from acsard.drive.modes import Mode
 from acsard.mcu.link import State
 from acsard.messages.topics import Direction
-from acsard.values import NS_PER_S, GyroDoes
+from acsard.values import NS_PER_S, GyroDoes, Plain
 
 # What `cdr.py` has to know: the width of an int in CDR, the length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -285,6 +285,12 @@ class SetPose(Message, frozen=True):
     yaw: float
 
 
+class Settings(Message, frozen=True):
+    """What is to be set: values by their keys in `acsard.toml`, tables and key joined by dots."""
+
+    settings: Annotated[dict[str, Plain], FEW]
+
+
 class Info(Message, frozen=True):
     """Who is this daemon."""
 
@@ -356,6 +362,7 @@ MESSAGES: dict[str, type[Message]] = {
         DiagnosticArray,
         ServiceReply,
         SetPose,
+        Settings,
         Info,
         Interfaces,
         Topics,

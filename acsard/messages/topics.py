@@ -48,6 +48,7 @@ _SERVICE_NOTES: dict[Verb, str] = {
     "deactivate": "switch off; ramps to zero, commands do not count",
     "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
     "set_pose": "the pose becomes the payload {x, y, yaw}",
+    "set": "settings become those of the payload {settings: {key: value}}",
 }
 
 

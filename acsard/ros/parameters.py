@@ -1,4 +1,6 @@
-"""The configuration as read-only ROS parameters: what `ros2 param list` and `get` ask a node.
+"""The configuration as ROS parameters: what `ros2 param` and `rqt_reconfigure` ask of a node.
+
+Those of `config/live.py` can be set; setting is the robot's to do, and here only its language.
 
 The rcl_interfaces structs live here, since nothing else speaks them; names are those of
 `acsard.toml`, joined by dots.
@@ -11,18 +13,28 @@ from typing import Annotated, TypeVar
 
 from msgspec import Meta, Struct
 
-from acsard.messages.cdr import Cdr
-
-Unsigned8 = Annotated[int, Meta(extra={"cdr": "B"})]
-Signed64 = Annotated[int, Meta(extra={"cdr": "q"})]
-Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
+from acsard.config.live import flat
+from acsard.messages.cdr import Cdr, CdrError
+from acsard.ros.descriptors import (
+    ParameterDescriptor,
+    Signed64,
+    Unsigned8,
+    Unsigned64,
+    described,
+)
+from acsard.values import Plain
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
 """All parameters at once are fewer; a request of more takes too long to answer in one step."""
+Many = Annotated[list[T], Meta(max_length=256)]
+"""Of what is quicker to read: names alone."""
+
+MAX_REQUEST_BYTES = 16384
+"""As many of the longest names."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
-DOUBLE_ARRAY, STRING_ARRAY = 8, 9
+INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
 
 SEPARATOR = "."
 
@@ -51,35 +63,6 @@ class Parameter(Struct, frozen=True):
     value: ParameterValue
 
 
-class FloatingPointRange(Struct, frozen=True):
-    """Bounds of a float."""
-
-    from_value: float
-    to_value: float
-    step: float
-
-
-class IntegerRange(Struct, frozen=True):
-    """Bounds of an integer."""
-
-    from_value: Signed64
-    to_value: Signed64
-    step: Unsigned64
-
-
-class ParameterDescriptor(Struct, frozen=True):
-    """What a parameter is."""
-
-    name: str
-    type: Unsigned8
-    description: str = ""
-    additional_constraints: str = ""
-    read_only: bool = True
-    dynamic_typing: bool = False
-    floating_point_range: list[FloatingPointRange] = []
-    integer_range: list[IntegerRange] = []
-
-
 class SetParametersResult(Struct, frozen=True):
     """Was it set, and if not, why."""
 
@@ -90,7 +73,7 @@ class SetParametersResult(Struct, frozen=True):
 class ListRequest(Struct, frozen=True):
     """`depth` 0 is any depth; no prefixes are all."""
 
-    prefixes: Some[str]
+    prefixes: Many[str]
     depth: Unsigned64
 
 
@@ -104,7 +87,7 @@ class ListReply(Struct, frozen=True):
 class Names(Struct, frozen=True):
     """The request of get, types and describe."""
 
-    names: Some[str]
+    names: Many[str]
 
 
 class Values(Struct, frozen=True):
@@ -143,25 +126,38 @@ class SetAtomicallyReply(Struct, frozen=True):
     result: SetParametersResult
 
 
-REFUSED = SetParametersResult(False, "read-only: change acsard.toml and start acsard anew")
+SETTING = ("set_parameters", "set_parameters_atomically")
+"""The services that are asked of the robot."""
+
+
+def failure(service: str, why: str) -> bytes:
+    """The reply to a request that is not served: as rclcpp, nothing where there is no room for why.
+
+    A client without any reply would wait for ever.
+    """
+    refused = SetParametersResult(False, why)
+    replies: dict[str, Struct] = {
+        "list_parameters": ListReply([], []),
+        "get_parameters": Values([]),
+        "get_parameter_types": Types([]),
+        "describe_parameters": Descriptors([]),
+        "set_parameters": SetReply([refused]),
+        "set_parameters_atomically": SetAtomicallyReply(refused),
+    }
+    reply = replies[service]
+    return Cdr(type(reply)).encode(reply)
 
 
 class Parameters:
-    """Answers the six parameter services from the tables of a configuration."""
+    """Answers the parameter services that ask, from the tables of a configuration."""
 
     def __init__(self, tables: Mapping[str, object]) -> None:
-        self._values = {name: _value(value) for name, value in _flat(tables, "")}
+        self._values = {name: _value(value) for name, value in flat(tables)}
         self._services: dict[str, Callable[[bytes], bytes]] = {
             "list_parameters": _service(ListRequest, self._list),
             "get_parameters": _service(Names, self._get),
             "get_parameter_types": _service(Names, self._types),
             "describe_parameters": _service(Names, self._describe),
-            "set_parameters": _service(
-                SetRequest, lambda asked: SetReply([REFUSED] * len(asked.parameters))
-            ),
-            "set_parameters_atomically": _service(
-                SetRequest, lambda _: SetAtomicallyReply(REFUSED)
-            ),
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
@@ -189,7 +185,38 @@ class Parameters:
         return Types([value.type for _, value in self._of(asked)])
 
     def _describe(self, asked: Names) -> Descriptors:
-        return Descriptors([ParameterDescriptor(name, v.type) for name, v in self._of(asked)])
+        return Descriptors([described(name, value.type) for name, value in self._of(asked)])
+
+
+def wished(payload: bytes) -> dict[str, Plain]:
+    """What a request to set asks for, by name; raises `CdrError`."""
+    asked = Cdr(SetRequest).decode(payload)
+    return {one.name: _plain(one) for one in asked.parameters}
+
+
+def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
+    """The reply to a request to set, which the robot does whole or not at all."""
+    result = SetParametersResult(successful, reason)
+    if service == "set_parameters_atomically":
+        return Cdr(SetAtomicallyReply).encode(SetAtomicallyReply(result))
+    asked = Cdr(SetRequest).decode(payload)
+    return Cdr(SetReply).encode(SetReply([result] * len(asked.parameters)))
+
+
+def _plain(parameter: Parameter) -> Plain:
+    value = parameter.value
+    fields: dict[int, Plain] = {
+        BOOL: value.bool_value,
+        INTEGER: value.integer_value,
+        DOUBLE: value.double_value,
+        STRING: value.string_value,
+        INTEGER_ARRAY: [float(one) for one in value.integer_array_value],
+        DOUBLE_ARRAY: [*value.double_array_value],
+        STRING_ARRAY: [*value.string_array_value],
+    }
+    if value.type not in fields:
+        raise CdrError(f"{parameter.name}: no value that a setting could have")
+    return fields[value.type]
 
 
 def _service(request: type[Q], reply: Callable[[Q], Struct]) -> Callable[[bytes], bytes]:
@@ -205,19 +232,6 @@ def _service(request: type[Q], reply: Callable[[Q], Struct]) -> Callable[[bytes]
 def _below(name: str, prefix: str, depth: int) -> bool:
     rest = name.removeprefix(prefix + SEPARATOR)
     return name == prefix or (rest != name and (not depth or rest.count(SEPARATOR) < depth))
-
-
-def _flat(value: object, name: str) -> Iterator[tuple[str, object]]:
-    """Every leaf with its dotted name; a list of named tables counts as tables by those names."""
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _flat(inner, f"{name}{SEPARATOR}{key}" if name else str(key))
-    elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
-        for table in value:
-            rest = {key: inner for key, inner in table.items() if key != "name"}
-            yield from _flat(rest, f"{name}{SEPARATOR}{table['name']}")
-    else:
-        yield name, value
 
 
 def _value(value: object) -> ParameterValue:

@@ -6,6 +6,7 @@ command, and what goes out the same message, as on the native key beside it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Iterator
 from typing import Literal
 
@@ -47,6 +48,8 @@ class Endpoint(Struct, frozen=True):
 KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
 
 TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
+
+_NAMED = re.compile(rf"\bsrv/({'|'.join(TRIGGERS)})\b")
 
 PARAMETER_SERVICES = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
@@ -114,6 +117,11 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
             for name, type_name in PARAMETER_SERVICES.items()
         ),
     )
+
+
+def in_ros_words(text: str, ros: RosConfig) -> str:
+    """The text with the services called as ROS calls them: /acsard/clear, not srv/clear."""
+    return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:

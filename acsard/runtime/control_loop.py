@@ -19,7 +19,7 @@ from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
-from acsard.incoming.queries import Queries
+from acsard.incoming.queries import Queries, refused
 from acsard.incoming.routers import RoutersTold
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
@@ -68,10 +68,12 @@ class ControlLoop:
         certificate_ends_ns: int | None = None,
         others: list[Event] | None = None,
         beside: Callable[[str], Message | None] | None = None,
+        adopted: Callable[[Config], None] | None = None,
     ) -> None:
         """`others` are the events of the daemon's other parts; each step takes what is there.
 
-        `beside` has the present values of the keys that those parts publish.
+        `beside` has the present values of the keys that those parts publish; `adopted` hears of a
+        configuration that is in force from now on.
         """
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
@@ -81,13 +83,9 @@ class ControlLoop:
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
         self._beside = beside
+        self._config, self._adopted = config, adopted
         stop = self.robot.session.codec.stop
-        self._guard = Guard(
-            stop,
-            config.limits.wheel_speed,
-            config.commands.sources,
-            require_check=config.mcu.link_check == "require",
-        )
+        self._guard = _guard(stop, config)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
@@ -130,7 +128,7 @@ class ControlLoop:
         """One step at `now`, at the end of a period or between two."""
         ended, missed = period.expired > 0, max(0, period.expired - 1)
         if ended:
-            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns)
+            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self._pace
         inputs = Inputs(
@@ -154,14 +152,26 @@ class ControlLoop:
         self._others.clear()
         self._turn_rates.clear()
         outputs = self.outputs = self.robot.step(inputs)
+        adopts = self.robot.config is not self._config
+        if adopts:
+            self._adopt(self.robot.config)
         went = self._send(outputs, now, inputs.tick)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
+        if adopts and self._adopted:  # once the log has told of it
+            self._adopted(self._config)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
         # Last of all: who sends needs the interpreter, and gets it when the loop waits again.
         self._bus.flush()
         return outputs
+
+    def _adopt(self, config: Config) -> None:
+        """Go by the configuration that the robot goes by since this step."""
+        self._config = config
+        self._guard = _guard(self.robot.session.codec.stop, config)
+        self.report.use(config)
+        self._queries.use(config)
 
     def _from_bus(
         self, now: Instant
@@ -214,7 +224,8 @@ class ControlLoop:
                 served = self._queries.serve(query, self._current, self.outputs)
             except DecodeError as error:
                 refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
-                served = []
+                reply = refused(query, str(error), now.wall_ns)
+                served = [] if reply is None else [reply]
             if isinstance(served, Request):
                 requests.append(served)
                 continue
@@ -265,5 +276,18 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        figures, routers = self._stopwatch.measured(now_ns), self._routers.status
-        return replace(self.robot.snapshot(now_ns), figures=figures, routers=routers)
+        return replace(
+            self.robot.snapshot(now_ns),
+            figures=self._stopwatch.measured(now_ns),
+            missed_last_minute=self._stopwatch.missed(now_ns),
+            routers=self._routers.status,
+        )
+
+
+def _guard(stop: bytes, config: Config) -> Guard:
+    return Guard(
+        stop,
+        config.limits.wheel_speed,
+        config.commands.sources,
+        require_check=config.mcu.link_check == "require",
+    )

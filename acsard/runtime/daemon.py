@@ -114,7 +114,17 @@ async def _run(
         await stack.enter_async_context(port)
         info = _info(config, path)
         control = ControlLoop(
-            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events, beside
+            config,
+            info,
+            port,
+            bus,
+            clock.now(),
+            log.event,
+            clock.mono_ns,
+            ends_ns,
+            events,
+            beside,
+            lambda adopted: log.use(adopted.log),
         )
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)

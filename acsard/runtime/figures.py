@@ -6,6 +6,7 @@ over the last minute. They go out in `state` and `diagnostics`.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Literal, get_args
 
 from acsard.runtime.histogram import Histogram
@@ -70,6 +71,25 @@ class _Figure:
             self._past.merge(self._slots[new % SLOTS])
             self._slots[new % SLOTS] = Histogram()
         self._number = number
+
+
+class LastMinute:
+    """How often something happened in the last minute, by the same pieces."""
+
+    def __init__(self) -> None:
+        self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
+
+    def add(self, now_ns: int, count: int) -> None:
+        """It happened so often at monotonic `now_ns`."""
+        number, before = now_ns // SLOT_NS, 0
+        if self._slots and self._slots[-1][0] == number:
+            _, before = self._slots.pop()
+        self._slots.append((number, before + count))
+
+    def count(self, now_ns: int) -> int:
+        """How often until monotonic `now_ns`."""
+        oldest = now_ns // SLOT_NS - SLOTS
+        return sum(count for number, count in self._slots if number > oldest)
 
 
 class Figures:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.runtime.figures import Figures
+from acsard.runtime.figures import Figures, LastMinute
 from acsard.values import Estimate, Measured, Outputs
 
 
@@ -11,14 +11,21 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self._figures = Figures()
+        self._missed = LastMinute()
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
         """Every figure by its name."""
         return self._figures.measured(now_ns)
 
-    def period(self, now_ns: int, late_ns: int) -> None:
-        """A period's step began, so late."""
+    def missed(self, now_ns: int) -> int:
+        """How many periods of the last minute had no step."""
+        return self._missed.count(now_ns)
+
+    def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
+        """A period's step began, so late, and so many before it had none."""
         self._figures.add("period_lateness", now_ns, late_ns)
+        if missed:
+            self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
         """A line left, after one at `before_ns`: how old is what it says?"""

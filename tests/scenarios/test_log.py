@@ -8,7 +8,7 @@ from typing import get_args
 import msgspec
 import pytest
 
-from acsard.incoming.commands import Arrival, Via
+from acsard.incoming.commands import EXAMPLES, Arrival, Via
 from acsard.incoming.queries import Query
 from acsard.messages.topics import VERBS
 from acsard.values import NS_PER_S, Event, EventName
@@ -42,7 +42,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
         world.bus.arrivals.append(
             Arrival("stop", True, b"", "", at_ns, None, "", via=via, attachment=name)
         )
-    payload = b'{"x": 1, "y": 2, "yaw": 0}' if service == "set_pose" else b""
+    payload = EXAMPLES.get(VERBS[key], "").encode()
     query = Query(1, key, key, "", payload, "", at_ns, via, name)
     world.bus.queries.append(query)
     world.run(0.03)

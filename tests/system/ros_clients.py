@@ -106,6 +106,8 @@ for _name, _text in {
     "rcl_interfaces/msg/ListRequest": "string[] prefixes\nuint64 depth",
     "rcl_interfaces/msg/GetRequest": "string[] names",
     "rcl_interfaces/msg/GetReply": "rcl_interfaces/ParameterValue[] values",
+    "rcl_interfaces/msg/SetRequest": "rcl_interfaces/Parameter[] parameters",
+    "rcl_interfaces/msg/SetReply": "rcl_interfaces/SetParametersResult[] results",
 }.items():
     _store.register(get_types_from_msg(_text, _name))
 

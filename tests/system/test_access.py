@@ -47,6 +47,7 @@ VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 TWIST_JSON = json.dumps(ZERO).encode()
 WHEELS_JSON = json.dumps({"name": ros.WHEELS, "velocity": [0.0] * 4}).encode()
 POSE_JSON = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
+SET_JSON = json.dumps({"settings": {"rates.state": 10.0}}).encode()
 FORGED = b"forged"
 NO_NAMES = b"\x00\x01\x00\x00" + bytes(4)
 NO_PREFIXES = b"\x00\x01\x00\x00" + bytes(16)
@@ -153,6 +154,7 @@ def _services() -> Iterator[Try]:
         yield Try(f"acsard/{verb}", who, ros.EMPTY_REQUEST)
         yield Try(ros.rmw_key(f"acsard/{verb}", ros.TRIGGER), who, ros.EMPTY_REQUEST)
     yield Try(f"{ME}/srv/set_pose", KEEPERS, POSE_JSON)
+    yield Try(f"{ME}/srv/set", KEEPERS, SET_JSON)
     for name, kind in ros.PARAMETER_SERVICES.items():
         payload = NO_PREFIXES if name == "list_parameters" else NO_NAMES
         yield Try(f"acsard/{name}", KEEPERS, payload)

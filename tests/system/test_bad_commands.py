@@ -107,7 +107,7 @@ BAD = {
         wheel_speeds([*JOINTS, JOINTS[0]], [10.0] * 4), "wrong_wheels", "rear_right", WHEEL
     ),
     "a fifth wheel": Bad(
-        wheel_speeds([*ALL_JOINTS, "spare"], [10.0] * 5), "wrong_wheels", "rear_right", WHEEL
+        wheel_speeds([*ALL_JOINTS, "spare"], [10.0] * 4), "wrong_wheels", "rear_right", WHEEL
     ),
     "a speed missing": Bad(
         wheel_speeds(ALL_JOINTS, [10.0] * 3), "wrong_wheels", "rear_right", WHEEL

@@ -42,7 +42,7 @@ PUBLISHED = {
     "diagnostics": "DiagnosticArray",
     "sim/pose": "PoseStamped",
 }
-SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose")
+SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set")
 FIELDS = {
     "odom": {"header", "child_frame_id", "pose", "twist"},
     "tf": {"transforms"},
@@ -183,7 +183,7 @@ def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
     assert all(answer.ok for answer in answers)
     types = [answer.key.removeprefix("schema/") for answer in answers]
     assert len(types) == len(set(types))
-    asked = {"ServiceReply", "Twist", "JointStateIn", "SetPose", "Config"}
+    asked = {"ServiceReply", "Twist", "JointStateIn", "SetPose", "Settings", "Config"}
     assert {*PUBLISHED.values(), *asked} <= set(types)
 
 

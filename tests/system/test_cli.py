@@ -50,6 +50,7 @@ VERBS = (
     "drive",
     "call",
     "whoami",
+    "set",
 )
 
 
@@ -326,6 +327,65 @@ def test_call_with_the_wrong_values_ends_with_2_and_the_form(
     assert (ended.code, ended.out) == (2, "")
     assert f"acsard call {words[0]}" in ended.err or "usage: acsard call" in ended.err
     bus.comes_to("ready")
+
+
+# set
+
+
+def test_set_changes_the_robot_that_runs_and_with_write_the_file(
+    shared: Daemon, bus: Bus, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.toml"
+    text = shared.config.read_text(encoding="utf-8")
+    file.write_text(f"{text}\n[rates]\nstate = 10.0  # often\n", encoding="utf-8")
+    words = ("set", "rates.state", "5", "log.level", "debug", "--config", str(file))
+    try:
+        ended = finish(acsard(*words), tmp_path)
+        assert (ended.code, ended.out) == (
+            0,
+            'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); until the next start',
+        )
+        assert bus.get("config")["rates"]["state"] == 5.0
+        assert "state = 10.0  # often" in file.read_text(encoding="utf-8")
+        ended = finish(
+            acsard("set", "rates.state", "4", "--write", "--config", str(file)), tmp_path
+        )
+        assert (ended.code, ended.out) == (
+            0, f"rates.state = 4.0 (was 5.0); written to {file}",
+        )  # fmt: skip
+        assert "state = 4 # often" in file.read_text(encoding="utf-8").replace("  #", " #")
+    finally:
+        assert tool(shared, "set", "rates.state", "10", "log.level", "info").code == 0
+
+
+def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> None:
+    told = tool(shared, "set")
+    assert told.code == 0
+    assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in told.out
+    assert "only while the robot stands" in told.out
+    found = json.loads(tool(shared, "set", "--json").out)
+    assert found["limits.linear_speed"] == bus.get("config")["limits"]["linear_speed"]
+    assert "mcu.port" not in found
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
+        (("mcu.port", "/dev/x"), 1, "takes a start"),
+        (("limits.linear_speed",), 2, "acsard set KEY VALUE"),
+        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "[[commands.sources]]"),
+        (("--write",), 2, "--write needs a setting"),
+    ],
+)
+def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
+    shared: Daemon, bus: Bus, words: tuple[str, ...], code: int, said: str
+) -> None:
+    before, text = bus.get("config"), shared.config.read_text(encoding="utf-8")
+    ended = tool(shared, "set", *words)
+    assert ended.code == code
+    assert said in ended.out + ended.err
+    assert (bus.get("config"), shared.config.read_text(encoding="utf-8")) == (before, text)
 
 
 # sim and run in two processes

@@ -66,6 +66,7 @@ ONE, TWO = "acsard/robot1", "acsard/robot2"
 TWIST = json.dumps(ZERO).encode()
 WHEELS = json.dumps({"name": astuple(Config().joints), "velocity": [0.0] * 4}).encode()
 POSE = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
+SET = json.dumps({"settings": {"rates.state": 10.0}}).encode()
 TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
@@ -126,9 +127,13 @@ def _queries() -> Iterator[Try]:
         yield Try(f"{ONE}/{key}", NOBODY)
     for key in ("acsard/*/srv/stop", "acsard/*/config", "acsard/**", "**", "@/*/router/**"):
         yield Try(key, NOBODY)
-    least = dict.fromkeys(SERVICES, DRIVERS) | {"stop": ANYBODY, "set_pose": KEEPERS}
+    least = dict.fromkeys(SERVICES, DRIVERS) | {
+        "stop": ANYBODY,
+        "set_pose": KEEPERS,
+        "set": KEEPERS,
+    }
     for verb, who in least.items():
-        yield Try(f"{ONE}/srv/{verb}", who, POSE if verb == "set_pose" else b"")
+        yield Try(f"{ONE}/srv/{verb}", who, {"set_pose": POSE, "set": SET}.get(verb, b""))
     yield Try(f"{TWO}/srv/stop", ANYBODY | ITSELF)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -10,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -593,12 +595,13 @@ def test_a_stop_without_attachment_stops_all_the_same(bus: Bus, ros: RmwClient) 
 @pytest.mark.parametrize(
     "request_bytes", [b"", b"\0\1", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", b"\0\7\0\0\0\0\0\0"]
 )
-def test_a_parameter_request_that_is_none_is_counted_and_ends_without_an_answer(
+def test_a_parameter_request_that_is_none_is_counted_and_answered_by_nothing(
     bus: Bus, ros: RmwClient, request_bytes: bytes
 ) -> None:
     before = bus.state()
     called = ros.call("acsard/get_parameters", GET, request_bytes)
-    assert (called.replies, called.errors) == ([], 0)
+    (reply,) = called.replies
+    assert decode("rcl_interfaces/msg/GetReply", reply.payload).values == []
     assert called.seconds < 1.0
     assert changes(before, bus.state()) == {"command_malformed": 1}
 
@@ -608,6 +611,63 @@ def test_parameters_can_be_asked_for_by_hand(ros: RmwClient) -> None:
     called = ros.call("acsard/get_parameters", GET, request)
     reply = decode("rcl_interfaces/msg/GetReply", called.replies[0].payload)
     assert [(value.type, value.integer_value) for value in reply.values] == [(2, 10)]
+
+
+def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> None:
+    for count, answered in ((128, 128), (129, 129), (256, 256), (300, 0), (1000, 0)):
+        names = ["commands.sources.nav.priority"] * count
+        request = encode(make("rcl_interfaces/msg/GetRequest", names=names))
+        (reply,) = ros.call("acsard/get_parameters", GET, request).replies
+        assert len(decode("rcl_interfaces/msg/GetReply", reply.payload).values) == answered
+
+
+@pytest.mark.parametrize("count", [100, 300])
+@pytest.mark.parametrize("service", ["acsard/get_parameters", "acsard/reset_odometry"])
+def test_of_many_calls_at_once_every_one_is_answered(
+    bus: Bus, ros: RmwClient, service: str, count: int
+) -> None:
+    names = encode(make("rcl_interfaces/msg/GetRequest", names=["robot.id"]))
+    request = names if service.endswith("parameters") else EMPTY_REQUEST
+    answers: queue.SimpleQueue[int] = queue.SimpleQueue()
+    asked = [ros.attachment() for _ in range(count)]
+    for attachment in asked:
+        ros.session.get(
+            ros.key(service, SERVICES[service]),
+            lambda reply: answers.put(reply.ok is not None),
+            payload=request,
+            attachment=attachment,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=20.0,
+        )
+    assert [answers.get(timeout=20.0) for _ in asked] == [True] * count
+    bus.state()
+
+
+@pytest.mark.parametrize("way", ["rmw", "bridge"])
+def test_a_parameter_is_set_by_both_ways_as_by_anybody(bus: Bus, way: str) -> None:
+    client: Client = RmwClient(bus.session) if way == "rmw" else BridgeHalf(bus.session)
+
+    def ask(value: float) -> Any:
+        none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
+        lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
+        none |= {f"{kind}_value": np.array([]) for kind in lists}
+        double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
+        wish = make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
+        request = encode(make("rcl_interfaces/msg/SetRequest", parameters=[wish]))
+        name = "acsard/set_parameters"
+        (reply,) = client.call(name, SERVICES[name], request).replies
+        return decode("rcl_interfaces/msg/SetReply", reply.payload).results[0]
+
+    before = bus.get("config")["limits"]["linear_speed"]
+    try:
+        assert ask(0.6).successful
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+        refused = ask(60.0)
+        assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+    finally:
+        assert ask(before).successful
 
 
 def test_a_query_on_all_keys_of_ros_stops_nothing(bus: Bus, ros: RmwClient) -> None:

@@ -43,6 +43,7 @@ from acsard.values import (
     Inputs,
     Instant,
     Outputs,
+    Plain,
     Pose,
     Received,
     Request,
@@ -360,6 +361,19 @@ class RobotMachine(RuleBasedStateMachine):
         self.requests.append(Request("set_pose", 2, Pose(x, y, yaw)))
         self.step(reply=True)
 
+    @rule(
+        name=st.sampled_from(
+            ["linear_speed", "angular_speed", "linear_acceleration", "angular_acceleration",
+             "linear_deceleration", "angular_deceleration", "linear_stop_deceleration",
+             "angular_stop_deceleration", "wheel_speed"]
+        ),
+        share=st.sampled_from([0.0, 0.3, 0.8, 1.0, 1.2, 3.0]),
+    )  # fmt: skip
+    def a_limit_is_set(self, name: str, share: float) -> None:
+        value = share * getattr(self.config.limits, name)
+        self.requests.append(Request("set", 3, settings={f"limits.{name}": value}))
+        self.step(reply=True)
+
     @rule()
     def the_odometry_is_reset(self) -> None:
         self.ask("reset_odometry")
@@ -459,11 +473,31 @@ class RobotMachine(RuleBasedStateMachine):
         self.commands.clear()
         self.requests.clear()
         self.received.clear()
+        for request, answer in zip(requests, outputs.answers, strict=True):
+            if request.verb == "set" and answer.success:
+                self.note_limits(request.settings)
         self.keep_books(outputs, commands, requests)
         self.broken = self.broken or outputs.link != "up"
         self.check(outputs, requests)
         self.send(outputs)
         self.before = outputs
+
+    def note_limits(self, settings: dict[str, Plain]) -> None:
+        """These hold from this step on; what would brake softer, or jump, only from rest."""
+        before, at_rest = self.limits, self.before is None or self.before.applied == REST
+        for key, value in settings.items():
+            assert isinstance(value, float)
+            name = key.removeprefix("limits.")
+            if name == "wheel_speed" and value != before.wheel_speed:
+                assert at_rest
+            if name.endswith("deceleration") and value < getattr(before, name):
+                assert at_rest
+            self.limits = msgspec.structs.replace(self.limits, **{name: value})
+        self.guard = Guard(
+            self.robot.session.codec.stop,
+            self.limits.wheel_speed,
+            self.config.commands.sources,
+        )
 
     def keep_books(
         self, outputs: Outputs, commands: tuple[Command, ...], requests: tuple[Request, ...]

@@ -170,6 +170,7 @@ LEAST: dict[str, Role] = {
     "srv/deactivate": "operator",
     "srv/reset_odometry": "operator",
     "srv/set_pose": "maintainer",
+    "srv/set": "maintainer",
 }
 
 

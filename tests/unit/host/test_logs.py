@@ -67,3 +67,16 @@ def test_an_event_below_the_level_is_not_written(tmp_path: Path) -> None:
         log.close()
         stream.seek(0)
         assert [json.loads(line)["event"] for line in stream] == ["link_down"]
+
+
+def test_from_another_level_on_it_tells_more_or_less(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w+") as stream:
+        log = Log(LogConfig(format="json", level="warning"), stream)
+        for level in ("warning", "info", "error", "info"):
+            log.use(LogConfig(format="json", level=level))
+            log.event(Event("mode", level))
+        log.close()
+        stream.seek(0)
+        told = [json.loads(line) for line in stream.read().splitlines()]
+    assert [line["text"] for line in told] == ["info", "info"]
+    assert all(set(line) == {"timestamp", "level", "event", "text"} for line in told)

@@ -196,7 +196,8 @@ def test_joint_names_are_the_configured_ones() -> None:
         joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], JOINTS[0]]),
         joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], "arm"]),
         joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS, JOINTS[0]]),
-        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS, "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS, "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS[:3], "arm", "hand"]),
         joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS, JOINTS[0]]),
         {"velocity": [1.0, 2.0, 3.0, 4.0]},
         {"name": JOINTS, "position": [1.0, 2.0, 3.0, 4.0]},
@@ -204,6 +205,23 @@ def test_joint_names_are_the_configured_ones() -> None:
 )
 def test_all_four_wheels_or_none(body: object) -> None:
     assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("place", range(5))
+def test_the_joints_of_an_arm_among_the_wheels_are_not_for_us(form: Format, place: int) -> None:
+    names, speeds = list(JOINTS), [1.0, 2.0, 4.0, 8.0]
+    names.insert(place, "arm")
+    for arm in (0.0, 1e308, *(NOT_FINITE if form != "json" else ())):
+        velocity = [*speeds[:place], arm, *speeds[place:]]
+        others = {"position": [0.5] * 5, "effort": [0.0] * place + [arm] + [0.0] * (4 - place)}
+        body = joints(*velocity, names=names) | others
+        assert wheels(body, form).twist == wheels(joints(*speeds)).twist
+
+
+def test_what_an_arm_does_is_no_speed_of_the_wheels() -> None:
+    got = wheels(joints(0.0, 0.0, 0.0, 0.0, 3.0, names=[*JOINTS, "arm"]))
+    assert (got.twist, got.cancelled) == (Twist(), False)
 
 
 @pytest.mark.parametrize("bad", NOT_FINITE)

@@ -10,8 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import Config, JointsConfig, RobotConfig
-from acsard.incoming.queries import Queries, Query, Reply
+from acsard.config.settings import Config, JointsConfig, LimitsConfig, RobotConfig, RosConfig
+from acsard.incoming.commands import EXAMPLES
+from acsard.incoming.queries import BUSY, Queries, Query, Reply, most_bytes, refused
 from acsard.messages.cdr import Cdr
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.messages.json_schema import SCHEMAS
@@ -21,7 +22,7 @@ from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.transports import PARAMETER_SERVICES, TRIGGERS
-from acsard.values import ROLES, Answer, Outputs, Pose, Request
+from acsard.values import ROLES, Answer, Outputs, Plain, Pose, Request
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
@@ -29,6 +30,7 @@ NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics
 
 CONFIG = Config(robot=RobotConfig("r7"))
 WALL_NS = 1_700_000_000_000_000_000
+NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
@@ -261,17 +263,20 @@ def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
 # services
 
 POSE = encode({"x": 1.0, "y": 2.0, "yaw": 3.0}, "json")
+SETTINGS = encode({"settings": {"limits.linear_speed": 0.8, "log.level": "debug"}}, "json")
 
 
 def payload_for(verb: str) -> bytes:
-    return POSE if verb == "set_pose" else b""
+    return {"set_pose": POSE, "set": SETTINGS}.get(verb, b"")
 
 
 @pytest.mark.parametrize("verb", SERVICES)
 def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
-    assert got == Request(verb, 7, pose, by="unnamed (native)")
+    told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
+    settings = told if verb == "set" else {}
+    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings)
 
 
 @pytest.mark.parametrize("asked", WILDCARDS)
@@ -353,7 +358,7 @@ def test_a_service_asked_in_cdr_answers_as_a_ros_trigger_does() -> None:
     assert reply.payload == bytes.fromhex("00010000 01000000 03000000 6f6b00")
 
 
-@pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb != "set_pose"])
+@pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb not in EXAMPLES])
 def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
     assert isinstance(got, Request)
@@ -461,11 +466,123 @@ def test_the_parameter_services_tell_the_configuration(via: str) -> None:
         assert reply.attachment == b""
 
 
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
 @pytest.mark.parametrize("service", PARAMETER_SERVICES)
-def test_a_parameter_request_that_cannot_be_read_is_not_answered(service: str) -> None:
+def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
+    service: str, via: str
+) -> None:
+    asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
     with pytest.raises(DecodeError) as caught:
-        queries().serve(ros_query(f"parameters/{service}", payload=b"\x00"), nothing, OUTPUTS)
+        queries().serve(asked, nothing, OUTPUTS)
     assert caught.value.reason == "malformed"
+    reply = refused(asked, str(caught.value), WALL_NS)
+    assert reply is not None
+    kinds: dict[str, tuple[type[Any], Any]] = {
+        "list_parameters": (rcl.ListReply, rcl.ListReply([], [])),
+        "get_parameters": (rcl.Values, rcl.Values([])),
+        "get_parameter_types": (rcl.Types, rcl.Types([])),
+        "describe_parameters": (rcl.Descriptors, rcl.Descriptors([])),
+        "set_parameters": (rcl.SetReply, rcl.SetReply([NO])),
+        "set_parameters_atomically": (rcl.SetAtomicallyReply, rcl.SetAtomicallyReply(NO)),
+    }
+    kind, expected = kinds[service]
+    assert Cdr(kind).decode(reply.payload) == expected
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert (reply.ok, reply.attachment) == (True, echo if via == "rmw" else b"")
+
+
+def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
+    names = ["robot.id"] * 256
+    payload = Cdr(rcl.Names).encode(rcl.Names(names))
+    (reply,) = reply_to(ros_query("parameters/get_parameters", payload=payload))
+    values = Cdr(rcl.Values).decode(reply.payload).values
+    assert [value.string_value for value in values] == ["r7"] * 256
+    for more, reason in ((names + names[:1], "malformed"), (["x" * 20_000], "too_big")):
+        payload = Cdr(rcl.Names).encode(rcl.Names(more))[: most_bytes("parameters/") + 1]
+        with pytest.raises(DecodeError) as caught:
+            queries().serve(ros_query("parameters/get_parameters", payload=payload), nothing, None)
+        assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_a_trigger_that_is_turned_away_hears_so(via: str) -> None:
+    reply = refused(ros_query("srv/clear", via), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.key, reply.ticket) == (True, "srv/clear", 7)
+    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(False, BUSY)
+
+
+def test_who_asks_natively_is_turned_away_with_an_error() -> None:
+    reply = refused(query("odom"), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.payload) == (False, BUSY.encode())
+
+
+def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> None:
+    assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize(
+    ("namespace", "clear", "activate"),
+    [
+        ("", "/acsard/clear", "/acsard/activate"),
+        ("robot1", "/robot1/acsard/clear", "/robot1/acsard/activate"),
+    ],
+)
+def test_to_ros_the_services_are_called_as_ros_calls_them(
+    via: str, namespace: str, clear: str, activate: str
+) -> None:
+    made = queries(replace(CONFIG, ros=RosConfig(namespace=namespace)))
+    made.serve(ros_query("srv/stop", via), nothing, OUTPUTS)
+    words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
+    reply = made.answered(Answer(7, True, words), WALL_NS)
+    assert reply is not None
+    told = Cdr(ServiceReply).decode(reply.payload).message
+    assert told == f"call {clear} first; {activate} switches it on, not srv/clearance"
+
+
+def test_to_others_the_services_are_called_by_their_keys() -> None:
+    made = queries()
+    made.serve(query("srv/stop"), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
+    service: str, via: str
+) -> None:
+    value = rcl.ParameterValue(rcl.DOUBLE, double_value=0.7)
+    payload = Cdr(rcl.SetRequest).encode(
+        rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
+    )
+    made = queries()
+    got = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
+    assert isinstance(got, Request)
+    assert (got.verb, got.id, got.settings) == ("set", 7, {"limits.linear_speed": 0.7})
+    reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    no = rcl.SetParametersResult(False, "call /acsard/clear first")
+    if service == "set_parameters":
+        assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no])
+    else:
+        assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert reply.attachment == (echo if via == "rmw" else b"")
+
+
+def test_what_is_set_is_what_config_and_parameters_tell() -> None:
+    made = queries()
+    made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
+    (told,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
+    assert from_builtins(msgspec.json.decode(told.payload)).limits.linear_speed == 0.7
+    payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
+    asked = ros_query("parameters/get_parameters", "bridge", payload)
+    (reply,) = made.serve(asked, nothing, OUTPUTS)  # type: ignore[misc]
+    assert Cdr(rcl.Values).decode(reply.payload).values[0].double_value == 0.7
 
 
 def reply_to(asked: Query) -> list[Reply]:

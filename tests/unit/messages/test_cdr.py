@@ -749,8 +749,8 @@ def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
     ("cls", "before", "most"),
     [
         (JointState, struct.pack("<iIIB3x", 0, 0, 1, 0), 64),
-        (Names, b"", 128),
-        (ListRequest, b"", 128),
+        (Names, b"", 256),
+        (ListRequest, b"", 256),
         (SetRequest, b"", 128),
     ],
 )

@@ -78,7 +78,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
     for topic in TOPICS:
         said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
     out = said["out"] | said["service"] | said["query"] | {"Imu"}  # that of the simulator
-    came = said["in"] | {"SetPose"}
+    came = said["in"] | {"SetPose", "Settings"}
     assert {name.removesuffix("In") for name in INCOMING} == came
     assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
     assert out | {"Config"} == OUTGOING

@@ -16,11 +16,9 @@ from msgspec.structs import replace
 from acsard.config.settings import (
     BusConfig,
     Config,
-    ControlConfig,
     DriveConfig,
     FootprintConfig,
     LidarConfig,
-    McuConfig,
     OdometryConfig,
     RatesConfig,
     RobotConfig,
@@ -349,52 +347,8 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
     )
 
 
-def status(name: str, config: Config = CONFIG, **changes: Any) -> DiagnosticStatus:
-    outputs, snapshot = OUTPUTS, SNAPSHOT
-    if "counters" in changes:
-        snapshot = replace(SNAPSHOT, counters=changes.pop("counters"))
-    found = Report(config, START).due(
-        replace(outputs, **changes), {"diagnostics"}, lambda: snapshot
-    )
-    ((_, message),) = found
-    assert isinstance(message, DiagnosticArray)
-    (one,) = [s for s in message.status if s.name == f"acsard: {name}"]
-    return one
-
-
 def values(one: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in one.values}
-
-
-def test_every_status_names_the_robot_it_is_of() -> None:
-    statuses = published()["diagnostics"].status
-    assert {one.hardware_id for one in statuses} == {"r7"}
-    assert len({one.name for one in statuses}) == len(statuses)
-
-
-@pytest.mark.parametrize(("link", "level"), [("up", 0), ("stale", 2), ("booting", 2), ("down", 2)])
-def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
-    one = status("serial link", link=link)
-    assert (one.level, one.message) == (level, link)
-
-
-@pytest.mark.parametrize(("mode", "level"), [("driving", 0), ("stopped", 0), ("fault", 2)])
-def test_a_fault_is_an_error_and_its_reason_the_message(mode: str, level: int) -> None:
-    one = status("mode", mode=mode, reason="words")
-    assert (one.level, one.message) == (level, "words")
-    assert values(one) == {"mode": mode, "source": "app"}
-
-
-def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> None:
-    mcu, control = McuConfig(port="/dev/x", baud_rate=38400), ControlConfig(rate=50)
-    one = status("serial link", replace(CONFIG, mcu=mcu, control=control))
-    assert values(one) == {
-        "port": "/dev/x",
-        "wire_use": "0.43",  # 33 bytes of 10 bits, 50 times a second, of 38400
-        "check": "plain",
-        "lines": "100",
-        "line_malformed": "2",
-    }
 
 
 def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> None:
@@ -411,32 +365,6 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
     (row,) = (one for one in array.status if one.name == "acsard: serial link")
     shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
     assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
-
-
-@pytest.mark.parametrize(("missed", "level"), [(0, 0), (10, 0), (11, 1)])
-def test_more_than_one_missed_period_in_a_hundred_is_a_warning(missed: int, level: int) -> None:
-    one = status("control loop", counters={"missed_periods": missed})
-    assert (one.level, one.message) == (level, f"{missed} of 1000 periods missed")
-    assert values(one) == {
-        "period_lateness_p50_us": "50",
-        "period_lateness_p99_us": "400",
-        "period_lateness_max_us": "900",
-        "period_lateness_minute_p50_us": "40",
-        "period_lateness_minute_p99_us": "80",
-        "period_lateness_minute_max_us": "90",
-    }
-
-
-def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> None:
-    one = status("commands")
-    assert (one.level, one.message) == (0, "commanded by app")
-    assert values(one) == {
-        "app": "driving",
-        "nav": "a command",
-        "commands": "7",
-        "command_stale": "3",
-    }
-    assert status("commands", source="").message == "no commands"
 
 
 @pytest.mark.parametrize(

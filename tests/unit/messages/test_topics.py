@@ -42,6 +42,7 @@ PROMISED = [
     ("srv/deactivate", "service", "ServiceReply"),
     ("srv/reset_odometry", "service", "ServiceReply"),
     ("srv/set_pose", "service", "ServiceReply"),
+    ("srv/set", "service", "ServiceReply"),
     ("info", "query", "Info"),
     ("config", "query", "Config"),
     ("interfaces", "query", "Interfaces"),

@@ -1,7 +1,9 @@
-"""The configuration as ROS parameters: listed, read and described, never set."""
+"""The configuration as ROS parameters: listed, read and described; what a request to set says."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -10,6 +12,7 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.messages.cdr import Cdr, CdrError
 from acsard.ros import parameters as rcl
+from acsard.ros.descriptors import ParameterDescriptor, described
 from acsard.ros.parameters import Parameters
 from acsard.ros.transports import PARAMETER_SERVICES
 
@@ -108,21 +111,45 @@ def test_a_name_that_is_not_there_has_no_value_and_no_type() -> None:
     assert ask("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
 
 
-def test_a_description_says_type_and_that_it_is_read_only() -> None:
-    asked = rcl.Names(["drive.wheel_radius"])
-    (found,) = ask("describe_parameters", asked, rcl.Descriptors).descriptors
-    assert found == rcl.ParameterDescriptor("drive.wheel_radius", rcl.DOUBLE, read_only=True)
+def test_a_description_is_that_of_the_key() -> None:
+    asked = rcl.Names(["drive.wheel_radius", "no.such"])
+    found, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
+    assert found == described("drive.wheel_radius", rcl.DOUBLE)
+    assert nothing == ParameterDescriptor("no.such", rcl.NOT_SET)
 
 
-def test_setting_is_refused_with_the_mend() -> None:
-    wish = rcl.Parameter("robot.id", rcl.ParameterValue(rcl.STRING, string_value="other"))
-    asked = rcl.SetRequest([wish, wish])
-    results = ask("set_parameters", asked, rcl.SetReply).results
-    assert [result.successful for result in results] == [False, False]
-    assert "acsard.toml" in results[0].reason
-    one: rcl.SetAtomicallyReply = ask("set_parameters_atomically", asked, rcl.SetAtomicallyReply)
-    assert not one.result.successful
-    assert value("robot.id").string_value == "acsar"
+WISHES: list[tuple[rcl.ParameterValue, object]] = [
+    (rcl.ParameterValue(rcl.BOOL, bool_value=True), True),
+    (rcl.ParameterValue(rcl.INTEGER, integer_value=5), 5),
+    (rcl.ParameterValue(rcl.DOUBLE, double_value=0.8), 0.8),
+    (rcl.ParameterValue(rcl.STRING, string_value="debug"), "debug"),
+    (rcl.ParameterValue(rcl.INTEGER_ARRAY, integer_array_value=[1, 2]), [1.0, 2.0]),
+    (rcl.ParameterValue(rcl.DOUBLE_ARRAY, double_array_value=[0.5]), [0.5]),
+    (rcl.ParameterValue(rcl.STRING_ARRAY, string_array_value=["a"]), ["a"]),
+]
+
+
+@pytest.mark.parametrize(("value", "expected"), WISHES)
+def test_a_wish_is_a_value_by_its_name(value: rcl.ParameterValue, expected: object) -> None:
+    asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
+    assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
+
+
+@pytest.mark.parametrize("kind", [rcl.NOT_SET, 5, 6, 10])
+def test_a_parameter_cannot_be_unset_nor_made_of_bytes(kind: int) -> None:
+    asked = rcl.SetRequest([rcl.Parameter("log.level", rcl.ParameterValue(kind))])
+    with pytest.raises(CdrError, match=r"log\.level"):
+        rcl.wished(Cdr(rcl.SetRequest).encode(asked))
+
+
+def test_the_reply_has_a_result_for_each_or_one_for_all() -> None:
+    wish = rcl.Parameter("log.level", rcl.ParameterValue(rcl.STRING, string_value="debug"))
+    payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish, wish]))
+    result = rcl.SetParametersResult(False, "why")
+    each = rcl.outcome("set_parameters", payload, False, "why")
+    assert Cdr(rcl.SetReply).decode(each) == rcl.SetReply([result, result])
+    one = rcl.outcome("set_parameters_atomically", payload, False, "why")
+    assert Cdr(rcl.SetAtomicallyReply).decode(one) == rcl.SetAtomicallyReply(result)
 
 
 @pytest.mark.parametrize("service", PARAMETER_SERVICES)
@@ -134,11 +161,13 @@ def test_a_request_cut_anywhere_is_refused(service: str) -> None:
         "set_parameters_atomically": rcl.SetRequest([wish]),
     }.get(service, rcl.Names(["robot.id"]))
     payload = Cdr(type(request)).encode(request)
-    serve = Parameters(TABLES).answer
-    assert serve(service, payload)
+    serve: Callable[[bytes], object] = partial(Parameters(TABLES).answer, service)
+    if service in rcl.SETTING:
+        serve = rcl.wished
+    assert serve(payload)
     for end in range(len(payload)):
         with pytest.raises(CdrError):
-            serve(service, payload[:end])
+            serve(payload[:end])
 
 
 def test_the_whole_configuration_can_be_had() -> None:

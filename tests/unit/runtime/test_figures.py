@@ -7,7 +7,7 @@ import sys
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.runtime.figures import NAMES, SLOT_NS, SLOTS, Figures
+from acsard.runtime.figures import NAMES, SLOT_NS, SLOTS, Figures, LastMinute
 from acsard.runtime.histogram import Histogram
 from acsard.values import NS_PER_S, Measured, Spread
 
@@ -88,3 +88,23 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
     for second in range(60, 86_400, 7):
         figures.add("period_lateness", second * NS_PER_S, second * US)
     assert size(figures) == after_a_minute
+
+
+def test_what_happened_counts_for_a_minute_and_then_no_more() -> None:
+    happened = LastMinute()
+    assert happened.count(0) == 0
+    happened.add(0, 3)
+    happened.add(SLOT_NS - 1, 2)
+    happened.add(SLOT_NS, 1)
+    assert happened.count(SLOT_NS) == 6
+    assert happened.count(MINUTE_NS - 1) == 6
+    assert happened.count(MINUTE_NS) == 1
+    assert happened.count(MINUTE_NS + SLOT_NS) == 0
+
+
+def test_counting_by_the_minute_takes_no_more_room_with_the_hours() -> None:
+    happened = LastMinute()
+    for second in range(3600):
+        happened.add(second * NS_PER_S, 1)
+    assert happened.count(3599 * NS_PER_S) == 60
+    assert len(happened._slots) == SLOTS

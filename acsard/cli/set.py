@@ -1,0 +1,131 @@
+"""`acsard set limits.linear_speed 0.8`: a setting of the robot that runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import add_bus, find, robot_address
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+
+if TYPE_CHECKING:
+    from acsard.values import Plain
+
+DESCRIPTION = """\
+Change settings of the robot that runs, all or none: limits, timeouts, covariances, publishing
+rates, the log's level. They are checked as the file is, told in the log and on the key `config`,
+and gone with the next start unless --write puts them into the configuration file too. A lower speed
+limit is reached by the deceleration. Without a setting: list those that there are. Exit 1 when it
+is refused.
+"""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "set",
+        help="change a setting of the running robot, or list those that can be",
+        description=DESCRIPTION,
+    )
+    parser.add_argument(
+        "settings",
+        nargs="*",
+        metavar="KEY VALUE",
+        help="a key of acsard.toml with its table, as limits.linear_speed; write a list as [1, 2]",
+    )
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help=f"also into the configuration file here, comments kept (an extra: {install('mcu')})",
+    )
+    parser.add_argument("--json", action="store_true", help="print the answer, or list, as JSON")
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Set, or list."""
+    from acsard.client import connect
+    from acsard.messages.encodings import encode
+
+    settings = pairs(args.settings)
+    file = _file(args.config, settings) if args.write else None
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        if not settings:
+            _tell(robot.get("config"), args.json)
+            return int(Exit.OK)
+        reply = robot.set(settings)
+    written = ""
+    if reply.success and file is not None:
+        from acsard.host.files import change
+
+        change(file, settings)
+        written = f"; written to {file}"
+    until = written or ("; until the next start" if reply.success else "")
+    print(encode(reply, "json").decode() if args.json else reply.message + until)
+    return int(Exit.OK if reply.success else Exit.FAILURE)
+
+
+def pairs(words: Sequence[str]) -> dict[str, Plain]:
+    """KEY VALUE KEY VALUE ... as settings; a value as TOML has it, a bare word as a text."""
+    from acsard.host.errors import UsageError
+
+    if len(words) % 2:
+        raise UsageError("write: acsard set KEY VALUE, as in acsard set limits.linear_speed 0.8")
+    return {key: _value(word) for key, word in zip(words[::2], words[1::2], strict=True)}
+
+
+def _value(word: str) -> Plain:
+    import tomllib
+
+    try:
+        found = tomllib.loads(f"value = {word}")
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError):
+        return word
+    value: Plain = found["value"]
+    one = len(found) == 1 and isinstance(value, bool | int | float | str | list)
+    return value if one else word
+
+
+def _file(path: str | None, settings: dict[str, Plain]) -> Path:
+    """What --write is to change; said before anything is set."""
+    from acsard.host.errors import UsageError
+    from acsard.host.files import require_tomlkit
+
+    if not settings:
+        raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
+    if any(key.startswith("commands.sources.") for key in settings):
+        raise UsageError(
+            "--write cannot change [[commands.sources]]: write the timeout into the file yourself, "
+            "and set it without --write"
+        )
+    require_tomlkit()
+    where, text = find(path)
+    if not text and not Path(where).is_file():
+        raise ExitError(
+            Exit.FAILURE,
+            "--write has no configuration file to write to: name it by --config, or make an "
+            "acsard.toml here (an empty one is valid)",
+        )
+    return Path(where)
+
+
+def _tell(config: object, as_json: bool) -> None:
+    """The settings that there are, with what they are now."""
+    import msgspec
+
+    from acsard.config.live import flat, live
+    from acsard.config.validation import show
+    from acsard.ros.descriptors import described
+
+    now = {key: value for key, value in flat(config) if live(key)}
+    if as_json:
+        print(msgspec.json.encode(now).decode())
+        return
+    for key, value in now.items():
+        said = described(key, 1)
+        print(f"{key} = {show(value)}\n    {said.description}\n    {said.additional_constraints}")

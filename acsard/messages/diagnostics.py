@@ -1,0 +1,155 @@
+"""`Outputs` and `Snapshot` -> the rows of `diagnostics`, as rqt_robot_monitor shows them.
+
+A row is there from the first message to the last or never: the monitor keeps what it has once
+seen, and calls it stale when it stays away. OK is a robot that needs nobody; WARN is what a person
+should know of; ERROR is what keeps it from driving.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.config.settings import Config
+from acsard.config.wire_time import wire_use
+from acsard.drive.gyro import WORDS
+from acsard.drive.words import waiting
+from acsard.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
+from acsard.values import (
+    WHEELS,
+    GyroStatus,
+    Measured,
+    Outputs,
+    RoutersStatus,
+    Snapshot,
+    WheelsStatus,
+)
+
+OK, WARN, ERROR = 0, 1, 2
+
+OF_MODE = {"stopped": WARN, "fault": ERROR}
+"""What latches waits for a person."""
+
+REFUSED_S = 2.0
+"""s that a refusal is shown: two of the messages, at their rate by default."""
+
+MISSED_SHARE = 0.01
+"""Of the last minute's periods; more are a warning."""
+
+
+class Row(Struct, frozen=True):
+    """One status, before it has the robot's name."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+def diagnostics(
+    config: Config, outputs: Outputs, snapshot: Snapshot, certificate: tuple[int, str]
+) -> DiagnosticArray:
+    """All rows; `certificate` is how bad and in words, without words where there is none."""
+    mode = {"mode": outputs.mode, "source": outputs.source}
+    rows = [
+        Row("mode", OF_MODE.get(outputs.mode, OK), outputs.reason, mode),
+        _serial_link(config, outputs, snapshot),
+        _control_loop(snapshot),
+        _commands(outputs, snapshot),
+        _wheels(snapshot.doubt, snapshot.counters),
+        *_gyro(config, snapshot.gyro),
+        *_routers(snapshot.routers),
+        *([Row("certificate", *certificate, {})] if certificate[1] else []),
+    ]
+    return DiagnosticArray(
+        Header(Time.from_ns(outputs.now.wall_ns)),
+        [
+            DiagnosticStatus(
+                row.level,
+                f"acsard: {row.name}",
+                row.message,
+                config.robot.id,
+                [KeyValue(key, value) for key, value in row.values.items()],
+            )
+            for row in rows
+        ],
+    )
+
+
+def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
+    mcu = config.mcu
+    use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
+    named = zip(WHEELS, snapshot.encoders, strict=False)
+    values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
+    values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
+    level, message = OK if outputs.link == "up" else ERROR, outputs.link
+    if mcu.simulated:
+        level, message = max(level, WARN), f"{message}: the simulator, no wheel turns"
+    return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
+
+
+def _control_loop(snapshot: Snapshot) -> Row:
+    figures, missed = snapshot.figures, snapshot.missed_last_minute
+    kept = figures.get("period_lateness", Measured()).last_minute.count
+    values = {
+        f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
+        for name, one in figures.items()
+        for when, spread in (("", one.since_start), ("_minute", one.last_minute))
+        for share in ("p50", "p99", "max")
+    }
+    return Row(
+        "control loop",
+        WARN if missed > MISSED_SHARE * (kept + missed) else OK,
+        f"{missed} of {kept + missed} periods missed in the last minute",
+        values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
+    )
+
+
+def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
+    values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
+    values |= _counted(snapshot.counters, "command")
+    message = f"commanded by {outputs.source}" if outputs.source else "no commands"
+    age_s = snapshot.refused_age_s
+    refused = age_s is not None and age_s < REFUSED_S
+    if refused:
+        message = f"{message}; refused: {snapshot.refused}"
+    return Row("commands", WARN if refused else OK, message, values)
+
+
+def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
+    """What front and rear say of each other."""
+    left, right = doubt.differ
+    values = {
+        "left_out": ", ".join(doubt.left_out),
+        "slipping": ", ".join(doubt.slipping),
+        "front_more_left": f"{left:.3f}",
+        "front_more_right": f"{right:.3f}",
+    }
+    level, message = WARN if doubt.text else OK, doubt.text or "front and rear agree"
+    return Row("wheels", level, message, values | _counted(counters, "wheels"))
+
+
+def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
+    """The row of the gyro, none without one."""
+    if gyro.does == "off":
+        return []
+    values = {"delay_s": f"{gyro.delay:.3f}"}
+    if gyro.bias is not None:
+        values["bias_rad_s"] = f"{gyro.bias:.5f}"
+    if gyro.track is not None:
+        configured = config.drive.wheel_separation_multiplier
+        values["wheel_separation_multiplier"] = f"{configured:.3f}"
+        values["learned_multiplier"] = f"{configured * gyro.track:.3f}"
+    level = OK if gyro.does in ("used", "waiting for rest") else WARN
+    return [Row("gyro", level, WORDS[gyro.does], values)]
+
+
+def _routers(routers: RoutersStatus) -> list[Row]:
+    """The row of what `bus.connect` names, none where it names nothing."""
+    missing, connected = routers.missing, routers.connected
+    values = dict.fromkeys(connected, "connected") | dict.fromkeys(missing, "not connected")
+    words = f"not connected to {', '.join(missing)}" if missing else "connected"
+    return [Row("router", WARN if missing else OK, words, values)] if values else []
+
+
+def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:
+    return {name: str(count) for name, count in counters.items() if name.startswith(kind)}

@@ -1,0 +1,64 @@
+"""What a person with rqt_robot_monitor sees, while the robot lives."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.messages.diagnostics import OK, WARN
+from acsard.messages.schema import DiagnosticArray, DiagnosticStatus
+from tests.scenarios.speakers import Speaker
+from tests.scenarios.world import World
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def row(world: World, name: str) -> DiagnosticStatus:
+    message = world.loop.report.current("diagnostics", world.loop._look)
+    assert isinstance(message, DiagnosticArray)
+    (found,) = [status for status in message.status if status.name == f"acsard: {name}"]
+    return found
+
+
+def test_a_stop_is_a_warning_until_it_is_cleared(world: World) -> None:
+    world.call("stop")
+    assert row(world, "mode").level == WARN
+    assert "srv/clear" in row(world, "mode").message
+    world.call("clear")
+    assert row(world, "mode").level == OK
+
+
+def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: World) -> None:
+    world.drive(0.3, seconds=0.5)
+    assert row(world, "commands").level == OK
+    for _ in range(30):
+        world.send(0.3, source="nobody")
+        world.hold(0.3, seconds=0.1)
+        assert row(world, "commands").level == WARN
+    assert "source nobody: not one of commands.sources" in row(world, "commands").message
+    world.hold(0.3, seconds=2.0)
+    assert (row(world, "commands").level, world.state.source) == (OK, "app")
+
+
+def test_a_sender_whose_clock_is_new_here_is_no_warning(world: World) -> None:
+    client = Speaker(world, "signed", ahead=-3600.0)
+    client.hold(0.0, 0.2)
+    assert world.state.counters["command_unproven"] == 4
+    assert row(world, "commands").level == OK
+
+
+def test_missed_periods_are_a_warning_for_a_minute(world: World) -> None:
+    assert row(world, "control loop").level == OK
+    for _ in range(20):
+        world.stall(0.05)
+        world.run(0.05)
+    assert row(world, "control loop").level == WARN
+    world.run(61.0)
+    found = row(world, "control loop")
+    assert found.level == OK
+    assert found.message.startswith("0 of ")
+    assert world.state.counters["missed_periods"] > 60

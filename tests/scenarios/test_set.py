@@ -1,0 +1,223 @@
+"""Settings changed in the middle of what the robot does: at a step's edge, safely, told."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgspec
+import pytest
+
+from acsard.config.settings import Config, LimitsConfig
+from acsard.incoming.commands import Via
+from acsard.incoming.queries import Query
+from acsard.messages.cdr import Cdr
+from acsard.messages.schema import Odometry, ServiceReply
+from acsard.ros import parameters as rcl
+from acsard.values import NS_PER_S, Outputs, Plain
+from tests.scenarios.world import World
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def sets(world: World, **settings: Plain) -> ServiceReply:
+    """Dots in keys are written as two underscores."""
+    wishes = {key.replace("__", "."): value for key, value in settings.items()}
+    return world.call("set", msgspec.json.encode({"settings": wishes}))
+
+
+def config(world: World) -> Config:
+    (reply,) = world.ask("config")
+    return msgspec.json.decode(reply.payload, type=Config)
+
+
+def applied(world: World) -> list[tuple[float, float]]:
+    """When each line from now on was made, s, and its speed, m/s."""
+    found: list[tuple[float, float]] = []
+
+    def note(outputs: Outputs) -> None:
+        if outputs.line is not None:
+            found.append((outputs.now.mono_ns / NS_PER_S, outputs.applied.linear))
+
+    world.watch = note
+    return found
+
+
+def slopes(lines: list[tuple[float, float]]) -> list[float]:
+    """m/s2 from each line to the next."""
+    return [(v - before) / (t - at) for (at, before), (t, v) in pairwise(lines)]
+
+
+def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(world: World) -> None:
+    world.drive(1.0, seconds=2.0)
+    speeds = applied(world)
+    assert sets(world, limits__linear_speed=0.4).success
+    world.hold(1.0, seconds=1.5)
+    assert world.state.mode == "driving"
+    assert min(slopes(speeds)) == pytest.approx(-1.0)  # limits.linear_deceleration
+    assert max(slopes(speeds)) <= 0.0
+    assert speeds[-1][1] == pytest.approx(0.4)
+
+
+def test_a_raised_limit_is_reached_by_the_acceleration() -> None:
+    world = World(Config(limits=LimitsConfig(linear_speed=0.4)))
+    world.run(0.2)
+    world.drive(1.0, seconds=1.0)
+    speeds = applied(world)
+    assert sets(world, limits__linear_speed=1.0).success
+    world.hold(1.0, seconds=1.0)
+    assert max(slopes(speeds)) == pytest.approx(1.0)  # limits.linear_acceleration
+    assert speeds[-1][1] == pytest.approx(1.0)
+
+
+def test_a_limit_of_zero_brings_it_to_rest(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    assert sets(world, limits__linear_speed=0.0).success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.linear == 0.0
+    assert world.state.mode == "driving"
+
+
+def test_what_is_set_is_in_config_and_in_the_log_with_who_asked_and_what_it_was(
+    world: World,
+) -> None:
+    payload = b'{"settings": {"limits.linear_speed": 0.8, "rates.state": 5}}'
+    name = msgspec.json.encode({"sender": "joe@laptop"})
+    key = "srv/set"
+    world.bus.queries.append(Query(77, key, key, "", payload, "", world.now_ns, "native", name))
+    world.run(0.03)
+    (event,) = [event for event in world.events if event.name == "set"]
+    assert event.text == "limits.linear_speed = 0.8 (was 1.0), rates.state = 5.0 (was 10.0)"
+    assert event.by == "joe@laptop (native)"
+    assert (config(world).limits.linear_speed, config(world).rates.state) == (0.8, 5.0)
+
+
+def test_several_settings_one_after_the_other_are_each_told(world: World) -> None:
+    for speed in (0.9, 0.8, 0.7):
+        sets(world, limits__linear_speed=speed)
+    told = [event.text for event in world.events if event.name == "set"]
+    assert told == [
+        "limits.linear_speed = 0.9 (was 1.0)",
+        "limits.linear_speed = 0.8 (was 0.9)",
+        "limits.linear_speed = 0.7 (was 0.8)",
+    ]
+
+
+def test_a_refused_change_changes_nothing_and_says_why(world: World) -> None:
+    reply = sets(world, limits__angular_speed=1.0, limits__linear_deceleration=0.15)
+    assert not reply.success
+    assert "limits.linear_deceleration = 0.15: would take" in reply.message
+    assert config(world) == Config()
+    assert not [event for event in world.events if event.name == "set"]
+
+
+def test_a_payload_that_is_none_is_answered_with_one_that_is(world: World) -> None:
+    for payload in (b"", b"{}", b'{"settings": {"limits.linear_speed": null}}'):
+        reply = world.call("set", payload)
+        assert not reply.success
+        assert '{"settings": {"limits.linear_speed": 0.8}}' in reply.message
+
+
+def test_the_wheels_limit_waits_until_the_robot_stands_and_the_guard_goes_by_it() -> None:
+    world = World(Config(limits=LimitsConfig(linear_speed=3.0, wheel_speed=10.0)))
+    world.run(0.2)
+    world.drive(3.0, seconds=1.0)
+    assert "only while the robot stands" in sets(world, limits__wheel_speed=40.0).message
+    world.run(2.0)
+    assert sets(world, limits__wheel_speed=40.0).success
+    world.drive(3.0, seconds=2.0)
+    assert world.state.mode == "driving"
+    assert world.state.linear == pytest.approx(2.0, abs=0.1)
+    world.run(3.0)
+    assert sets(world, limits__wheel_speed=10.0).success
+    world.drive(3.0, seconds=1.0)
+    assert world.state.mode == "driving"
+    assert world.state.linear == pytest.approx(0.5, abs=0.05)
+
+
+def test_braking_set_softer_behind_a_lowered_limit_waits_until_the_robot_is_that_slow(
+    world: World,
+) -> None:
+    world.drive(1.0, seconds=2.0)
+    assert sets(world, limits__linear_speed=0.1).success
+    soft = {"limits__linear_deceleration": 0.05, "limits__linear_stop_deceleration": 0.05}
+    assert not sets(world, **soft).success
+    world.call("stop")
+    world.run(0.5)
+    assert world.state.linear == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_longer_timeout_holds_and_a_new_one_wants_neutral_first(world: World) -> None:
+    world.drive(0.3, seconds=0.5)
+    assert not sets(world, commands__sources__app__timeout=0.6).success
+    world.run(1.0)
+    assert sets(world, commands__sources__app__timeout=0.6).success
+    world.hold(0.3, seconds=0.3)
+    assert world.state.mode == "ready"
+    world.run(2.0)  # a pause is neutral too
+    world.drive(0.3, seconds=0.5)
+    world.run(0.4)
+    assert world.state.mode == "driving"
+    world.run(0.3)
+    assert world.state.mode == "ready"
+
+
+def test_rates_and_covariances_hold_from_the_next_message_on(world: World) -> None:
+    diagonal: list[float | str] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    assert sets(
+        world,
+        rates__odom=10.0,
+        odometry__covariance="constant",
+        odometry__pose_covariance_diagonal=diagonal,
+    ).success
+    world.bus.published["odom"].clear()
+    world.run(2.0)
+    found = world.bus.published["odom"]
+    assert 19 <= len(found) <= 21
+    last = found[-1]
+    assert isinstance(last, Odometry)
+    assert last.pose.covariance[::7] == diagonal
+
+
+def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
+    def grows() -> float:
+        before = world.odom.pose.covariance[0]
+        world.drive(0.5, seconds=1.0)
+        return world.odom.pose.covariance[0] - before
+
+    little = grows()
+    assert sets(world, odometry__distance_variance_per_metre=1e-2).success
+    assert grows() > 20 * little
+
+
+def test_setting_what_is_so_already_says_so(world: World) -> None:
+    reply = sets(world, limits__linear_speed=1.0)
+    assert (reply.success, reply.message) == (True, "nothing new: all of it is so already")
+
+
+@pytest.mark.parametrize("via", ["bridge"])
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_ros_sets_parameters_the_same_way(world: World, service: str, via: Via) -> None:
+    def ask(name: str, value: float) -> rcl.SetParametersResult:
+        wish = rcl.Parameter(name, rcl.ParameterValue(rcl.DOUBLE, double_value=value))
+        payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish]))
+        key, ticket = f"parameters/{service}", world.now_ns
+        world.bus.queries.append(Query(ticket, key, key, "", payload, "", world.now_ns, via))
+        world.run(0.03)
+        (reply,) = world.bus.replies[ticket]
+        if service == "set_parameters":
+            return Cdr(rcl.SetReply).decode(reply.payload).results[0]
+        return Cdr(rcl.SetAtomicallyReply).decode(reply.payload).result
+
+    assert ask("limits.linear_speed", 0.7).successful
+    assert config(world).limits.linear_speed == 0.7
+    (event,) = [event for event in world.events if event.name == "set"]
+    assert (event.text, event.by) == ("limits.linear_speed = 0.7 (was 1.0)", "unnamed (bridge)")
+    refused = ask("limits.linear_speed", 70.0)
+    assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
+    assert "takes a start" in ask("drive.wheel_radius", 0.07).reason
+    assert config(world).limits.linear_speed == 0.7

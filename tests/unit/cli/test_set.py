@@ -1,0 +1,46 @@
+"""What is typed after `acsard set` is settings by their keys."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.cli.set import pairs
+from acsard.host.errors import UsageError
+
+
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        ("0.8", 0.8),
+        ("-1", -1),
+        ("true", True),
+        ("debug", "debug"),
+        ('"debug"', "debug"),
+        ("[1, 2.5]", [1, 2.5]),
+        ("nan and more", "nan and more"),
+        ("1\nother = 2", "1\nother = 2"),
+        ("", ""),
+        ("'", "'"),
+        ("2026-01-01", "2026-01-01"),
+        ("{a = 1}", "{a = 1}"),
+    ],
+)
+def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
+    word: str, value: object
+) -> None:
+    found = pairs(["log.level", word])
+    assert found == {"log.level": value}
+    assert type(found["log.level"]) is type(value)
+
+
+def test_several_settings_are_pairs_one_after_the_other() -> None:
+    assert pairs(["rates.state", "5", "log.level", "info"]) == {
+        "rates.state": 5,
+        "log.level": "info",
+    }
+    assert pairs([]) == {}
+
+
+def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
+    with pytest.raises(UsageError, match=r"acsard set KEY VALUE"):
+        pairs(["limits.linear_speed"])
