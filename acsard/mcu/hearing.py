@@ -17,8 +17,8 @@ from acsard.values import NS_PER_S
 PATIENCE_NS = 3 * NS_PER_S
 """A board that boots has answered by then."""
 
-SHOWN = 40
-"""Bytes that people are shown."""
+SHOWN = 64
+"""Characters of them that people are shown: a whole line, and noise on it."""
 
 Look = Literal["nothing", "cut", "foreign", "garbage", "few"]
 """No byte at all; pieces of right lines, or lines without an end; right lines with other bytes on
@@ -50,7 +50,7 @@ class Heard(Struct):
         """Bytes as they came, before their lines."""
         self.size += len(data)
         if not self.lines:
-            self.last = (self.last + data)[-2 * SHOWN :]
+            self.last = (self.last + data)[-SHOWN:]
 
     def line(self, line: bytes, good: bool) -> None:
         """One line of them without its end."""
@@ -76,7 +76,8 @@ class Heard(Struct):
         if not self.size:
             return "nothing at all heard"
         if not self.lines:
-            return f"{self.size} bytes heard but no line end, the last `{printable(self.last)}`"
+            last = printable(self.last, last=True)
+            return f"{self.size} bytes heard but no line end, the last `{last}`"
         good, which = "none good", "last"
         if self.good:
             good, which = f"only {self.good} good", "last other"
@@ -90,10 +91,16 @@ class Heard(Struct):
         return f"the microcontroller: {self.counted}; {mend}"
 
 
-def printable(data: bytes) -> str:
-    """Bytes for people: the last few of them, what cannot be printed as `\\x00`."""
-    text = repr(bytes(data[-SHOWN:]))[2:-1]
-    return ("…" if len(data) > SHOWN else "") + text
+def printable(data: bytes, last: bool = False) -> str:
+    """Bytes for people: the first of them, or the last, what cannot be printed as `\\x00`."""
+    shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
+    room = 0
+    for count, text in enumerate(shown):
+        room += len(text)
+        if room > SHOWN:
+            kept = shown[:count]
+            return "…" + "".join(reversed(kept)) if last else "".join(kept) + "…"
+    return "".join(reversed(shown) if last else shown)
 
 
 class Hearing:
