@@ -68,7 +68,7 @@ FAIL reply rate: none | too few replies
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
     news of the wheels come late
-    -> an FTDI chip holds bytes back for 16 ms unless its latency_timer is 1 (`doctor`)
+    -> firmware that waits? an FTDI chip does, 16 ms unless its latency_timer is 1 (`doctor`)
 SKIPPED round trip: own clock
     it answers by its own clock: a reply says nothing of the line before it
 SKIPPED round trip: none
@@ -256,7 +256,7 @@ FAIL runaway: against | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
 
 FAIL stop: turns | turns {seconds:g} s after zeros
     {motors} turns on, by its encoder, whatever zeros are sent
-    -> cut the motors' power; does the firmware take `p00.00` for a stop?
+    -> does a hand or a slope turn it? else cut the motors' power: firmware must stop at `p00.00`
 
 FAIL link: silent | silent for {seconds:.1f} s
     the microcontroller fell silent while {motors} was to turn

@@ -8,10 +8,9 @@ from acsard.bus.address import address_of
 from acsard.bus.session import reachable
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding, Level
-from acsard.doctor.link import link
+from acsard.doctor.link import check, link
 from acsard.doctor.running import Running, answers, asked
 from acsard.drive.gyro import WORDS
-from acsard.host import clock
 from acsard.values import NS_PER_S, AcsardError
 
 APART_S = 0.4
@@ -54,10 +53,11 @@ def daemon(running: Running) -> Iterator[Finding]:
     """What does it say?"""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
-    mend = "see the reason; `acsard call clear` releases it" if level == "failure" else ""
+    mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
+    mend = mend if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from link(running)
-    yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
+    yield from clocks(state.stamp.to_ns(), running.looked_ns, state.counters)
     yield from gyro(state.gyro, state.counters)
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"

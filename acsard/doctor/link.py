@@ -18,22 +18,22 @@ ENOUGH = 40
 def link(running: Running) -> Iterator[Finding]:
     """What is wrong with it, by the counters and words of the daemon."""
     config, state = running.config, running.state
-    check = _check(running)
+    mend = check(running)
     if state.link != "up":
-        mend = check if state.link != "down" else "see the port above"
+        mend = mend if state.link != "down" else "see the port above"
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)
         return
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    problems = [*lost(passed, config), *refused(state.counters)]
+    problems = [*lost(passed, config), *refused(state.counters), *gone(state.counters)]
     for text in problems:
-        yield Finding("link", "warning", text, check)
+        yield Finding("link", "warning", text, mend)
     if not problems:
         yield Finding("link", "ok", "up, and no line is lost")
     if state.doubt:
-        yield Finding("wheels", "warning", state.doubt, check)
+        yield Finding("wheels", "warning", state.doubt, mend)
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
@@ -59,7 +59,17 @@ def refused(counters: Mapping[str, int]) -> Iterator[str]:
         yield f"lines of the microcontroller that did not count: {told}"
 
 
-def _check(running: Running) -> str:
+def gone(counters: Mapping[str, int]) -> Iterator[str]:
+    """A link that was there and went."""
+    if times := counters.get("link_lost", 0):
+        yield (
+            f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
+            "at times or was unplugged; the log says when (link_stale, link_down)"
+        )
+
+
+def check(running: Running) -> str:
+    """What looks closer at the board, and what it needs."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds out why, wheels lifted; stop the daemon first: "

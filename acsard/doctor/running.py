@@ -15,6 +15,7 @@ from acsard.client import Client, connect
 from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding
+from acsard.host import clock
 from acsard.messages.schema import Info, RobotState
 from acsard.values import AcsardError
 
@@ -32,6 +33,8 @@ class Running(Struct, frozen=True):
     config: Config
     before: RobotState
     state: RobotState
+    looked_ns: int
+    """When that was asked for, by this machine's wall clock."""
 
 
 def asked(config: Config) -> Running:
@@ -40,7 +43,8 @@ def asked(config: Config) -> Running:
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(WATCHED_S)
-        return Running(info, _configuration(robot, info, config), before, robot.get("state"))
+        runs, state = _configuration(robot, info, config), robot.get("state")
+        return Running(info, runs, before, state, clock.now().wall_ns)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:

@@ -25,7 +25,7 @@ Look = Literal["nothing", "cut", "foreign", "garbage", "few"]
 them; nothing that looks like a line; good lines among others."""
 
 MENDS: dict[Look, str] = {
-    "nothing": "is it powered, is this its port, are TX and RX crossed?",
+    "nothing": "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed?",
     "cut": "does it cut its lines short, or leave out their ends?",
     "foreign": "what disturbs the cable, or prints on it too?",
     "garbage": "is mcu.baud_rate the board's own?",

@@ -301,6 +301,30 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
     assert world.mcu.vehicle.set_points == [0.0] * 4
 
 
+@pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
+def test_a_link_that_loses_lines_is_told_once(fault: str) -> None:
+    world = World()
+    with named(fault).on(world.mcu):
+        world.run(25.0)
+    told = [event for event in world.events if event.name == "lines_lost"]
+    assert [event.level for event in told] == ["warning"]
+    assert "were answered" in told[0].text
+
+
+def test_a_sound_link_is_not_said_to_lose_lines() -> None:
+    world = World()
+    world.drive(0.5, seconds=25.0)
+    assert not [event for event in world.events if event.name == "lines_lost"]
+    assert "link_lost" not in world.state.counters
+
+
+def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
+    world = World()
+    with named("stalls=1:0.3").on(world.mcu):
+        world.run(5.5)
+    assert world.state.counters["link_lost"] == 5
+
+
 @pytest.mark.parametrize(
     ("fault", "heard", "mend"),
     [

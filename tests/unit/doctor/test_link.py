@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config, McuConfig
 from acsard.doctor.finding import Finding
-from acsard.doctor.link import link, lost, refused
+from acsard.doctor.link import gone, link, lost, refused
 from acsard.doctor.running import Running
 from tests.unit.doctor.test_running import INFO, STATE
 
@@ -16,7 +16,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
 
 def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
     one, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
-    return list(link(Running(INFO, CONFIG, one, two)))
+    return list(link(Running(INFO, CONFIG, one, two, 0)))
 
 
 def test_a_sound_link_is_one_ok() -> None:
@@ -64,3 +64,10 @@ def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
 def test_a_wheel_that_is_left_out_is_told() -> None:
     *_, finding = found({}, {}, doubt="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
+
+
+def test_a_link_that_went_is_told_with_how_often() -> None:
+    assert not list(gone({"lines": 9}))
+    (finding,) = found({}, {"link_lost": 4})
+    assert finding.level == "warning"
+    assert "lost 4 times" in finding.text

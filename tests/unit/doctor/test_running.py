@@ -16,7 +16,7 @@ FILE = Config()
 
 
 def running(config: Config) -> Running:
-    return Running(INFO, config, STATE, STATE)
+    return Running(INFO, config, STATE, STATE, 0)
 
 
 def test_a_daemon_that_runs_with_the_file_has_it() -> None:
