@@ -48,9 +48,15 @@ def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
 def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
     text = printable(data)
     assert text.isprintable()
-    assert text.isascii() or text.startswith("…")
-    assert len(text) <= 4 * SHOWN + 1
-    assert text.startswith("…") == (len(data) > SHOWN)
+    assert text.removesuffix("…").isascii()
+    assert len(text) <= SHOWN + 1
+    assert text.endswith("…") == (len(data) > SHOWN)
+
+
+def test_of_many_bytes_the_first_or_the_last_are_shown_and_none_in_half() -> None:
+    data = b"\xff" * SHOWN + b"end"
+    assert printable(data) == r"\xff" * (SHOWN // 4) + "…"
+    assert printable(data, last=True) == "…" + r"\xff" * ((SHOWN - 3) // 4) + "end"
 
 
 def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise() -> None:
