@@ -13,6 +13,7 @@ from collections import Counter
 from acsard.config.live import changed
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
+from acsard.drive.answered import Answered
 from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.dropped import Dropped
 from acsard.drive.gyro import Gyro
@@ -96,6 +97,7 @@ class Robot:
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         self._dropped = Dropped()
+        self._answered = Answered(config.mcu.reply_period)
         self._tally = Tally()
         self._asked: tuple[str, str, int | None] = ("", "", None)
         """The request before; a stop comes twice, ahead of its query and with it."""
@@ -193,6 +195,11 @@ class Robot:
             inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent
         )
         link = session.link
+        told = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")
+        if told is not None:
+            events.append(told)
+        if before == "up" != link:
+            self.counters["link_lost"] += 1
         if link != "up":
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble

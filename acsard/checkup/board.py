@@ -19,6 +19,7 @@ from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.mcu.contract import WATCHDOG_S
 from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
+from acsard.mcu.hearing import Heard
 from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, WheelSpeeds
 
@@ -52,7 +53,11 @@ class Board:
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Lines that are no good replies."""
-        self.heard_bytes = self.sent_lines = 0
+        self.heard = Heard()
+        """All that came since the line was opened."""
+        self.lost = 0.0
+        """Share of the lines that get lost or damaged, of either way."""
+        self.sent_lines = 0
         self.sent_s = 0.0
         self.paused = False
         """This host paused while driving, for so long that the watchdog may have struck."""
@@ -69,7 +74,7 @@ class Board:
     def open(self, baud_rate: int) -> None:
         """Open the line at this rate; what was half received is forgotten."""
         self.wire.open(baud_rate)
-        self.baud_rate, self.heard_bytes = baud_rate, 0
+        self.baud_rate, self.heard = baud_rate, Heard()
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
 
@@ -192,10 +197,11 @@ class Board:
         """What the MCU answers in the next so many seconds; a runaway in it ends the check."""
         got = []
         for at_ns, data in self.wire.listen(self.wire.now_ns() + ceil(seconds * NS_PER_S)):
-            self.heard_bytes += len(data)
+            self.heard.take(data)
             for line, following in self._lines.feed(data):
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
+                self.heard.line(line, reply is not None)
                 if reply is not None:
                     got.append(reply)
         self.replies += got

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from acsard.checkup import manual
+from acsard.checkup import loss, manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import GLANCE_S
@@ -37,6 +37,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     """`mcu.encoder_counts`, from the identification or measured; `motors` have moved right."""
     if not board.sampled:
         return manual.find("encoder counts: none")
+    if board.lost > loss.MOST:
+        return manual.find("encoder counts: damaged", share=board.lost)
     said = board.identity.get("counts", "")
     named = int(said) if said.isdigit() and len(said) < 9 else 0
     measured, configured = per_turn(board.replies, motors), board.mcu.encoder_counts

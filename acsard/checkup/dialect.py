@@ -26,6 +26,9 @@ OTHER_S = 0.6
 ENOUGH = 3
 """Good replies that prove a baud rate."""
 
+ASKED = 3
+"""How often it is asked who it is: the question or its answer may be lost."""
+
 TRIES = 5
 """Lines that are sent to see whether they are answered."""
 
@@ -35,14 +38,15 @@ def baud(board: Board) -> Finding:
     configured = board.baud_rate
     if _knock(board, BOOT_S):
         return manual.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
-    heard = "only garbage" if board.heard_bytes else "nothing"
+    heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, OTHER_S):
-            seen = {"rate": rate, "configured": configured, "heard": heard}
+            seen = {"rate": rate, "configured": configured, "heard": heard.counted}
             return manual.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
     board.open(configured)
-    raise StoppedError(manual.find("baud rate: none", heard=heard, configured=configured))
+    told = manual.find(f"baud rate: {heard.looks}", heard=heard.counted, configured=configured)
+    raise StoppedError(told)
 
 
 def _knock(board: Board, seconds: float) -> bool:
@@ -62,8 +66,11 @@ def _knock(board: Board, seconds: float) -> bool:
 def identity(board: Board) -> Finding:
     """Who it says it is; ends the check when it only says what we say."""
     board.others.clear()
-    board.wire.send(b"\r\n?\r\n")
-    board.listen(1.5 * GLANCE_S)
+    for _ in range(ASKED):
+        board.wire.send(b"\r\n?\r\n")
+        board.listen(1.5 * GLANCE_S)
+        if any(line.startswith(IDENTITY) or line == b"?" for line in board.others):
+            break
     for line in board.others:
         if line.startswith(IDENTITY):
             text = line.decode("ascii", "replace").removeprefix("!")
@@ -79,6 +86,8 @@ def form(board: Board) -> Finding | None:
     """Whether it answers the configured form of line at all; None when it does, or cannot tell."""
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
+    if _answers(board, board.comma):
+        return None  # it had been held up
     board.comma = not board.comma
     return _comma_wrong(board, "refused")
 

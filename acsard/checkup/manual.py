@@ -19,10 +19,26 @@ PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
-FAIL baud rate: none | {heard} at {configured} baud
-    no good line at any baud rate
-    -> is it the right port (`acsard ports`), is the board powered, does the firmware answer, are
-    TX and RX crossed?
+FAIL baud rate: nothing | nothing heard
+    {heard} at {configured} baud, and no good line at any other
+    -> is it the right port (`acsard ports`), is the board powered, does the firmware answer lines,
+    are TX and RX crossed?
+FAIL baud rate: cut | pieces of lines
+    at {configured} baud {heard}; no good line at any other
+    -> the firmware cuts its replies short or leaves out the line end: all four values and
+    Serial.println() in one reply; is its send buffer too small, does it start anew while it writes?
+FAIL baud rate: foreign | other bytes on its lines
+    at {configured} baud {heard}; no good line at any other
+    -> the baud rate is right, but something else is on the line: a debug print of the firmware or
+    a second program at this port; else noise: one ground for board and computer, a short cable away
+    from the motors' leads
+FAIL baud rate: garbage | only garbage
+    at {configured} baud {heard}; no good line at any other
+    -> does the firmware speak at 9600 to 115200 baud, at TTL level and not RS-232? is it the right
+    port (`acsard ports`), and the board's ground joined to the computer's?
+FAIL baud rate: few | hardly a good line
+    at {configured} baud {heard}; fewer good lines at any other
+    -> a short cable away from the motors' leads, one ground, a lower baud rate at both ends
 
 PASS identification: named | {short}
     {text}
@@ -41,7 +57,7 @@ PASS reply rate: right | {rate:.0f} Hz, {way}
     longest gap {longest:.0f} ms
 WARN reply rate: lossy | {rate:.0f} Hz, {way}
     only {answered:.0%} of the lines were answered
-    -> odometry is as fine as this
+    -> odometry is as fine as this; whether lines get lost is counted below
 FAIL reply rate: slow | {rate:.0f} Hz, {way}
     one reply in {gap:.0f} ms: the host takes {quiet:.0f} ms of silence for a lost link
     -> write mcu.reply_period = {period:g}, or have every line answered
@@ -52,7 +68,7 @@ FAIL reply rate: none | too few replies
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
     news of the wheels come late
-    -> an FTDI chip holds bytes back for 16 ms unless its latency_timer is 1 (`doctor`)
+    -> firmware that waits? an FTDI chip does, 16 ms unless its latency_timer is 1 (`doctor`)
 SKIPPED round trip: own clock
     it answers by its own clock: a reply says nothing of the line before it
 SKIPPED round trip: none
@@ -67,7 +83,45 @@ FAIL checked link: required | none
     the firmware answers plain: a damaged line can say a wrong speed
     -> write mcu.link_check = "auto", or give the board firmware that knows the check
 
+PASS lost lines: none | none of {lines}
+PASS lost lines: few | {lost} of {lines}
+WARN lost lines: late | none of {lines}, but silent for {silent:.0f} ms
+    so long nothing came, then all at once: the host takes that for a lost link, and the robot stops
+    -> another USB port without a hub, no power saving of USB; does the firmware wait somewhere?
+FAIL lost lines: back | {share:.0%} of {lines}
+    {damaged} came damaged from the board, the last `{last}`
+    -> the lead from the board's TX to the computer's RX; a short cable away from the motors' leads,
+    one ground, a lower baud rate at both ends
+FAIL lost lines: both | {share:.0%} of {lines}
+    {damaged} came damaged from the board, the last `{last}`; others were lost there or back
+    -> a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+FAIL lost lines: either | {share:.0%} of {lines}
+    so many had no answer: lost on the way there, or the answer on its way back; see below
+    -> a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+FAIL lost lines: silent | {share:.0%} of {lines}
+    so many of the board's own reports did not come
+    -> the lead from the board's TX to the computer's RX; a short cable away from the motors' leads,
+    one ground, a lower baud rate at both ends
+
+PASS lost where: not seen | none of {sent} more
+FAIL lost where: there | {there} of {sent} there, {back} back
+    lines are lost on the way to the board: the motors did not do what these said
+    -> the lead from the computer's TX to the board's RX, ground, a lower baud rate; does the
+    firmware read its buffer often enough?
+FAIL lost where: back | {there} of {sent} there, {back} back
+    answers are lost on their way back: the motors did what the lines said
+    -> the lead from the board's TX to the computer's RX, the ground, a lower baud rate at both ends
+FAIL lost where: both | {there} of {sent} there, {back} back
+    lines and answers are lost
+    -> the ground of board and computer first, then cable and plugs; a lower baud rate at both ends
+SKIPPED lost where: untold
+    the motors cannot show on which way: too slow, too coarsely seen, or too much is lost
+
 PASS motor: right | {figure}
+WARN motor: off | {figure}
+    {error:.0%} {which} than the {speed:g} rad/s it was told: the robot will not drive straight
+    -> if slower: does the wheel turn freely, are supply and driver enough for it, is the motor
+    worn? else counts per turn and gear ratio in the firmware
 FAIL motor: dead, not seen | {figure}
     encoder {here} shows nothing: a dead encoder, or a motor that does not turn
     -> look whether the wheel turns: if it does, the encoder's supply and leads; if not, the
@@ -136,6 +190,8 @@ FAIL wheel map: twice
 
 SKIPPED encoder counts: none
     the firmware sends no counts
+SKIPPED encoder counts: damaged
+    {share:.0%} of the lines are lost: what the rest says of the counts is no measure
 SKIPPED encoder counts: not turned
     too little was turned to measure them
 FAIL encoder counts: backward | {measured:.0f} per turn
@@ -200,7 +256,7 @@ FAIL runaway: against | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
 
 FAIL stop: turns | turns {seconds:g} s after zeros
     {motors} turns on, by its encoder, whatever zeros are sent
-    -> cut the motors' power; does the firmware take `p00.00` for a stop?
+    -> does a hand or a slope turn it? else cut the motors' power: firmware must stop at `p00.00`
 
 FAIL link: silent | silent for {seconds:.1f} s
     the microcontroller fell silent while {motors} was to turn

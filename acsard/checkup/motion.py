@@ -10,7 +10,7 @@ from statistics import fmean
 
 from msgspec import Struct
 
-from acsard.checkup.limits import GLANCE_S, MOVES
+from acsard.checkup.limits import GLANCE_S, MOVES, SPEED
 from acsard.config.wire_time import FIELD
 from acsard.mcu.check import Reading
 from acsard.mcu.frames import Motors
@@ -100,6 +100,17 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
     now = mean(since(replies, now_s - span_s, now_s))
     turn = [min(abs(one), abs(other)) > 0.1 for one, other in zip(before, now, strict=True)]
     return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
+
+
+def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
+    """For how long a steady motor turns for what its speeds jump by: whole counts make them jump,
+    by one count in the time of a reply."""
+    if len(steady) < 5:
+        return 0.0
+    between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
+    speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
+    # One that is damaged is no jump.
+    return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
 
 
 def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from acsard.checkup import counts, damage, dialect, manual, pace, turning, watchdog
+from acsard.checkup import (
+    counts,
+    damage,
+    dialect,
+    loss,
+    lost_where,
+    manual,
+    pace,
+    turning,
+    watchdog,
+)
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, WireLostError
 from acsard.checkup.outside import Operator, Wire
@@ -22,9 +32,24 @@ CONFIRM = (
 
 STEPS = (
     "baud rate", "identification", "reply form", "reply rate", "round trip", "checked link",
-    "motors", "trailing comma", "wheel map", "encoder counts", "watchdog", "damaged lines",
+    "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
+    "damaged lines",
 )  # fmt: skip
-"""In this order; what the check does not come to is said to be skipped."""
+"""In this order; what the check does not come to is said to be skipped, in one row."""
+
+REST = "the rest"
+
+SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
+    ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
+    ("asking who it is", dialect.identity),
+    ("listening how often it answers", pace.rate),
+    ("measuring how soon it answers", pace.trip),
+    ("trying the comma at the end of the line", dialect.form),
+    ("looking at its replies", dialect.replies),
+    ("asking for the check", dialect.check),
+    ("counting lost lines, 3 s and more", loss.finding),
+)
+"""What is looked at with zeros and questions alone, and what the person is told meanwhile."""
 
 Tell = Callable[[Finding], None]
 
@@ -57,14 +82,14 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
         why = "the check ended early: the serial line was lost"
     else:
         return
-    for step in STEPS:
-        if step not in told:
-            tell(Finding(step, "SKIPPED", "", why))
+    rest = [step for step in STEPS if step not in told]
+    if rest:
+        tell(Finding(REST, "SKIPPED", f"{len(rest)} steps", f"{why}; not tried: {', '.join(rest)}"))
 
 
 def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], None]) -> None:
-    for step in (dialect.baud, dialect.identity, pace.rate, pace.trip, dialect.form,
-                 dialect.replies, dialect.check):  # fmt: skip
+    for doing, step in SILENT:
+        operator.say(doing)
         tell(step(board))
     board.rest()
     board.armed = True
@@ -74,7 +99,8 @@ def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], No
         tell(encoder_finding(board.mcu, channel))
     tell(dialect.comma(board, channels[-1].kind == "dead"))
     tell(wheel_map(board.mcu, channels))
-    right = [channel.motor for channel in channels if channel.kind == "right"]
+    right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
+    tell(lost_where.finding(board, operator, right))
     tell(counts.finding(board, right))
     operator.say("the motors turn together, then the host falls silent, several times perhaps")
     tell(watchdog.finding(board, right))

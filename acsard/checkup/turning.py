@@ -15,8 +15,14 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import motor_name
 from acsard.checkup.motion import ZERO, moving
 from acsard.checkup.outside import Operator
-from acsard.checkup.wheels import TOLERANCE, Channel
+from acsard.checkup.wheels import OFF, TOLERANCE, Channel
 from acsard.mcu.frames import LETTERS, Motors
+
+NEAR = 0.8
+"""Of what is off: a first look is no surer."""
+
+LOOK_S = 0.75 * limits.MOTOR_S
+"""Over so long the speed of a motor is taken that is off at first."""
 
 LOOKS = 8
 """Over so many looks the speed of an encoder is taken that is not steady before."""
@@ -31,14 +37,32 @@ def one(motor: int, speed: float) -> Motors:
     return motion.each(lambda index: speed if index == motor else 0.0)
 
 
-def turn(board: Board, motor: int, speed: float) -> Motors:
-    """Bring a motor to speed, once more if this host has paused; each encoder's speed by then."""
+def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
+    """Bring a motor to speed, once more if this host has paused.
+
+    Each encoder's speed by then, and by which share this motor's may err: whole counts tell it.
+    """
     board.paused = False
     means = run_up(board, one(motor, speed))
     if board.paused:
         board.rest()
         means = run_up(board, one(motor, speed))
-    return means
+    unsure = _unsure(board, motor, 2 * _look_s(board))
+    if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
+        # Weak, or a heavy one that is not there yet: a longer look tells.
+        board.drive(one(motor, speed), limits.MOTOR_S)
+        means = motion.mean(motion.since(board.replies, board.now_s - LOOK_S))
+        unsure = _unsure(board, motor, LOOK_S)
+    return means, unsure
+
+
+def _unsure(board: Board, motor: int, seconds: float) -> float:
+    look = motion.since(board.replies, board.now_s - seconds / 2)  # the ramp is over by then
+    return motion.grain_s(look, [motor]) / seconds
+
+
+def _look_s(board: Board) -> float:
+    return max(limits.GLANCE_S / 2, 2.5 * board.gap_s)
 
 
 def run_up(board: Board, motors: Motors) -> Motors:
@@ -47,7 +71,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
         board.drive((a, b, c, d), board.period_s)
-    began_s, look_s = board.now_s, max(limits.GLANCE_S / 2, 2.5 * board.gap_s)
+    began_s, look_s = board.now_s, _look_s(board)
     told = [motor for motor in range(4) if motors[motor]]
     means, looks, steady = ZERO, 0, 0
     while steady < 2 and board.now_s - began_s < _patience_s(board, told):
@@ -85,14 +109,15 @@ def _both_ways(board: Board, motor: int) -> Channel:
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
-    forth, back = turn(board, motor, limits.SPEED), ZERO
+    (forth, unsure), back = turn(board, motor, limits.SPEED), ZERO
     if motor in moving(forth):
         board.rest()
-        back = turn(board, motor, -limits.SPEED)
+        back, other = turn(board, motor, -limits.SPEED)
+        unsure = max(unsure, other)
     if motor not in moving(back):
         board.let_go(limits.CUT_S)
     board.rest()
-    return Channel(motor, forth, back)
+    return Channel(motor, forth, back, unsure=unsure)
 
 
 def probe(board: Board, motor: int) -> Motors | None:

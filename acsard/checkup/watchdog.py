@@ -141,7 +141,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
         letters = ", ".join(LETTERS[motor] for motor in motors)
         raise StoppedError(manual.find("watchdog: weak", letters=letters))
     # The ramp is over by the second half of the time.
-    grain_s = _grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
+    grain_s = motion.grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
     told_s, lines = board.sent_s, iter(instead)
     while (left_s := told_s + length_s - board.now_s) > 0:
         if line := next(lines, b""):
@@ -179,13 +179,3 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
 def _share(reply: Reply, motors: Sequence[int]) -> float:
     """The fastest of these motors, as a share of the speed they were told."""
     return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED
-
-
-def _grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
-    """Whole counts make the speeds of a steady motor jump, by one count in the time of a reply."""
-    if len(steady) < 5:
-        return 0.0
-    between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
-    speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
-    # One that is damaged is no jump.
-    return max(course[-2] - course[1] for course in speeds) * between_s / limits.SPEED

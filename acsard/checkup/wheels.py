@@ -19,9 +19,12 @@ from acsard.mcu.frames import LETTERS, Motors
 from acsard.values import WHEELS
 
 TOLERANCE = 0.25
-"""By which share the encoder's speed may differ from the command."""
+"""By which share the encoder's speed may differ from the command, and pass for this motor's."""
 
-Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size"]
+OFF = 0.05
+"""By which share it may differ on a sound robot."""
+
+Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off"]
 
 
 class Channel(Struct, frozen=True):
@@ -36,6 +39,8 @@ class Channel(Struct, frozen=True):
     """It turned forward first, as seen by a person."""
     probed: bool = False
     """Its own encoder did not follow a short probe: it was not turned further, and not back."""
+    unsure: float = 0.0
+    """By which share the speeds may err: counts of a coarse encoder."""
 
     @property
     def moved(self) -> list[int]:
@@ -58,8 +63,15 @@ class Channel(Struct, frozen=True):
             return "other"
         if self.probed or self.forth[own] < 0 < self.back[own]:
             return "reversed"
-        sizes = self.forth[own] / SPEED, -self.back[own] / SPEED
-        return "right" if all(abs(size - 1) <= TOLERANCE for size in sizes) else "size"
+        if self.error > TOLERANCE:
+            return "size"
+        return "off" if self.error > OFF + self.unsure else "right"
+
+    @property
+    def error(self) -> float:
+        """By which share of its command the own encoder's speed is off, the worse of both ways."""
+        own = self.motor
+        return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
 
 def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
@@ -76,6 +88,8 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         there=LETTERS[there],
         reversed=", and one of them is reversed" if channel.forth[there] < 0 else "",
         wheel=words(wheel_of(mcu, motor)[0]),
+        error=channel.error,
+        which="slower" if forth - back < 2 * SPEED else "faster",
         tolerance=TOLERANCE,
         speed=SPEED,
     )
@@ -107,7 +121,7 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     entries: dict[str, str] = {}
     for channel in found:
         wheel, sign = wheel_of(mcu, channel.motor)
-        if channel.kind in ("right", "size") and channel.wheel:
+        if channel.kind in ("right", "off", "size") and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
             return manual.find("wheel map: twice", wheel=words(wheel))

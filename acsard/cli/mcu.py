@@ -91,6 +91,7 @@ def main(args: argparse.Namespace) -> int:
     def tell(finding: Finding) -> None:
         findings.append(finding)
         if not args.json:
+            person.clear()
             print(row(finding, sys.stdout.isatty()), flush=True)
 
     if not args.json:
@@ -104,6 +105,8 @@ def main(args: argparse.Namespace) -> int:
         if not args.json:
             raise
         trouble = error  # programs get their object all the same
+    finally:
+        person.clear()
     changes = advice.changes(findings, configured, args.port if args.write else "")
     written = ""
     if args.write and changes and not trouble:

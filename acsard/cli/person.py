@@ -15,15 +15,35 @@ from acsard.host.exits import Exit, ExitError
 SIMULATOR = "sim"
 
 
-class Person:
-    """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
+class Progress:
+    """What happens now: a line on the terminal, written over by what comes next; nothing into a
+    pipe."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._on = sys.stderr.isatty() and not quiet
+        self._shown = False
 
     def say(self, text: str) -> None:
         """Tell what happens now."""
-        print(f"   ... {text}", file=sys.stderr, flush=True)
+        if self._on:
+            # Whole or cut, never wrapped: a wrapped line cannot be written over.
+            room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
+            print(f"\r\033[K{f'   ... {text}'[:room]}", end="", file=sys.stderr, flush=True)
+            self._shown = True
+
+    def clear(self) -> None:
+        """Room for what stays on the screen."""
+        if self._shown:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+            self._shown = False
+
+
+class Person(Progress):
+    """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
         """One of the answers; the end of the input ends the check."""
+        self.clear()
         choice = f" [{'/'.join(answers)}]" if len(answers) > 1 else ""
         while True:
             print(f"\n{question}{choice} ", end="", file=sys.stderr, flush=True)
@@ -36,16 +56,8 @@ class Person:
             print(f"   please type {' or '.join(answers)}", file=sys.stderr)
 
 
-class Nobody:
+class Nobody(Progress):
     """Confirms what has been said on the command line, and sees nothing."""
-
-    def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
-
-    def say(self, text: str) -> None:
-        """Nobody listens; whoever looks at the screen may know."""
-        if not self._quiet and sys.stderr.isatty():
-            print(f"   ... {text}", file=sys.stderr, flush=True)
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """The confirmation; no wheel has been seen to turn."""
@@ -68,7 +80,7 @@ def answering(args: argparse.Namespace, port: str) -> Person | Nobody:
                 "mcu check turns the wheels and asks a person who sees them: run it in a "
                 "terminal; `--yes` without one is for the simulator (--port sim)",
             )
-        return Person()
+        return Person(args.json)
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
         return Nobody(args.json)
     from acsard.host.processes import master_of

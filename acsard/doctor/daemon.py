@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator, Mapping
 
 from acsard.bus.address import address_of
 from acsard.bus.session import reachable
-from acsard.client import connect
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding, Level
+from acsard.doctor.link import check, link
+from acsard.doctor.running import Running, answers, asked
 from acsard.drive.gyro import WORDS
-from acsard.host import clock
 from acsard.messages.schema import DiagnosticStatus
 from acsard.values import NS_PER_S, AcsardError
 
@@ -39,7 +38,7 @@ START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon
 def routers(config: Config) -> Iterator[Finding]:
     """Are they there, and whom does it lend its rights to?"""
     for endpoint in config.bus.connect:
-        if not _answers(endpoint):
+        if not answers(endpoint):
             yield Finding("router", "warning", f"nobody listens at {endpoint}", START_ROUTER)
         if endpoint.startswith("tls/"):
             continue
@@ -47,31 +46,33 @@ def routers(config: Config) -> Iterator[Finding]:
         yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
 
 
-def daemon(config: Config) -> Iterator[Finding]:
-    """Is there a daemon, and what does it say?"""
-    endpoint, _, tls = address_of(config)
-    if not _answers(endpoint):
+def found(config: Config) -> Running | Finding:
+    """The daemon that runs where this configuration has it; else what is wrong with that."""
+    endpoint = address_of(config).endpoint
+    if not answers(endpoint):
         if config.bus.mode == "client":
             text = f"cannot be asked: the router at {endpoint}, by which it is reached, is missing"
-            yield Finding(
-                "daemon", "warning", text, "the router first; see `systemctl status acsard`"
-            )
-            return
+            mend = "the router first; see `systemctl status acsard`"
+            return Finding("daemon", "warning", text, mend)
         mend = "systemctl status acsard; or start it: acsard run"
-        yield Finding("daemon", "warning", f"nobody listens at {endpoint}", mend)
-        return
+        return Finding("daemon", "warning", f"nobody listens at {endpoint}", mend)
     try:
-        with connect(endpoint, robot_id=config.robot.id, tls=tls) as robot:
-            state, rows = robot.get("state"), robot.get("diagnostics").status
+        return asked(config)
     except AcsardError as error:
-        yield Finding("daemon", "failure", str(error), "is another program on that port?")
-        return
+        return Finding("daemon", "failure", str(error), "is another program on that port?")
+
+
+def daemon(running: Running) -> Iterator[Finding]:
+    """What does it say?"""
+    state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
-    mend = "see the reason; `acsard call clear` releases it" if level == "failure" else ""
+    mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
+    mend = mend if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
-    yield from clocks(state.stamp.to_ns(), clock.now().wall_ns, state.counters)
+    yield from link(running)
+    yield from clocks(state.stamp.to_ns(), running.looked_ns, state.counters)
     yield from gyro(state.gyro, state.counters)
-    yield from linked({row.name: row for row in rows})
+    yield from linked({row.name: row for row in running.rows})
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"
         yield Finding("door", "warning", text, "take his certificate from [access], or his program")
@@ -119,18 +120,8 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 def door(config: Config) -> Iterator[Finding]:
     """Is the door to the network open?"""
     for endpoint in map(reachable, config.bus.outside):
-        if _answers(endpoint):
+        if answers(endpoint):
             yield Finding("door", "ok", f"open at {endpoint}")
         else:
             mend = "systemctl status acsard-door; `acsard run` opens one by itself"
             yield Finding("door", "warning", f"nobody listens at {endpoint}", mend)
-
-
-def _answers(endpoint: str) -> bool:
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    host = host.strip("[]")
-    try:
-        socket.create_connection((host, int(port)), timeout=1.0).close()
-    except OSError:
-        return False
-    return True

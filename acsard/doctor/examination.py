@@ -1,6 +1,7 @@
 """Everything the doctor looks at, in order: from the configuration to a robot that drives.
 
-It opens no port and sends nothing to a robot.
+It opens no port and sends nothing to a robot. Where a daemon runs, what it runs with is looked at:
+the file may say something else by now, or options did.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from collections.abc import Iterator
 from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, parse
 from acsard.doctor.certificates import certificates
-from acsard.doctor.daemon import daemon, door, routers
+from acsard.doctor.daemon import daemon, door, found, routers
 from acsard.doctor.finding import Finding
 from acsard.doctor.machine import clock_and_scheduling, meddlers
 from acsard.doctor.port import serial_port
+from acsard.doctor.running import Running, compared
 
 
 def examine(where: str, text: bytes) -> Iterator[Finding]:
@@ -25,6 +27,10 @@ def examine(where: str, text: bytes) -> Iterator[Finding]:
             yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
         return
     yield Finding("configuration", "ok", where)
+    running = found(config)
+    if isinstance(running, Running):
+        yield from compared(running, config)
+        config = running.config
     for warning in warnings(config):
         yield Finding("configuration", "warning", warning, "see acsard.toml")
     yield from serial_port(config)
@@ -32,5 +38,8 @@ def examine(where: str, text: bytes) -> Iterator[Finding]:
     yield from clock_and_scheduling()
     yield from certificates(config)
     yield from routers(config)
-    yield from daemon(config)
+    if isinstance(running, Running):
+        yield from daemon(running)
+    else:
+        yield running
     yield from door(config)

@@ -41,8 +41,10 @@ TOLD_AGAIN_S = 1.0
 
 
 _FAULTS = {
-    "dead": "does not turn, or its encoder is dead: look at cable, motor and encoder",
-    "reversed": "turns against its command: look at the motor's leads and its sign in mcu.wheels",
+    "dead": "does not turn, or its encoder is dead: look at cable, motor and encoder; if it "
+    "is motor d, at mcu.trailing_comma",
+    "reversed": "turns against its command: look at the motor's leads, its encoder's A and B, and "
+    "its sign in mcu.wheels",
     "runaway": "turns faster than commanded: the motor driver or its encoder is at fault",
     "stuck": "reports one and the same speed: its encoder is stuck",
 }

@@ -27,7 +27,9 @@ Reason = Literal[
 ]
 
 _TOKEN = rb"([abcd])([pn])([0-9]{1,2}\.[0-9]{1,3})"
-_LINE = re.compile(_TOKEN + (rb", *" + _TOKEN) * 3 + rb"(?:, *)?")
+TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
+"""The four values of a line, as an expression."""
+_LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):

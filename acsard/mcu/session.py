@@ -13,6 +13,7 @@ from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.hearing import Hearing
 from acsard.mcu.lines import LineReader
 from acsard.mcu.link import WORDS, Link
 from acsard.mcu.link import State as LinkState
@@ -51,6 +52,7 @@ class McuSession:
         self._link = Link(self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self.snapping = Snapping()
+        self._hearing = Hearing()
         self._wants_samples = mcu.wants_samples
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
@@ -132,8 +134,11 @@ class McuSession:
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.link in ("booting", "stale"):
+            heard = self._hearing.heard
             if self.negotiation.trouble:
                 return MENDS[self.negotiation.trouble]
+            if heard is not None and not heard.good:
+                return heard.words
             if self._damaged:
                 return "the microcontroller's replies come damaged; asking it for the check again"
             if self._link.sparse_s:
@@ -142,6 +147,8 @@ class McuSession:
                     f"the microcontroller's lines come {apart} s apart; if it reports "
                     f"by its own clock, set mcu.reply_period = {apart}"
                 )
+            if heard is not None:
+                return heard.words
         return WORDS[self.link]
 
     @property
@@ -164,6 +171,7 @@ class McuSession:
         self._lines.clear()
         self._timeline.forget()
         self.snapping.forget()
+        self._hearing.forget()
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
@@ -184,6 +192,10 @@ class McuSession:
         if settled and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns:
             check.begin()
         check.judge(now_ns)
+        if self.link == "up":
+            self._hearing.forget()
+        elif self._hearing.judge(now_ns):
+            self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, more: int = 1, text: str = "") -> None:
         """Count lines that were not taken."""
@@ -222,6 +234,8 @@ class McuSession:
     def _read(self, piece: Received) -> list[Feedback]:
         """The good lines of one read; of each line the timeline hears."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
+        if self.link != "up":
+            self._hearing.now.take(piece.data)
         if lines:
             timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
@@ -230,6 +244,8 @@ class McuSession:
                 timeline.spoilt()
             else:
                 feedback.append(got)
+            if self.link != "up":
+                self._hearing.now.line(line, got is not None)
         return feedback
 
     def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:

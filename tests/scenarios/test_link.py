@@ -8,6 +8,7 @@ import pytest
 
 from acsard.config.settings import Config, ControlConfig, McuConfig
 from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.named_faults import named
 from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 
@@ -298,3 +299,54 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
     world.drive(0.5, seconds=1.0)
     world.mcu.advance(world.now_ns + 400_000_000)
     assert world.mcu.vehicle.set_points == [0.0] * 4
+
+
+@pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
+def test_a_link_that_loses_lines_is_told_once(fault: str) -> None:
+    world = World()
+    with named(fault).on(world.mcu):
+        world.run(25.0)
+    told = [event for event in world.events if event.name == "lines_lost"]
+    assert [event.level for event in told] == ["warning"]
+    assert "were answered" in told[0].text
+
+
+def test_a_sound_link_is_not_said_to_lose_lines() -> None:
+    world = World()
+    world.drive(0.5, seconds=25.0)
+    assert not [event for event in world.events if event.name == "lines_lost"]
+    assert "link_lost" not in world.state.counters
+
+
+def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
+    world = World()
+    with named("stalls=1:0.3").on(world.mcu):
+        world.run(5.5)
+    assert world.state.counters["link_lost"] == 5
+
+
+@pytest.mark.parametrize(
+    ("fault", "heard", "mend"),
+    [
+        ("mute", "nothing at all heard", "is it powered"),
+        ("noise", r"none good, the last `\x00\xff~ap00.00,", "what disturbs the cable"),
+        ("partial_line", "bytes heard but no line end, the last `", "cut its lines short"),
+    ],
+)
+def test_a_silent_or_garbled_board_is_told_by_what_was_heard(
+    fault: str, heard: str, mend: str
+) -> None:
+    world = World()
+    with named(fault).on(world.mcu):
+        world.run(2.9)
+        assert "first good lines" in world.state.reason
+        states = len(world.bus.published["state"])
+        world.run(6.5)
+    assert heard in world.state.reason
+    assert mend in world.state.reason
+    assert "`acsard mcu check`" in world.state.reason
+    assert len(world.bus.published["state"]) - states < 80, "its figures are not news of their own"
+    (event,) = [
+        event for event in world.events if event.name == "link_booting" and heard in event.text
+    ]
+    assert event.level == "warning"

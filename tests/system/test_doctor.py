@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from acsard.lan.authority import Authority
-from tests.system.harness import Bus, Daemon, FarPeer, free_endpoint
+from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, free_endpoint, until
 
 pytestmark = pytest.mark.network
 
@@ -106,6 +106,45 @@ def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
         assert found["daemon"][0]["text"].startswith("ready: ")
         assert all(one["level"] != "failure" for one in found["daemon"])
     assert code in (0, 1)  # the far peer itself holds the pty
+
+
+def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_told(tmp_path: Path) -> None:
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, words=("--port", str(peer.path))) as daemon:
+        peer.awaits(b"ap00.00")
+        _, found = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
+        other = worst(found["configuration"])
+        assert f'mcu.port = "{peer.path}", not "sim"' in other["text"]
+        assert f"pid {daemon.pid}" in other["text"]
+        assert not any("simulator" in one["text"] for one in found["port"])
+        assert any(str(peer.path) in one["text"] for one in found["port"])
+        assert worst(found["link"])["level"] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("fault", "subject", "words"),
+    [
+        ("mute", "link", "nothing at all heard"),
+        pytest.param("noise", "link", r"last `\x00\xff~ap00.00", marks=pytest.mark.slow),
+        pytest.param("partial_line", "link", "no line end", marks=pytest.mark.slow),
+        ("lost_replies", "link", "were answered"),
+        pytest.param("lost_commands", "link", "were answered", marks=pytest.mark.slow),
+    ],
+)
+def test_a_poor_board_behind_a_daemon_is_named(
+    tmp_path: Path, fault: str, subject: str, words: str
+) -> None:
+    with Program(acsard("sim", "--fault", fault), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        with Daemon(tmp_path, words=("--port", port)) as daemon, Bus(daemon.endpoint) as bus:
+            linked = fault.startswith("lost")
+            until(lambda: bus.state()["mode"] == "ready" if linked else "heard" in
+                  bus.state()["reason"], 10.0, "what is heard")  # fmt: skip
+            code, found = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
+    finding = worst(found[subject])
+    assert words in finding["text"]
+    assert f"acsard mcu check --port {port}" in finding["mend"]
+    assert finding["level"] == ("warning" if linked else "failure")
+    assert code == 1 or linked
 
 
 def test_an_address_with_something_else_behind_it_is_a_failure(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def test_the_rate_it_speaks_at_is_found_and_used(rate: Any) -> None:
 
 
 def test_garbage_is_told_from_silence() -> None:
-    for fault, word in (("mute", "nothing"), ("noise", "only garbage")):
+    for fault, word in (("mute", "nothing"), ("noise", "other bytes"), ("partial_line", "pieces")):
         with Robot(fault).board(rest=False) as board, pytest.raises(StoppedError) as end:
             dialect.baud(board)
         assert end.value.finding.figure.startswith(word)

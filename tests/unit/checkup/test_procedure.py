@@ -107,6 +107,7 @@ def test_the_person_is_told_what_can_happen() -> None:
 
 def test_every_step_has_a_finding() -> None:
     checked = check(person=True)
+    assert not [f for f in checked.findings if f.name == procedure.REST]
     names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
     assert names == set(procedure.STEPS)
 
@@ -352,7 +353,7 @@ def test_a_runaway_stops_it_at_once() -> None:
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
     assert "more than 6 rad/s" in checked["runaway"].text
-    assert checked["watchdog"].verdict == "SKIPPED"
+    assert "watchdog" in checked[procedure.REST].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a has had its 3 rad/s; b never was told more than what already looked like a runaway.
@@ -461,8 +462,55 @@ def test_an_mcu_that_says_nothing_good_is_never_driven(fault: str) -> None:
     robot = Robot(fault)
     checked = Checked(robot)
     assert checked.failed == ["baud rate"]
+    (rest,) = [found for found in checked.findings if found.verdict == "SKIPPED"]
+    assert rest is checked.findings[-1]
+    assert all(step in rest.text for step in procedure.STEPS[1:])
     assert robot.mcu.vehicle.angles == [0.0] * 4
     assert set(robot.opened) == {9600, 19200, 38400, 57600, 115200}
+
+
+def test_mute_noise_and_half_lines_are_three_mends_with_what_was_heard() -> None:
+    found = {fault: check(fault)["baud rate"] for fault in ("mute", "noise", "partial_line")}
+    assert len({finding.mend for finding in found.values()}) == 3
+    assert "TX and RX crossed" in found["mute"].mend
+    assert "nothing at all heard" in found["mute"].text
+    assert "ground" in found["noise"].mend
+    assert r"`\x00\xff~ap00.00,bp00.00" in found["noise"].text
+    assert "line end" in found["partial_line"].mend
+    assert "bytes heard but no line end, the last `" in found["partial_line"].text
+
+
+@pytest.mark.parametrize("gain", [0.8, 0.93, 1.07])
+def test_a_motor_that_is_off_by_more_than_a_twentieth_is_a_warning(gain: float) -> None:
+    checked = check(f"bias=c:{gain}")
+    assert checked.failed == []
+    assert checked.named("WARN") == ["motor c (rear left)"]
+    assert checked["watchdog"].verdict == "PASS"
+
+
+@pytest.mark.parametrize(
+    "robot", [(0.2, 3200), (1.0, 3200), slow((0.05, 16)), (0.05, 48), slow((0.5, 64))]
+)
+def test_neither_a_heavy_wheel_nor_a_coarse_encoder_is_a_weak_motor(
+    robot: tuple[float, int],
+) -> None:
+    lag, per_turn = robot
+    config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
+    checked = check("plain_only", config=config)
+    assert not [name for name in checked.named("WARN") if name.startswith("motor")]
+
+
+def test_what_it_does_is_said_before_it_takes_time() -> None:
+    said: list[str] = []
+
+    class Listener(Nobody):
+        def say(self, text: str) -> None:
+            said.append(text)
+
+    robot = Robot()
+    procedure.run(robot, Listener(), robot.config, lambda finding: said.append(finding.name))
+    told = [n for n, text in enumerate(said) if text in ("baud rate", "lost lines", "watchdog")]
+    assert all(said[n - 1] not in procedure.STEPS for n in told)
 
 
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors", "slow_reply"])

@@ -15,7 +15,7 @@ from tests.unit.checkup.robots import Nobody, Robot
 def test_one_motor_turns_and_no_other(motor: int) -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
-        means = turning.turn(board, motor, -SPEED)
+        means, _ = turning.turn(board, motor, -SPEED)
         assert means[motor] == pytest.approx(-SPEED, abs=0.1)
         assert [m for m in range(4) if means[m]] == [motor]
 
@@ -51,7 +51,7 @@ def test_a_host_that_stalled_measures_again() -> None:
 
     robot = Stalls("plain_only")
     with robot.board() as board:
-        assert turning.turn(board, 0, SPEED)[0] == pytest.approx(SPEED, abs=0.1)
+        assert turning.turn(board, 0, SPEED)[0][0] == pytest.approx(SPEED, abs=0.1)
     assert robot.stalls == 1
 
 

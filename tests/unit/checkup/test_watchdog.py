@@ -166,7 +166,7 @@ def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         robot.mcu.understand = gives_in
-        assert turn(board, 0, 3.0)[0] == pytest.approx(3.0, abs=0.1)
+        assert turn(board, 0, 3.0)[0][0] == pytest.approx(3.0, abs=0.1)
         board.rest()
         with pytest.raises(StoppedError) as end:
             run(board, ALL, 0.0)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import io
 import json
 import os
 import pty
 import signal
+import struct
 import sys
+import termios
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -183,6 +187,46 @@ def test_a_person_is_asked_until_the_answer_is_one(
     assert out == ""
     assert "which? [fr/rl]" in err
     assert "please type fr or rl" in err
+
+
+def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
+    """What standard error, a terminal so wide, was written meanwhile."""
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    with os.fdopen(slave, "w") as end, monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", end)
+        do()
+        end.write("$")  # so that there is something to read
+        end.flush()
+        written = os.read(master, 1 << 16).decode().removesuffix("$")
+    os.close(master)
+    return written
+
+
+@pytest.mark.parametrize("columns", [0, 40, 120])
+def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
+    tmp_path: Path, columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check = ("--port", "sim", "--yes")
+    written = on_terminal(columns, lambda: called(tmp_path, *check), monkeypatch)
+    assert "listening at the configured baud" in written
+    assert "\n" not in written
+    shown = [line for line in written.split("\r\033[K") if line]
+    assert len(shown) > 8
+    assert max(map(len, shown)) < (columns or 80)
+    assert written.endswith("\r\033[K"), "what is printed at last stands on a line of its own"
+
+
+def test_progress_does_not_go_into_a_pipe(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert called(tmp_path, "--port", "sim", "--yes") == 0
+    Person().say("a motor turns")
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "   ..." not in out
+    check = ("--port", "sim", "--yes", "--json")
+    assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
 def test_the_end_of_the_input_ends_the_check(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -709,3 +709,36 @@ def test_an_mcu_that_has_started_again_may_be_another() -> None:
     counts_after(bench, 20)
     bench.wait(10, BOOTED)
     assert bench.session.snapping.counts == (0,) * 4
+
+
+# what is heard while there is no link
+
+
+def test_a_board_that_only_prints_noise_is_told_with_what_it_said() -> None:
+    bench = Bench().open()
+    texts = []
+    for tick in range(500):
+        bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
+        texts += [event.text for event in bench.session.events if event.name == "link_booting"]
+    told = [text for text in texts if "none good" in text]
+    assert len(told) == 1
+    assert "150 lines heard, none good, the last `" in told[0]
+    assert bench.session.words() == told[0]
+    bench.wait(10, GOOD * 3)
+    assert bench.session.words() == "linked"
+
+
+def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
+    bench = Bench().up()
+    bench.wait(200)
+    assert bench.session.words() == "the microcontroller has fallen silent"
+    for _ in range(302):
+        bench.wait(10)
+    assert "nothing at all heard" in bench.session.words()
+
+
+def test_lines_too_far_apart_are_still_told_as_that() -> None:
+    bench = Bench().open()
+    for tick in range(600):
+        bench.wait(10, *([] if tick % 20 else [GOOD]))
+    assert "set mcu.reply_period = 0.20" in bench.session.words()

@@ -25,7 +25,7 @@ from acsard.messages.topics import PUBLISHED, TOPICS
 from acsard.values import GyroDoes
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
-INCOMING = {"Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "DoorState"}
+INCOMING = {"Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Settings", "DoorState"}
 OUTGOING = set(SCHEMAS) - INCOMING
 
 

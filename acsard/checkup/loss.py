@@ -1,0 +1,124 @@
+"""How many lines are lost or damaged on the way, and how long the board is silent at a time.
+
+A line that comes damaged was damaged on its way back. One that stays unanswered may have been lost
+on either: which one, `lost_where.py` finds out with the motors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from statistics import median
+
+from msgspec import Struct
+
+from acsard.checkup import limits, manual, motion
+from acsard.checkup.board import Board
+from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup.motion import ZERO, Reply
+from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.mcu.hearing import printable
+from acsard.mcu.session import IDENTITY
+
+MOST = 0.02
+"""Share of the lines that may be lost; a sound link loses none."""
+
+FEW = 2
+"""A single lost line is chance."""
+
+LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
+"""So many lines show a loss of 2 %; within these times, where the wire is slow or none is lost."""
+
+OWN_PACE = 1.5
+"""Answers so many periods apart are not one to each line: the board has a pace of its own."""
+
+SILENT = 2.0
+"""Times the usual: a longer time between two answers is a silence."""
+
+
+class Count(Struct, frozen=True):
+    """Of so many lines; those `damaged` on the way back are among the `lost`."""
+
+    lines: int
+    lost: int
+    damaged: int
+
+    @property
+    def share(self) -> float:
+        """Of the lines, 0 where no more are lost than by chance."""
+        return self.lost / self.lines if self.lost >= FEW else 0.0
+
+
+def finding(board: Board) -> Finding:
+    """Send zeros at the host's pace, and judge what comes back; sets `board.lost`.
+
+    Ends the check where plain lines come damaged: the ones on the way there may be, too, and a
+    damaged one can tell a motor any speed.
+    """
+    board.listen(limits.GLANCE_S)  # what comes later answers what goes out now
+    board.paused = False
+    began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
+    board.drive(ZERO, LEAST_S, _period_s(board))
+    silent_s = 0.0 if board.paused else _silence_s(board, motion.since(board.replies, began_s))
+    while True:
+        board.listen(limits.GLANCE_S)
+        count = _counted(board, began_s, board.sent_lines - sent, others)
+        if not count.lost or count.lines >= LINES or board.now_s - began_s > MOST_S:
+            break
+        board.drive(ZERO, 0.5, _period_s(board))
+    board.lost = count.share
+    if board.lost <= MOST:
+        return _sound(count, silent_s)
+    last = printable(board.others[-1]) if count.damaged else ""
+    seen = {"share": board.lost, "lines": count.lines, "damaged": count.damaged, "last": last}
+    if not count.damaged:
+        return manual.find(f"lost lines: {'silent' if board.own_clock else 'either'}", None, **seen)
+    found = manual.find(
+        f"lost lines: {'back' if 2 * count.damaged > count.lost else 'both'}", None, **seen
+    )
+    if not board.sealed:
+        raise StoppedError(found)
+    return found
+
+
+def _sound(count: Count, silent_s: float) -> Finding:
+    if silent_s:
+        return manual.find("lost lines: late", lines=count.lines, silent=silent_s * 1000)
+    outcome = "few" if count.lost else "none"
+    return manual.find(f"lost lines: {outcome}", lines=count.lines, lost=count.lost)
+
+
+def _period_s(board: Board) -> float:
+    """The host's, or the board's own pace if it answers less often."""
+    longest = line_bytes(board.comma, board.sealed, board.sampled)
+    period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
+    if not board.own_clock and board.gap_s > OWN_PACE * period_s:
+        return 1.25 * board.gap_s
+    return period_s
+
+
+def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
+    damaged = sum(not line.startswith(IDENTITY) for line in board.others[others:])
+    got = motion.since(board.replies, began_s)
+    if not board.own_clock:
+        return Count(lines, max(damaged, lines - len(got)), damaged)
+    lost = max(damaged, _left_out(got))
+    return Count(len(got) + lost, lost, damaged)
+
+
+def _gaps(replies: Sequence[Reply]) -> list[float]:
+    return [after.at_s - before.at_s for before, after in pairwise(replies)]
+
+
+def _left_out(replies: Sequence[Reply]) -> int:
+    """How many are missing between others that come evenly."""
+    gaps = _gaps(replies)
+    usual = median(gaps) if gaps else 0.0
+    return sum(max(0, round(gap / usual) - 1) for gap in gaps) if usual > 0 else 0
+
+
+def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
+    """The longest time without an answer that the host would take for a lost link, else 0."""
+    longest = max(_gaps(replies), default=0.0)
+    quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
+    return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0

@@ -1,0 +1,77 @@
+"""The link to the microcontroller, by two looks at the daemon's state: is it there, is it whole?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from acsard.config.settings import Config
+from acsard.doctor.finding import Finding
+from acsard.doctor.running import Running
+
+LOST = 0.02
+"""Share of the lines; a sound link loses none."""
+
+ENOUGH = 40
+"""Lines sent between the looks from which on their share is no chance."""
+
+
+def link(running: Running) -> Iterator[Finding]:
+    """What is wrong with it, by the counters and words of the daemon."""
+    config, state = running.config, running.state
+    mend = check(running)
+    if state.link != "up":
+        mend = mend if state.link != "down" else "see the port above"
+        text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
+        yield Finding("link", "failure", text, mend)
+        return
+    passed = {
+        key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
+    }
+    problems = [*lost(passed, config), *refused(state.counters), *gone(state.counters)]
+    for text in problems:
+        yield Finding("link", "warning", text, mend)
+    if not problems:
+        yield Finding("link", "ok", "up, and no line is lost")
+    if state.doubt:
+        yield Finding("wheels", "warning", state.doubt, mend)
+
+
+def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
+    """Of lines that were sent and came between two looks: is there one to each?"""
+    sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
+    if config.mcu.reply_period or sent < ENOUGH or came >= (1 - LOST) * sent - 1:
+        return
+    yield (
+        f"of {sent} lines that were sent in a second {came} were answered: the others are lost on "
+        "the way there or back, or it reports by its own clock"
+    )
+
+
+def refused(counters: Mapping[str, int]) -> Iterator[str]:
+    """Lines since the start that did not count."""
+    kinds = {
+        name.removeprefix("line_"): count
+        for name, count in counters.items()
+        if name.startswith("line_") and count
+    }
+    if sum(kinds.values()) > LOST * max(1, counters.get("lines", 0)):
+        told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
+        yield f"lines of the microcontroller that did not count: {told}"
+
+
+def gone(counters: Mapping[str, int]) -> Iterator[str]:
+    """A link that was there and went."""
+    if times := counters.get("link_lost", 0):
+        yield (
+            f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
+            "at times or was unplugged; the log says when (link_stale, link_down)"
+        )
+
+
+def check(running: Running) -> str:
+    """What looks closer at the board, and what it needs."""
+    port = running.config.mcu.port
+    return (
+        f"`acsard mcu check --port {port}` finds out why, wheels lifted; stop the daemon first: "
+        f"systemctl stop acsard, or kill {running.info.pid}"
+    )

@@ -1,0 +1,49 @@
+"""What the doctor makes of a daemon that runs with other values than the file has."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.config.settings import BusConfig, Config, McuConfig, RobotConfig
+from acsard.doctor.running import SHOWN, Running, compared, differences
+from acsard.messages.schema import Info, RobotState, Time
+
+INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
+STATE = RobotState(
+    Time(), "ready", "", 0.0, 0.0, 0.0, 0.0, 0.0, [0.0] * 4, "up", "", [], "", {}
+)  # fmt: skip
+FILE = Config()
+
+
+def running(config: Config) -> Running:
+    return Running(INFO, config, STATE, STATE, 0)
+
+
+def test_a_daemon_that_runs_with_the_file_has_it() -> None:
+    (finding,) = compared(running(FILE), FILE)
+    assert finding.level == "ok"
+    assert "pid 77" in finding.text
+
+
+def test_each_key_that_is_otherwise_is_told_with_both_values() -> None:
+    runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
+    assert differences(runs, FILE) == [
+        'mcu.port = "/dev/pts/3", not "sim"',
+        "mcu.baud_rate = 57600, not 115200",
+    ]
+    (finding,) = compared(running(runs), FILE)
+    assert finding.level == "warning"
+    assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
+    assert finding.mend
+
+
+def test_another_file_is_not_told_key_by_key() -> None:
+    runs = replace(
+        FILE,
+        robot=RobotConfig("other"),
+        mcu=McuConfig("/dev/x", 9600, True, 0.1, "auto", 400),
+        bus=BusConfig(listen=("tcp/127.0.0.1:1",)),
+    )
+    (finding,) = compared(running(runs), FILE)
+    assert finding.text.count(", not ") == SHOWN
+    assert f"and {len(differences(runs, FILE)) - SHOWN} more" in finding.text
