@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import re
 import sys
 import traceback
+from decimal import Decimal
 from typing import NoReturn
 
 from acsard import __version__
@@ -84,7 +86,7 @@ def main(argv: list[str] | None = None) -> int:
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
     for verb in VERBS:
         verb.add(verbs)
-    words = list(sys.argv[1:] if argv is None else argv)
+    words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
@@ -105,6 +107,14 @@ def main(argv: list[str] | None = None) -> int:
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
+
+
+_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
+
+
+def _decimal(word: str) -> str:
+    """A negative number without its exponent, with which argparse takes it for an option."""
+    return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def entry() -> NoReturn:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_config, find, load
 from acsard.cli.person import SIMULATOR, answering, ended_by_signals
+from acsard.host.colours import coloured
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
@@ -91,7 +92,7 @@ def main(args: argparse.Namespace) -> int:
     def tell(finding: Finding) -> None:
         findings.append(finding)
         if not args.json:
-            print(row(finding, sys.stdout.isatty()), flush=True)
+            print(row(finding, coloured(sys.stdout)), flush=True)
 
     if not args.json:
         simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""

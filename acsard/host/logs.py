@@ -17,6 +17,7 @@ from typing import Any, Literal, TextIO
 import structlog
 
 from acsard.config.settings import LogConfig
+from acsard.host.colours import coloured
 from acsard.host.journal import JournalStream, is_journal, render
 from acsard.values import Event, EventName
 
@@ -98,7 +99,7 @@ class Log:
                 structlog.processors.TimeStamper(fmt="iso", utc=form != "console"),
                 _in_order,
                 _printable,
-                _renderer(form),
+                _renderer(form, stream),
             ],
             wrapper_class=structlog.make_filtering_bound_logger(
                 logging.getLevelNamesMapping()[settings.level.upper()]
@@ -150,12 +151,13 @@ def _fitting(stream: TextIO) -> Form:
     return "console" if stream.isatty() else "json"
 
 
-def _renderer(form: Form) -> Any:
+def _renderer(form: Form, stream: TextIO) -> Any:
     match form:
         case "journal":
             return render
         case "console":
-            return structlog.dev.ConsoleRenderer(14)  # how far it pads; the name was another once
+            # How far it pads; the name was another once.
+            return structlog.dev.ConsoleRenderer(14, colors=coloured(stream))
         case "json":
             return structlog.processors.JSONRenderer()
         case "logfmt":
