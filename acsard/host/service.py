@@ -14,19 +14,15 @@ from pathlib import Path
 
 import acsard
 from acsard.host.exits import Exit, ExitError
-from acsard.host.steps import File, Keep, Remove, Run, Step, Write, called
+from acsard.host.placement import HOME
+from acsard.host.steps import File, Keep, Remove, RemoveAll, Run, Step, Write, called
 
 UNIT, DOOR, STOP = "acsard.service", "acsard-door.service", "acsard-stop"
 UNITS = Path("/etc/systemd/system")
+ETC = Path("/etc/acsard")
 LAN = "lan.conf"
-HOME = "/opt/acsard/venv"
-"""Where the unit of `deploy/` believes acsard to be."""
-
 TLS = "/etc/acsard/tls"
 """Where `lan.conf` believes the certificates to be."""
-
-OUT_OF_SIGHT = ("/home/", "/root", "/tmp/")
-"""Places a service cannot see."""
 
 Found = Mapping[Path, bytes | None]
 """What is there now in the place of each file."""
@@ -60,7 +56,7 @@ def files() -> list[File]:
             (_source() / "udev" / "70-acsar.rules").read_bytes(),
         ),
         File(
-            Path("/etc/acsard/acsard.toml"),
+            ETC / "acsard.toml",
             reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
             kept=True,
         ),
@@ -93,16 +89,6 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
     return {file.path: file.found() for file in wanted}
 
 
-def misplaced(prefix: str = sys.prefix, base: str = sys.base_prefix) -> str:
-    """Why this installation is no place for a service, or ""."""
-    if prefix != base and not prefix.startswith(OUT_OF_SIGHT):
-        return ""
-    return (
-        f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard in a "
-        f"venv at {HOME} (deploy/systemd/README.md)"
-    )
-
-
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
     """The steps to the service; raises `ExitError` when they would overwrite somebody's work."""
     steps: list[Step] = []
@@ -121,21 +107,48 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
     return [*steps, *INSTALLED]
 
 
-def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """The steps that undo it; what somebody has changed stays unless forced, a `kept` file also
-    then."""
+def own_places() -> list[Path]:
+    """Directories that may hold more of the service than was installed."""
+    return [UNITS / f"{DOOR}.d", UNITS / f"{UNIT}.d", ETC]
+
+
+def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
+    """What else is in these places: certificates, drop-ins of somebody's own."""
+    ours = {file.path for file in files}
+    inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
+    return [path for path in inside if path not in ours]
+
+
+def uninstalling(
+    wanted: Iterable[File],
+    found: Found,
+    others: Iterable[Path] = (),
+    *,
+    force: bool,
+    purge: bool = False,
+) -> list[Step]:
+    """The steps that undo it, and what stays with the reason.
+
+    What somebody has changed stays unless forced, a `kept` file and `others` unless purged.
+    """
     there = [file for file in wanted if found[file.path] is not None]
-    staying = {
-        file.path for file in there if found[file.path] != file.content and (file.kept or not force)
-    }
-    if any(path.name == UNIT for path in staying):
-        # A unit that is started again must find what sends zeros after it.
-        staying |= {file.path for file in there if file.path.name == STOP}
-    why = "changed, or needed by what is; --force removes it"
-    steps: list[Step] = []
+    why: dict[Path, str] = {}
     for file in there:
-        stays = file.path in staying
-        steps.append(Keep(file.path, why) if stays else Remove(file.path))
+        if found[file.path] == file.content or purge:
+            continue
+        if file.kept:
+            why[file.path] = "your configuration; --purge removes it"
+        elif not force:
+            why[file.path] = "somebody has changed it; --force removes it"
+    if any(path.name == UNIT for path in why):
+        # A unit that is started again must find what sends zeros after it.
+        why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
+    steps: list[Step] = [
+        Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
+    ]
+    for path in others:
+        what = "certificates and their authority" if path == Path(TLS) else "not of the service"
+        steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
     units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]
