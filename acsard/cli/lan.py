@@ -8,7 +8,6 @@ from pathlib import Path
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY
 from acsard.config.validation import write
-from acsard.host.extras import install
 from acsard.host.service import TLS
 from acsard.lan import identities
 
@@ -20,8 +19,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "lan",
         help="make certificates, so that other machines may join",
-        description="Certificates for a bus that leaves this machine. Needs an extra: "
-        f"{install('lan')}.",
+        description="Certificates for a bus that leaves this machine. Needs the "
+        "library cryptography; without it, it tells what to type.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(

@@ -15,7 +15,6 @@ from acsard.cli.person import SIMULATOR, answering, ended_by_signals
 from acsard.host.colours import coloured
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
-from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write the lines into the configuration file, and --port, comments kept (needs "
-        f"an extra: {install('mcu')})",
+        "the library tomlkit; without it, it tells what to type)",
     )
     check.set_defaults(main=main)
 
