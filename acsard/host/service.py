@@ -7,6 +7,7 @@ somebody else wrote is overwritten or removed without force.
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
@@ -73,15 +74,29 @@ def lan_drop_in(unit: str) -> File:
     return File(UNITS / f"{unit}.d" / LAN, (_source() / "systemd" / LAN).read_bytes())
 
 
-def admitting(directory: Path) -> Write | None:
+def admitting(directory: Path) -> Write | Keep | None:
     """What opens the installed service's door with these certificates; None without a service.
 
-    The unit itself sees loopback only, and none of root's files.
+    The unit itself sees loopback only, and none of root's files. A drop-in that is there keeps its
+    networks, which somebody may have narrowed.
     """
     if os.geteuid() != 0 or not (UNITS / DOOR).exists():
         return None
     file = lan_drop_in(DOOR)
-    return Write(File(file.path, file.content.replace(TLS.encode(), str(directory).encode())))
+    return admitted(file, file.found(), directory)
+
+
+def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
+    """The drop-in, as it is `found` or else as it comes, with the certificates of `directory`."""
+    place = str(directory).encode()
+    text = re.sub(
+        rb"(?m)^(LoadCredential=[\w.-]+:).*/",
+        lambda match: match[1] + place + b"/",
+        file.content if found is None else found,
+    )
+    if text == found:
+        return Keep(file.path, "it names these certificates")
+    return Write(File(file.path, text))
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:

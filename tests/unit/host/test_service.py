@@ -14,6 +14,7 @@ from acsard.host.service import (
     STOP,
     UNIT,
     Found,
+    admitted,
     files,
     installing,
     present,
@@ -131,3 +132,22 @@ def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
     (tmp_path / "acsard.toml").touch()
     ours = File(tmp_path / "acsard.toml", b"", kept=True)
     assert strangers([ours], [tmp_path, tmp_path / "missing"]) == [tmp_path / "tls"]
+
+
+DROP_IN = File(
+    ETC / "lan.conf", b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
+)
+
+
+def test_a_drop_in_comes_with_the_place_of_the_certificates() -> None:
+    step = admitted(DROP_IN, None, Path("/srv/tls"))
+    assert isinstance(step, Write)
+    assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
+
+
+def test_networks_that_somebody_has_narrowed_stay() -> None:
+    own = b"IPAddressAllow=10.1.2.0/24\nLoadCredential=key.pem:/srv/tls/key.pem\n"
+    assert isinstance(admitted(DROP_IN, own, Path("/srv/tls")), Keep)
+    moved = admitted(DROP_IN, own, Path("/etc/tls"))
+    assert isinstance(moved, Write)
+    assert moved.file.content == own.replace(b"/srv/tls", b"/etc/tls")
