@@ -20,6 +20,7 @@ from acsard.cli import (
     calibrate,
     call,
     check,
+    completion,
     doctor,
     door,
     drive,
@@ -60,6 +61,7 @@ VERBS = (
     door,
     router,
     service,
+    completion,
 )
 
 _EPILOG = """\
@@ -73,26 +75,31 @@ try:  acsard run                (the robot, on the built-in simulator)
 """
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Entry point of the `acsard` command; returns the exit code."""
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Every verb with its options."""
+    whole = argparse.ArgumentParser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
         "microcontroller below, Zenoh bus above. Without a verb: run.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"acsard {__version__}")
-    verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    whole.add_argument("--version", action="version", version=f"acsard {__version__}")
+    verbs = whole.add_subparsers(title="verbs", metavar="VERB", dest="verb")
     for verb in VERBS:
         verb.add(verbs)
+    return whole
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the `acsard` command; returns the exit code."""
     words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
     try:
         try:
-            args = parser.parse_args(words)
+            args = parser().parse_args(words)
             return int(args.main(args))
         except MendableError as error:
             print(f"acsard: {error}", file=sys.stderr)
