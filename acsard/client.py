@@ -21,7 +21,7 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
                                         behind somebody else, not allowed; the text says which
     NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
     CertificateError   ValueError       certificates that are not there, or cannot be used
-    UsageError         ValueError       an endpoint, a key or a number that cannot be
+    UsageError         ValueError       an endpoint, an id, a key or a number that cannot be
     DecodeError                         what was sent is not one of our messages
 """
 
@@ -40,6 +40,7 @@ import msgspec
 import zenoh
 
 from acsard.bus.access import least_role
+from acsard.bus.address import require_id
 from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
@@ -85,6 +86,9 @@ __all__ = (
 ENDPOINT = "tcp/127.0.0.1:7448"
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
+
+TIMED_OUT = "Timeout"
+"""What Zenoh says in the place of one who heard the question and did not answer in time."""
 
 
 class Client:
@@ -240,6 +244,11 @@ class Client:
         for reply in replies:
             if reply.ok is not None:
                 found.append(encoded(reply.ok))
+            elif reply.err is not None and reply.err.payload.to_string() == TIMED_OUT:
+                raise NoAnswerError(
+                    f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
+                    "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
+                )
             elif reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
@@ -322,6 +331,7 @@ def connect(
 
     `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
     """
+    require_id(robot_id)
     session = client_session(endpoint, tls)
     try:
         yield Client(session, robot_id, source, tls)
@@ -334,6 +344,7 @@ async def connect_async(
     endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
 ) -> AsyncIterator[AsyncClient]:
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
+    require_id(robot_id)
     session = await in_thread(lambda: client_session(endpoint, tls), 10.0, late=_close)
     try:
         yield AsyncClient(Client(session, robot_id, source, tls))

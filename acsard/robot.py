@@ -282,10 +282,11 @@ class Robot:
             case "stop":
                 return life.stop(now_ns)
             case "clear":
-                message = life.clear(asked_ns, now_ns, linked)
+                if not life.clear(asked_ns, now_ns, linked):
+                    return "nothing to clear: neither stopped nor in fault"
                 self._sanity.forget()
                 self._arbiter.require_neutral(asked_ns)
-                return message
+                return "cleared; each source must be neutral once before it drives"
             case "activate":
                 if life.activate(linked):
                     self._arbiter.require_neutral(asked_ns)

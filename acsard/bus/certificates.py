@@ -19,6 +19,11 @@ CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 
 def require_usable(directory: str) -> None:
     """Raises `CertificateError` or `NotPermittedError`, with the file and the mend."""
+    if not Path(directory).is_dir():
+        raise CertificateError(
+            f"there is no directory {directory}: name the one with {CA}, {CERTIFICATE} and {KEY} "
+            "that `acsard lan init` or `lan add` made"
+        )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
         try:

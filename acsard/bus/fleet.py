@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import zenoh
 
+from acsard.bus.address import require_id
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.config.settings import TLS
 from acsard.host.errors import NoAnswerError, UsageError
@@ -24,15 +25,20 @@ PRESENT_S = 2.0
 def named(text: str) -> tuple[str, ...]:
     """The ids of an `--id` for many, `("*",)` for all there are; () for one robot's.
 
-    Raises `UsageError` for what is neither.
+    Raises `UsageError` for what no robot can be called.
     """
     if text == ALL:
         return (ALL,)
     if "," not in text:
         return ()
     ids = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    if not all(ids) or any(set(one) & set("*$#?/") for one in ids):
-        raise UsageError(f"--id {text}: write ids with a comma between, or '*' for all robots")
+    try:
+        for one in ids:
+            require_id(one)
+    except UsageError:
+        raise UsageError(
+            f"--id {text}: write ids with a comma between, or '*' for all robots"
+        ) from None
     return ids
 
 

@@ -12,8 +12,9 @@ import re
 import zenoh
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
+from acsard.bus.tls_trouble import trouble
 from acsard.config.settings import TLS, BusConfig
-from acsard.host.errors import InUseError, UnreachableError, UsageError
+from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
@@ -133,17 +134,26 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
-    if tls:
+    secured = endpoint.startswith(TLS)
+    if secured and not tls:
+        raise CertificateError(
+            f"{endpoint} wants a certificate: add --tls DIRECTORY (tls= in Python), the directory "
+            "that `acsard lan init` or `lan add` made for you"
+        )
+    if secured:
         require_usable(tls)  # Zenoh says of them what it says of a daemon that is not there
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        about = ", and is your certificate (--tls DIRECTORY) of its authority and in date"
+        seen = trouble(endpoint, tls) if secured else ""
         raise UnreachableError(
-            f"no daemon answers at {endpoint} ({first_line(error)}); is `acsard run` running, "
-            f"is this its bus.listen, has it room (at most {MAX_SESSIONS} connections)"
-            f"{about if endpoint.startswith(TLS) else ''}?",
+            f"no daemon answers at {endpoint}: "
+            + (
+                seen
+                or f"is `acsard run` running, is this its bus.listen, has it room (at most "
+                f"{MAX_SESSIONS} connections)? ({first_line(error)})"
+            )
         ) from error
 
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import re
 import sys
 import traceback
+from decimal import Decimal
 from typing import NoReturn
 
 from acsard import __version__
@@ -18,6 +20,7 @@ from acsard.cli import (
     calibrate,
     call,
     check,
+    completion,
     doctor,
     door,
     drive,
@@ -66,6 +69,7 @@ VERBS = (
     door,
     router,
     service,
+    completion,
 )
 
 _EPILOG = """\
@@ -79,26 +83,31 @@ try:  acsard run                (the robot, on the built-in simulator)
 """
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Entry point of the `acsard` command; returns the exit code."""
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Every verb with its options."""
+    whole = argparse.ArgumentParser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
         "microcontroller below, Zenoh bus above. Without a verb: run.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"acsard {__version__}")
-    verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    whole.add_argument("--version", action="version", version=f"acsard {__version__}")
+    verbs = whole.add_subparsers(title="verbs", metavar="VERB", dest="verb")
     for verb in VERBS:
         verb.add(verbs)
-    words = list(sys.argv[1:] if argv is None else argv)
+    return whole
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the `acsard` command; returns the exit code."""
+    words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
     try:
         try:
-            args = parser.parse_args(words)
+            args = parser().parse_args(words)
             return int(args.main(args))
         except MendableError as error:
             print(f"acsard: {error}", file=sys.stderr)
@@ -113,6 +122,14 @@ def main(argv: list[str] | None = None) -> int:
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
+
+
+_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
+
+
+def _decimal(word: str) -> str:
+    """A negative number without its exponent, with which argparse takes it for an option."""
+    return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def entry() -> NoReturn:

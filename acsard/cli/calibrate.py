@@ -15,7 +15,6 @@ from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, guided
 from acsard.cli.common import add_bus, find, load
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
-from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write what was found into the configuration file, comments kept (needs the "
-        f"extra: {install('mcu')})",
+        "library tomlkit; without it, it tells what to type)",
     )
     parser.set_defaults(main=main)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import MANY, add_bus, robot_address
+from acsard.cli.common import MANY, add_bus, robots_address
 from acsard.host.exits import Exit
 from acsard.messages.topics import SERVICES
 
@@ -33,7 +33,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Call and print."""
-    from acsard.bus.fleet import named
     from acsard.client import connect
     from acsard.host.errors import UsageError
     from acsard.messages.encodings import encode
@@ -42,8 +41,8 @@ def main(args: argparse.Namespace) -> int:
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"write: {form}")
-    endpoint, robot_id, tls = robot_address(args)
-    if many := named(robot_id):
+    (endpoint, robot_id, tls), many = robots_address(args)
+    if many:
         if args.service != "stop":
             raise UsageError(f"only stop goes to many robots: give {args.service} one --id")
         with connect(endpoint, robot_id=robot_id, tls=tls) as robot:

@@ -98,6 +98,15 @@ def robot_address(args: argparse.Namespace) -> Address:
     return address_of(config, args.connect, args.id, args.tls)
 
 
+def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
+    """`robot_address`, and the ids where `--id` names many: `("*",)` for all, () for one robot."""
+    from acsard.bus.fleet import named
+
+    many = named(args.id or "")
+    _, config = load(args.config)
+    return address_of(config, args.connect, None if many else args.id, args.tls), many
+
+
 def require_followed(key: str) -> None:
     """Raises `UsageError` for a key on which nothing ever comes, with what to type instead."""
     row = row_of(key)

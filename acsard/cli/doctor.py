@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_config, find
+from acsard.host.colours import coloured
 
 if TYPE_CHECKING:
     from acsard.doctor.finding import Finding
@@ -36,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(findings).decode())
     else:
-        colours = sys.stdout.isatty()
+        colours = coloured(sys.stdout)
         for finding in findings:
             print(line(finding, colours))
     return 1 if any(finding.level == "failure" for finding in findings) else 0

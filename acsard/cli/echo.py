@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import MANY, add_bus, count, require_followed, robot_address
+from acsard.cli.common import MANY, add_bus, count, require_followed, robots_address
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -41,19 +41,19 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
-    from acsard.bus.fleet import follow, named, robot_of
+    from acsard.bus.fleet import follow, robot_of
     from acsard.bus.subscription import encoded
     from acsard.client import connect
 
-    endpoint, robot_id, tls = robot_address(args)
+    (endpoint, robot_id, tls), many = robots_address(args)
     if args.csv:
-        if named(robot_id):
+        if many:
             raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
         with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
             return _record(robot, args.topic, args.n, args.timeout)
     if len(args.topic) > 1:
         raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
-    left, topic, many = args.n, args.topic[0], named(robot_id)
+    left, topic = args.n, args.topic[0]
     require_followed(topic)
     _hint(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:

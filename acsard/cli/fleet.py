@@ -9,7 +9,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import MANY, add_bus, robot_address
+from acsard.cli.common import MANY, add_bus, robots_address
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
@@ -37,12 +37,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Show until told otherwise."""
-    from acsard.bus.fleet import ALL, named
+    from acsard.bus.fleet import ALL
     from acsard.client import connect
     from acsard.top.fleet import Fleet
 
-    endpoint, robot_id, tls = robot_address(args)
-    ids = (named(robot_id) or (robot_id,)) if args.id else (ALL,)
+    (endpoint, robot_id, tls), many = robots_address(args)
+    ids = (many or (robot_id,)) if args.id else (ALL,)
     dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         fleet = Fleet(robot, ids, endpoint)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from acsard.cli.common import MANY, add_bus, require_asked, robot_address
+from acsard.cli.common import MANY, add_bus, require_asked, robots_address
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,13 +26,12 @@ def main(args: argparse.Namespace) -> int:
     """Ask and print."""
     import msgspec
 
-    from acsard.bus.fleet import named, present
+    from acsard.bus.fleet import present
     from acsard.cli.echo import json_line, of_robot
     from acsard.client import connect
 
     require_asked(args.key)
-    endpoint, robot_id, tls = robot_address(args)
-    many = named(robot_id)
+    (endpoint, robot_id, tls), many = robots_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         if not many:
             found = [json_line(*robot.reply(args.key))]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY
+from acsard.cli.common import add_config, load
+from acsard.config.settings import Config
 from acsard.config.validation import write
-from acsard.host.extras import install
 from acsard.host.service import TLS
 from acsard.lan import identities
 from acsard.values import ROLES
@@ -21,8 +23,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "lan",
         help="make certificates, so that other machines may join",
-        description="Certificates for a bus that leaves this machine. Needs an extra: "
-        f"{install('lan')}.",
+        description="Certificates for a bus that leaves this machine. Needs the "
+        "library cryptography; without it, it tells what to type.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
@@ -50,6 +52,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         choices=ROLES,
         help="what it may do; leave it out for a robot or a router",
     )
+    add_config(more)
     more.set_defaults(main=main_add)
     renew = actions.add_parser(
         "renew",
@@ -81,44 +84,58 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 def main_init(args: argparse.Namespace) -> int:
     """Make everything a first robot needs."""
-    from acsard.host.files import require_tomlkit
+    from acsard.host.files import require_changeable, require_tomlkit
+
+    directory = args.directory.resolve()
+
+    def keys(config: Config) -> dict[str, object]:
+        return identities.keys(config, directory)
 
     if args.write:
         require_tomlkit()
-    identities.init(args.directory, args.address, args.days, force=args.force)
-    directory = args.directory.resolve()
+        require_changeable(args.write, keys, new=True)
+    names = identities.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
-        _configure(args.write, directory)
+        _configure(args.write, keys)
     _admit_service(directory)
     host = socket.gethostname()
-    names = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
-    print(_NEXT.format(directory=directory, port=identities.PORT, host=host, **names))
+    files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
+    print(_certified(names))
+    print(_NEXT.format(directory=directory, port=identities.PORT, host=host, **files))
     return 0
 
 
 def main_add(args: argparse.Namespace) -> int:
     """Make one more client certificate."""
+    where, config = load(args.config)  # before anything is made
     place = identities.add(args.directory, args.name, args.address, args.days)
     if not args.role:
         print(f"{place} is for {args.name}")
         return 0
-    print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do:\n")
-    print(f"[access]\n{args.role}s = {write([args.role, args.name])}")
+    there = getattr(config.access, f"{args.role}s")
+    names = list(dict.fromkeys([*there, args.name]))
+    print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do (whom {where}")
+    print(f"has as {args.role}s stays):\n\n[access]\n{args.role}s = {write(names)}")
     return 0
 
 
 def main_renew(args: argparse.Namespace) -> int:
     """Replace the robot's own certificate."""
-    identities.renew(args.directory, args.address, args.days)
+    names = identities.renew(args.directory, args.address, args.days)
+    print(_certified(names))
     print(f"{args.directory / CERTIFICATE} is new; systemctl restart acsard takes it into use")
     return 0
 
 
-def _configure(file: Path, directory: Path) -> None:
+def _certified(names: list[str]) -> str:
+    return f"The robot may be reached as {', '.join(names)} (more by --address).\n"
+
+
+def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
     """Set the bus's keys in a configuration, its comments kept."""
     from acsard.host.files import change
 
-    changed = change(file, lambda config: identities.keys(config, directory), new=True)
+    changed = change(file, keys, new=True)
     print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
 
 
@@ -130,7 +147,7 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"wrote {step.file.path} for the service's door; look at its networks, then:")
+    print(f"{step}\nFor the service's door; look at the networks in it, then:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_config, find, load
 from acsard.cli.person import SIMULATOR, answering, ended_by_signals
+from acsard.host.colours import coloured
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
-from acsard.host.extras import install
 from acsard.host.files import change, require_tomlkit
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write the lines into the configuration file, and --port, comments kept (needs "
-        f"an extra: {install('mcu')})",
+        "the library tomlkit; without it, it tells what to type)",
     )
     check.set_defaults(main=main)
 
@@ -92,7 +92,7 @@ def main(args: argparse.Namespace) -> int:
         findings.append(finding)
         if not args.json:
             person.clear()
-            print(row(finding, sys.stdout.isatty()), flush=True)
+            print(row(finding, coloured(sys.stdout)), flush=True)
 
     if not args.json:
         simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from acsard.host.errors import MendableError
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -36,15 +37,22 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
             action.add_argument(
                 "--force", action="store_true", help="also files that somebody has changed"
             )
+        if name == "uninstall":
+            action.add_argument(
+                "--purge",
+                action="store_true",
+                help="also your configuration, certificates and drop-ins in its directories",
+            )
         action.set_defaults(main=main)
 
 
 def main_install(args: argparse.Namespace) -> int:
     """Write, reload, enable, start."""
     from acsard.host import service
+    from acsard.host.placement import misplaced
 
     _ready(args)
-    trouble = service.misplaced()
+    trouble = misplaced()
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         if not (args.dry_run or args.force):
@@ -63,7 +71,15 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
     _ready(args)
     files = [*service.files(), *map(service.lan_drop_in, (service.UNIT, service.DOOR))]
-    _do(service.uninstalling(files, service.present(files), force=args.force), args.dry_run)
+    steps = service.uninstalling(
+        files,
+        service.present(files),
+        service.strangers(files, service.own_places()),
+        force=args.force or args.purge,
+        purge=args.purge,
+    )
+    _do(steps, args.dry_run)
+    print(f"\nkept as well: the program, in {sys.prefix}; removing that directory removes it")
     return 0
 
 
@@ -88,5 +104,13 @@ def _ready(args: argparse.Namespace) -> None:
 def _do(steps: Iterable[Step], dry_run: bool) -> None:
     for step in steps:
         print(step)
-        if not dry_run:
+        if dry_run:
+            continue
+        try:
             step.do()
+        except MendableError:
+            raise
+        except OSError as error:
+            raise ExitError(
+                Exit.FAILURE, f"could not: {step}: {error.strerror}; mend that and run it again"
+            ) from None

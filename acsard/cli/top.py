@@ -18,7 +18,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="the robot on one screen, live",
         description="Show mode, pose, wheels, command sources, link and timing on one screen, "
         "live; q or Ctrl-C leaves. Into a pipe, or with --once, print one screen as plain text. "
-        f"Needs an extra: {install('top')}.",
+        "Needs the library rich; without it, it tells what to type.",
     )
     parser.add_argument("--once", action="store_true", help="print one screen and end")
     add_bus(parser)

@@ -10,7 +10,8 @@ import ipaddress
 import math
 
 from acsard.config import motion_rules
-from acsard.config.settings import AccessConfig, BusConfig, Config, McuConfig, RosConfig
+from acsard.config.partial import Rule, told
+from acsard.config.settings import BusConfig, Config, McuConfig
 from acsard.config.validation import show
 from acsard.config.wire_time import (
     COMFORTABLE_USE,
@@ -88,16 +89,7 @@ def _count_warnings(config: Config) -> list[str]:
 
 def contradictions(config: Config) -> list[str]:
     """What cannot be: a line each."""
-    return [
-        *_wire_problems(config),
-        *_count_problems(config),
-        *_name_problems(config),
-        *motion_rules.problems(config),
-        *_source_problems(config),
-        *_bus_problems(config.bus),
-        *_access_problems(config.access),
-        *_ros_problems(config.ros),
-    ]
+    return told(RULES, config)
 
 
 def _wire_problems(config: Config) -> list[str]:
@@ -141,8 +133,21 @@ def _count_problems(config: Config) -> list[str]:
     ]
 
 
-def _name_problems(config: Config) -> list[str]:
-    motors, joints = config.mcu.wheels, config.joints
+def _motor_problems(config: Config) -> list[str]:
+    motors = config.mcu.wheels
+    return _repeated("motor", {f"mcu.wheels.{w}": getattr(motors, w)[1] for w in WHEELS})
+
+
+def _joint_problems(config: Config) -> list[str]:
+    return _repeated("joint name", {f"joints.{w}": getattr(config.joints, w) for w in WHEELS})
+
+
+def _source_name_problems(config: Config) -> list[str]:
+    sources = enumerate(config.commands.sources)
+    return _repeated("source name", {f"commands.sources[{i}].name": s.name for i, s in sources})
+
+
+def _frame_problems(config: Config) -> list[str]:
     frames = {
         "odometry.odom_frame": config.odometry.odom_frame,
         "odometry.base_frame": config.odometry.base_frame,
@@ -151,13 +156,7 @@ def _name_problems(config: Config) -> list[str]:
         frames["lidar.lidar_frame"] = config.lidar.lidar_frame
     if config.footprint.publish_tf:
         frames["footprint.footprint_frame"] = config.footprint.footprint_frame
-    sources = {f"commands.sources[{i}].name": s.name for i, s in enumerate(config.commands.sources)}
-    return [
-        *_repeated("motor", {f"mcu.wheels.{w}": getattr(motors, w)[1] for w in WHEELS}),
-        *_repeated("joint name", {f"joints.{w}": getattr(joints, w) for w in WHEELS}),
-        *_repeated("source name", sources),
-        *_repeated("frame", frames),
-    ]
+    return _repeated("frame", frames)
 
 
 def _repeated(noun: str, names: dict[str, str]) -> list[str]:
@@ -182,8 +181,9 @@ def _source_problems(config: Config) -> list[str]:
     return found
 
 
-def _bus_problems(bus: BusConfig) -> list[str]:
-    found = []
+def _way_problems(config: Config) -> list[str]:
+    """Nobody, or nobody by TLS, could reach the daemon."""
+    bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
             'bus.mode = "client": connects to nothing; write bus.connect = ["tcp/127.0.0.1:7447"] '
@@ -196,39 +196,45 @@ def _bus_problems(bus: BusConfig) -> list[str]:
             f"bus.listen = {show(list(bus.listen))}: who comes by TLS reaches the daemon through "
             'its address on this machine; add "tcp/127.0.0.1:7448"'
         )
-    for key, endpoints in _endpoints(bus).items():
-        for endpoint in endpoints:
-            where = f"bus.{key} = {show(endpoint)}"
-            host = _host(endpoint)
-            if host is None:
-                found.append(
-                    f"{where}: not an endpoint; write it like "
-                    '"tcp/127.0.0.1:7448", "tcp/[::1]:7448" or "tls/0.0.0.0:7449"'
-                )
-            elif endpoint.startswith("tls/"):
-                if not bus.tls:
-                    found.append(
-                        f"{where}: needs certificates; `acsard lan init` makes them and tells "
-                        "the bus.tls to write"
-                    )
-            elif not _is_loopback(host) and not bus.insecure:
-                found.append(
-                    f"{where}: leaves this machine, and there is no encryption or access control "
-                    "on it; use 127.0.0.1 (a laptop joins by an SSH tunnel), certificates (`acsard "
-                    'lan init`, then "tls/…"), or accept that anyone there can drive the robot: '
-                    "bus.insecure = true"
-                )
     return found
 
 
-def _access_problems(access: AccessConfig) -> list[str]:
+def _endpoint_problems(config: Config, key: str) -> list[str]:
+    bus, found = config.bus, []
+    for endpoint in _endpoints(bus).get(key, ()) if key == "listen" else bus.connect:
+        where = f"bus.{key} = {show(endpoint)}"
+        host = _host(endpoint)
+        if host is None:
+            found.append(
+                f"{where}: not an endpoint; write it like "
+                '"tcp/127.0.0.1:7448", "tcp/[::1]:7448" or "tls/0.0.0.0:7449"'
+            )
+        elif endpoint.startswith("tls/"):
+            if not bus.tls:
+                found.append(
+                    f"{where}: needs certificates; `acsard lan init` makes them and tells "
+                    "the bus.tls to write"
+                )
+        elif not _is_loopback(host) and not bus.insecure:
+            found.append(
+                f"{where}: leaves this machine, and there is no encryption or access control "
+                "on it; use 127.0.0.1 (a laptop joins by an SSH tunnel), certificates (`acsard "
+                'lan init`, then "tls/…"), or accept that anyone there can drive the robot: '
+                "bus.insecure = true"
+            )
+    return found
+
+
+def _access_problems(config: Config) -> list[str]:
+    access = config.access
     lists = {"viewers": access.viewers, "operators": access.operators}
     lists |= {"maintainers": access.maintainers}
     names = {f"access.{r}[{i}]": n for r, held in lists.items() for i, n in enumerate(held)}
     return _repeated("certificate", names)
 
 
-def _ros_problems(ros: RosConfig) -> list[str]:
+def _ros_problems(config: Config) -> list[str]:
+    ros = config.ros
     if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
         return [
             f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, which the '
@@ -265,3 +271,21 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+RULES: tuple[Rule, ...] = (
+    _wire_problems,
+    _count_problems,
+    _motor_problems,
+    _joint_problems,
+    _source_name_problems,
+    _frame_problems,
+    *motion_rules.RULES,
+    _source_problems,
+    _way_problems,
+    lambda config: _endpoint_problems(config, "listen"),
+    lambda config: _endpoint_problems(config, "connect"),
+    _access_problems,
+    _ros_problems,
+)
+"""Each by itself: one that looks at a key without a valid value says nothing."""

@@ -9,6 +9,7 @@ import math
 
 from msgspec import Struct
 
+from acsard.config.partial import Rule, told
 from acsard.config.settings import Config
 
 LEAST_JERK = 0.01
@@ -40,18 +41,6 @@ class _Reach(Struct, frozen=True):
     linear: float
     angular: float
     wheel: float
-
-
-def problems(config: Config) -> list[str]:
-    """What cannot be: a line each."""
-    reach = _reach(config)
-    return [
-        *_braking_problems(config, "linear", reach.linear, "m/s"),
-        *_braking_problems(config, "angular", reach.angular, "rad/s"),
-        *_jerk_problems(config),
-        *_feedback_problems(config, reach.wheel),
-        *_reply_problems(config),
-    ]
 
 
 def _reach(config: Config) -> _Reach:
@@ -90,13 +79,13 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
     return found
 
 
-def _jerk_problems(config: Config) -> list[str]:
-    jerks = {name: getattr(config.limits, name) for name in ("linear_jerk", "angular_jerk")}
+def _jerk_problems(config: Config, name: str) -> list[str]:
+    jerk = getattr(config.limits, name)
+    if not 0.0 < jerk < LEAST_JERK:
+        return []
     return [
         f"limits.{name} = {jerk:g}: the robot would take minutes to start; write "
         f"{LEAST_JERK:g} or more, or 0 for no limit"
-        for name, jerk in jerks.items()
-        if 0.0 < jerk < LEAST_JERK
     ]
 
 
@@ -132,3 +121,18 @@ def _reply_problems(config: Config) -> list[str]:
 def _rounded_up(value: float) -> float:
     """To three decimals, so that what is advised is enough."""
     return math.ceil(round(value * 1000, 6)) / 1000
+
+
+RULES: tuple[Rule, ...] = (
+    lambda config: _braking_problems(config, "linear", _reach(config).linear, "m/s"),
+    lambda config: _braking_problems(config, "angular", _reach(config).angular, "rad/s"),
+    lambda config: _jerk_problems(config, "linear_jerk"),
+    lambda config: _jerk_problems(config, "angular_jerk"),
+    lambda config: _feedback_problems(config, _reach(config).wheel),
+    _reply_problems,
+)
+
+
+def problems(config: Config) -> list[str]:
+    """What cannot be: a line each."""
+    return told(RULES, config)

@@ -12,8 +12,9 @@ import tomllib
 from msgspec import convert, to_builtins
 
 from acsard.config.contradictions import contradictions
+from acsard.config.partial import without
 from acsard.config.settings import Config
-from acsard.config.validation import build
+from acsard.config.validation import build_partly
 from acsard.values import AcsardError
 
 MAX_BYTES = 65536
@@ -48,12 +49,13 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
         if isinstance(inner, dict):
             inner.update(values)
     problems: list[str] = []
+    spoilt: set[str] = set()
     try:
-        config = build(Config, table, "", problems)
+        config = build_partly(Config, table, "", problems, spoilt)
     except RecursionError:
         raise ConfigError(["lists or tables nested too deep; no key needs that"]) from None
     if config is not None:
-        problems += contradictions(config)
+        problems += contradictions(without(config, spoilt))
     if config is None or problems:
         raise ConfigError(problems)
     return config

@@ -25,35 +25,58 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 
     `path` is the dotted name of the table, "" at the root.
     """
+    before = len(problems)
+    made = build_partly(cls, table, path, problems, set())
+    return made if len(problems) == before else None
+
+
+def build_partly(
+    cls: type[T], table: object, path: str, problems: list[str], spoilt: set[str]
+) -> T | None:
+    """As `build`, but what has no valid value gets its default, and its dotted key is `spoilt`.
+
+    None where a key without a default has none.
+    """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
         problems.append(f"{path} = {show(table)}: expected a table; write it as {header}")
         return None
     known = {field.encode_name: field for field in fields(cls)}
-    before = len(problems)
+    prefix, complete = f"{path}." if path else "", True
     for key in table:
         if key not in known:
-            problems.append(_unknown(key, table[key], path, list(known)))
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+            problems.append(_unknown(key, table[key], path, near, list(known)))
+            spoilt |= {prefix + name for name in near}  # what was meant is not known
     values: dict[str, Any] = {}
     for name, field in known.items():
-        where = f"{path}.{name}" if path else name
+        where = prefix + name
         if name in table:
-            values[field.name] = _value(field, table[name], where, problems)
+            value = _value(field, table[name], where, problems, spoilt)
+            if value is not None:
+                values[field.name] = value
+            elif field.required:
+                complete = False
+            else:
+                spoilt.add(where)
         elif field.required:
             problems.append(f"{where}: missing; write {name} = {_example(field)}")
-    return cls(**values) if len(problems) == before else None
+            complete = False
+    return cls(**values) if complete else None
 
 
-def _value(field: FieldInfo, raw: object, where: str, problems: list[str]) -> Any:
+def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoilt: set[str]) -> Any:
+    """The value, None where it is not valid."""
     if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
-        return build(field.type, raw, where, problems)
+        return build_partly(field.type, raw, where, problems, spoilt)
     kind = inspect.type_info(field.type)
     if isinstance(kind, inspect.VarTupleType) and isinstance(kind.item_type, inspect.StructType):
         if not isinstance(raw, list):
             problems.append(f"{where} = {show(raw)}: expected tables; write them as [[{where}]]")
             return None
         item = kind.item_type.cls
-        return tuple(build(item, one, f"{where}[{i}]", problems) for i, one in enumerate(raw))
+        made = [build(item, one, f"{where}[{i}]", problems) for i, one in enumerate(raw)]
+        return None if None in made else tuple(made)
     if not _finite(raw):
         value = None
     else:
@@ -73,10 +96,9 @@ def _finite(raw: object) -> bool:
     return not isinstance(raw, float) or math.isfinite(raw)
 
 
-def _unknown(key: str, value: object, path: str, known: list[str]) -> str:
+def _unknown(key: str, value: object, path: str, near: list[str], known: list[str]) -> str:
     name = key if _BARE_KEY.fullmatch(key) else show(key)
     where = f"{path}.{name}" if path else name
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
     return f"{where} = {show(value)}: unknown key; {hint}"
 

@@ -10,7 +10,7 @@ from acsard.drive.modes import Mode, RefusedError, Trigger, next_mode
 
 
 class Lifecycle:
-    """One robot's mode. Each request returns words for who asked, or raises `RefusedError`."""
+    """One robot's mode. A request that cannot be raises `RefusedError`, in words."""
 
     def __init__(self, active: bool) -> None:
         self.mode = Mode.INACTIVE
@@ -48,14 +48,20 @@ class Lifecycle:
         self.latched = "stopped by request"
         return "stopped and latched; srv/clear releases it"
 
-    def clear(self, asked_ns: int, now_ns: int, linked: bool) -> str:
-        """Release the latch, unless it was asked before the last stop or fault came about."""
+    def clear(self, asked_ns: int, now_ns: int, linked: bool) -> bool:
+        """Release the latch, unless it was asked before the last stop or fault came about.
+
+        False when nothing was latched, and nothing has changed.
+        """
         if asked_ns <= self._stopped_ns or now_ns == self._stopped_ns:
             raise RefusedError("a stop or fault came at the same time or after; call it again")
+        before = self.mode
         self.fire(Trigger.CLEAR)
+        if self.mode is before:
+            return False
         self.latched = ""
         self._resume(linked)
-        return "cleared; each source must be neutral once before it drives"
+        return True
 
     def activate(self, linked: bool) -> bool:
         """Switch on; True when it was off."""

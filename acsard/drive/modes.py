@@ -54,6 +54,7 @@ TABLE: dict[tuple[Mode, Trigger], Mode] = {
     (_M.INACTIVE, _T.FAULT): _M.FAULT,
     (_M.INACTIVE, _T.LEAVE): _M.LEAVING,
     (_M.INACTIVE, _T.STOP): _M.STOPPED,
+    (_M.INACTIVE, _T.CLEAR): _M.INACTIVE,
     (_M.INACTIVE, _T.ACTIVATE): _M.WAITING,
     (_M.INACTIVE, _T.DEACTIVATE): _M.INACTIVE,
     # active without a link
@@ -64,6 +65,7 @@ TABLE: dict[tuple[Mode, Trigger], Mode] = {
     (_M.WAITING, _T.FAULT): _M.FAULT,
     (_M.WAITING, _T.LEAVE): _M.LEAVING,
     (_M.WAITING, _T.STOP): _M.STOPPED,
+    (_M.WAITING, _T.CLEAR): _M.WAITING,
     (_M.WAITING, _T.ACTIVATE): _M.WAITING,
     (_M.WAITING, _T.DEACTIVATE): _M.INACTIVE,
     # active and linked
@@ -74,6 +76,7 @@ TABLE: dict[tuple[Mode, Trigger], Mode] = {
     (_M.READY, _T.FAULT): _M.FAULT,
     (_M.READY, _T.LEAVE): _M.LEAVING,
     (_M.READY, _T.STOP): _M.STOPPED,
+    (_M.READY, _T.CLEAR): _M.READY,
     (_M.READY, _T.ACTIVATE): _M.READY,
     (_M.READY, _T.DEACTIVATE): _M.INACTIVE,
     # following a command
@@ -84,6 +87,7 @@ TABLE: dict[tuple[Mode, Trigger], Mode] = {
     (_M.DRIVING, _T.FAULT): _M.FAULT,
     (_M.DRIVING, _T.LEAVE): _M.LEAVING,
     (_M.DRIVING, _T.STOP): _M.STOPPED,
+    (_M.DRIVING, _T.CLEAR): _M.DRIVING,
     (_M.DRIVING, _T.ACTIVATE): _M.DRIVING,
     (_M.DRIVING, _T.DEACTIVATE): _M.INACTIVE,
     # latched stop: only clear leaves it
@@ -113,13 +117,9 @@ TABLE: dict[tuple[Mode, Trigger], Mode] = {
     (_M.LEAVING, _T.LEAVE): _M.LEAVING,
     (_M.LEAVING, _T.STOP): _M.LEAVING,
 }
-"""After `clear` the robot is inactive, and active again at once if it was before the latch."""
+"""After `clear` of a latch the robot is inactive, and active again at once if it was before it."""
 
 REFUSALS: dict[tuple[Mode, Trigger], str] = {
-    (_M.INACTIVE, _T.CLEAR): "nothing to clear: neither stopped nor in fault",
-    (_M.WAITING, _T.CLEAR): "nothing to clear: neither stopped nor in fault",
-    (_M.READY, _T.CLEAR): "nothing to clear: neither stopped nor in fault",
-    (_M.DRIVING, _T.CLEAR): "nothing to clear: neither stopped nor in fault",
     (_M.STOPPED, _T.ACTIVATE): "stopped: call srv/clear first",
     (_M.STOPPED, _T.DEACTIVATE): "stopped already: it cannot move; call srv/clear first",
     (_M.FAULT, _T.ACTIVATE): "in fault: call srv/clear first",

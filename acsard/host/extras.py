@@ -2,11 +2,48 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shlex
+import sys
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
+from urllib.parse import unquote, urlsplit
 
-Extra = Literal["lan", "mcu", "top"]
+Extra = Literal["lan", "mcu", "top", "shell"]
 
 
 def install(extra: Extra) -> str:
-    """What to type, and where, as the error that says what is missing tells it."""
-    return f"pip install '.[{extra}]' in a clone of acsard"
+    """What to type, as the error that says what is missing tells it."""
+    try:
+        wanted = wanted_by(distribution("acsard"), extra)
+    except PackageNotFoundError:  # run from a directory that nobody has installed
+        wanted = [f".[{extra}]"]
+    return shlex.join([*_installer(), *wanted])
+
+
+def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
+    """The arguments of pip: where it was installed from, with the extra; or the libraries alone
+    where that is gone."""
+    told = json.loads(installed.read_text("direct_url.json") or "{}")
+    url = urlsplit(told.get("url", ""))
+    place = Path(unquote(url.path))
+    if url.scheme == "file" and (place / "pyproject.toml").is_file():
+        editable = told.get("dir_info", {}).get("editable", False)
+        return [*(["-e"] if editable else []), f"{place}[{extra}]"]
+    libraries = (line.partition(";") for line in installed.requires or ())
+    return [name.strip() for name, _, when in libraries if when.split() == _only(extra)]
+
+
+def _only(extra: Extra) -> list[str]:
+    return ["extra", "==", f"'{extra}'"]
+
+
+def _installer() -> list[str]:
+    """The pip of this very venv, whichever is first in the PATH."""
+    sudo = [] if os.access(sys.prefix, os.W_OK) else ["sudo"]
+    if find_spec("pip"):
+        return [*sudo, sys.executable, "-m", "pip", "install"]
+    return [*sudo, "uv", "pip", "install", "--python", sys.executable]

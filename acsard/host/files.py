@@ -39,16 +39,38 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     Raises `ExitError` and leaves it as it was when it cannot be done. `new`: it need not be there.
     """
     try:
-        file = file.resolve(strict=not new)
-        # Not read_text: it would lose CRLF.
-        text = "" if new and not file.exists() else file.read_bytes().decode()
-        given = keys(parse(text.encode())) if callable(keys) else keys
-        replace(file, edited(text, given))
+        place, text, given = _changed(file, keys, new)
+        replace(place, text)
         return given
     except (OSError, ValueError, ConfigError) as error:
-        raise ExitError(
-            Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand"
-        ) from None
+        raise _left(file, error) from None
+
+
+def require_changeable(
+    file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
+) -> None:
+    """Raises what `change` would, before anything else is done that needs the change."""
+    try:
+        place, _, _ = _changed(file, keys, new)
+        if not os.access(place.parent, os.W_OK):
+            raise PermissionError(f"no permission to write to {place.parent}")
+    except (OSError, ValueError, ConfigError) as error:
+        raise _left(file, error) from None
+
+
+def _changed(
+    file: Path, keys: Keys | Callable[[Config], Keys], new: bool
+) -> tuple[Path, str, Keys]:
+    """Where the file really is, its text with the keys, and the keys."""
+    place = file.resolve(strict=not new)
+    # Not read_text: it would lose CRLF.
+    text = "" if new and not place.exists() else place.read_bytes().decode()
+    given = keys(parse(text.encode())) if callable(keys) else keys
+    return place, edited(text, given), given
+
+
+def _left(file: Path, error: Exception) -> ExitError:
+    return ExitError(Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand")
 
 
 def replace(file: Path, text: str) -> None:

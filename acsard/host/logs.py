@@ -17,6 +17,7 @@ from typing import Any, Literal, TextIO
 import structlog
 
 from acsard.config.settings import LogConfig
+from acsard.host.colours import coloured
 from acsard.host.journal import JournalStream, is_journal, render
 from acsard.values import Event, EventName
 
@@ -91,7 +92,7 @@ class Log:
             except OSError:
                 form = "json"  # no journal here, or a sandbox without it
         self._writer = Writer(stream)
-        self._form = form
+        self._form, self._stream = form, stream
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
@@ -103,7 +104,7 @@ class Log:
                 structlog.processors.TimeStamper(fmt="iso", utc=self._form != "console"),
                 _in_order,
                 _printable,
-                _renderer(self._form),
+                _renderer(self._form, self._stream),
             ],
             wrapper_class=structlog.make_filtering_bound_logger(
                 logging.getLevelNamesMapping()[settings.level.upper()]
@@ -155,12 +156,13 @@ def _fitting(stream: TextIO) -> Form:
     return "console" if stream.isatty() else "json"
 
 
-def _renderer(form: Form) -> Any:
+def _renderer(form: Form, stream: TextIO) -> Any:
     match form:
         case "journal":
             return render
         case "console":
-            return structlog.dev.ConsoleRenderer(14)  # how far it pads; the name was another once
+            # How far it pads; the name was another once.
+            return structlog.dev.ConsoleRenderer(14, colors=coloured(stream))
         case "json":
             return structlog.processors.JSONRenderer()
         case "logfmt":

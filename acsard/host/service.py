@@ -7,6 +7,7 @@ somebody else wrote is overwritten or removed without force.
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
@@ -14,19 +15,15 @@ from pathlib import Path
 
 import acsard
 from acsard.host.exits import Exit, ExitError
-from acsard.host.steps import File, Keep, Remove, Run, Step, Write, called
+from acsard.host.placement import HOME
+from acsard.host.steps import File, Keep, Remove, RemoveAll, Run, Step, Write, called
 
 UNIT, DOOR, STOP = "acsard.service", "acsard-door.service", "acsard-stop"
 UNITS = Path("/etc/systemd/system")
+ETC = Path("/etc/acsard")
 LAN = "lan.conf"
-HOME = "/opt/acsard/venv"
-"""Where the unit of `deploy/` believes acsard to be."""
-
 TLS = "/etc/acsard/tls"
 """Where `lan.conf` believes the certificates to be."""
-
-OUT_OF_SIGHT = ("/home/", "/root", "/tmp/")
-"""Places a service cannot see."""
 
 Found = Mapping[Path, bytes | None]
 """What is there now in the place of each file."""
@@ -60,7 +57,7 @@ def files() -> list[File]:
             (_source() / "udev" / "70-acsar.rules").read_bytes(),
         ),
         File(
-            Path("/etc/acsard/acsard.toml"),
+            ETC / "acsard.toml",
             reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
             kept=True,
         ),
@@ -77,30 +74,34 @@ def lan_drop_in(unit: str) -> File:
     return File(UNITS / f"{unit}.d" / LAN, (_source() / "systemd" / LAN).read_bytes())
 
 
-def admitting(directory: Path) -> Write | None:
+def admitting(directory: Path) -> Write | Keep | None:
     """What opens the installed service's door with these certificates; None without a service.
 
-    The unit itself sees loopback only, and none of root's files.
+    The unit itself sees loopback only, and none of root's files. A drop-in that is there keeps its
+    networks, which somebody may have narrowed.
     """
     if os.geteuid() != 0 or not (UNITS / DOOR).exists():
         return None
     file = lan_drop_in(DOOR)
-    return Write(File(file.path, file.content.replace(TLS.encode(), str(directory).encode())))
+    return admitted(file, file.found(), directory)
+
+
+def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
+    """The drop-in, as it is `found` or else as it comes, with the certificates of `directory`."""
+    place = str(directory).encode()
+    text = re.sub(
+        rb"(?m)^(LoadCredential=[\w.-]+:).*/",
+        lambda match: match[1] + place + b"/",
+        file.content if found is None else found,
+    )
+    if text == found:
+        return Keep(file.path, "it names these certificates")
+    return Write(File(file.path, text))
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
     """What is there now in the place of these files."""
     return {file.path: file.found() for file in wanted}
-
-
-def misplaced(prefix: str = sys.prefix, base: str = sys.base_prefix) -> str:
-    """Why this installation is no place for a service, or ""."""
-    if prefix != base and not prefix.startswith(OUT_OF_SIGHT):
-        return ""
-    return (
-        f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard in a "
-        f"venv at {HOME} (deploy/systemd/README.md)"
-    )
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
@@ -121,21 +122,48 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
     return [*steps, *INSTALLED]
 
 
-def uninstalling(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """The steps that undo it; what somebody has changed stays unless forced, a `kept` file also
-    then."""
+def own_places() -> list[Path]:
+    """Directories that may hold more of the service than was installed."""
+    return [UNITS / f"{DOOR}.d", UNITS / f"{UNIT}.d", ETC]
+
+
+def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
+    """What else is in these places: certificates, drop-ins of somebody's own."""
+    ours = {file.path for file in files}
+    inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
+    return [path for path in inside if path not in ours]
+
+
+def uninstalling(
+    wanted: Iterable[File],
+    found: Found,
+    others: Iterable[Path] = (),
+    *,
+    force: bool,
+    purge: bool = False,
+) -> list[Step]:
+    """The steps that undo it, and what stays with the reason.
+
+    What somebody has changed stays unless forced, a `kept` file and `others` unless purged.
+    """
     there = [file for file in wanted if found[file.path] is not None]
-    staying = {
-        file.path for file in there if found[file.path] != file.content and (file.kept or not force)
-    }
-    if any(path.name == UNIT for path in staying):
-        # A unit that is started again must find what sends zeros after it.
-        staying |= {file.path for file in there if file.path.name == STOP}
-    why = "changed, or needed by what is; --force removes it"
-    steps: list[Step] = []
+    why: dict[Path, str] = {}
     for file in there:
-        stays = file.path in staying
-        steps.append(Keep(file.path, why) if stays else Remove(file.path))
+        if found[file.path] == file.content or purge:
+            continue
+        if file.kept:
+            why[file.path] = "your configuration; --purge removes it"
+        elif not force:
+            why[file.path] = "somebody has changed it; --force removes it"
+    if any(path.name == UNIT for path in why):
+        # A unit that is started again must find what sends zeros after it.
+        why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
+    steps: list[Step] = [
+        Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
+    ]
+    for path in others:
+        what = "certificates and their authority" if path == Path(TLS) else "not of the service"
+        steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
     units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]

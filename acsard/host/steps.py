@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from pathlib import Path
 
 from msgspec import Struct
 
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.exits import Exit, ExitError
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d")
@@ -31,10 +33,15 @@ class File(Struct, frozen=True):
             return self.path.read_bytes()
         except FileNotFoundError:
             return None
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
 
     def condition(self) -> str:
         """How it is, in a word or two."""
-        found = self.found()
+        try:
+            found = self.found()
+        except MendableError:
+            return "unreadable"
         if found is None:
             return "missing"
         return "as installed" if found == self.content else "changed"
@@ -73,13 +80,35 @@ class Remove(Struct, frozen=True):
     def do(self) -> None:
         """Remove it."""
         self.path.unlink()
-        for place in self.path.parents:
+        self.tidy(self.path)
+
+    @staticmethod
+    def tidy(path: Path) -> None:
+        """Remove the directories of ours that nothing is left in."""
+        for place in path.parents:
             if place.name not in OURS:
                 return
             try:
                 place.rmdir()
             except OSError:
                 return  # something else lives there
+
+
+class RemoveAll(Struct, frozen=True):
+    """A file or a whole directory is removed, whatever is in it."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return f"remove  {self.path}" + ("/ and all in it" if self.path.is_dir() else "")
+
+    def do(self) -> None:
+        """Remove it."""
+        if self.path.is_dir() and not self.path.is_symlink():
+            shutil.rmtree(self.path)
+            Remove.tidy(self.path)
+        else:
+            Remove(self.path).do()
 
 
 class Keep(Struct, frozen=True):
@@ -116,7 +145,13 @@ class Run(Struct, frozen=True):
             raise ExitError(Exit.FAILURE, f"{' '.join(self.words)}: {failed}")
 
 
-Step = Write | Remove | Keep | Run
+Step = Write | Remove | RemoveAll | Keep | Run
+
+
+def _unreadable(path: Path, error: OSError) -> MendableError:
+    if isinstance(error, PermissionError):
+        return NotPermittedError(f"no permission to read {path}; run it by sudo")
+    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; look what it is")
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,8 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY
-
-CA_KEY = "ca-key.pem"
+from acsard.lan.identities import CA_KEY
 
 SLACK = timedelta(hours=1)
 """Certificates count from a little before now: robots' clocks are not all right at the start."""
@@ -32,6 +32,7 @@ class Authority:
     @classmethod
     def make(cls, directory: Path, name: str, days: int) -> Authority:
         """A new one, valid five times as long as what it signs, written to `directory`."""
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name[:64])])
         certificate = (
@@ -45,12 +46,29 @@ class Authority:
         return cls(certificate, key)
 
     @classmethod
-    def load(cls, directory: Path) -> Authority:
-        """The one in `directory`; raises `OSError` or `ValueError`."""
-        key = serialization.load_pem_private_key((directory / CA_KEY).read_bytes(), None)
+    def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
+        """The one in `directory`; raises `OSError` or `ValueError`.
+
+        `password` is asked for that of a key that is encrypted.
+        """
+        data = (directory / CA_KEY).read_bytes()
+        try:
+            key = serialization.load_pem_private_key(data, None)
+        except TypeError:  # it is encrypted
+            key = serialization.load_pem_private_key(data, password().encode())
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{CA_KEY} is not a P-256 key")
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
+
+    def names_in(self, directory: Path) -> list[str]:
+        """The host names and IP addresses of the certificate in `directory`; none without one."""
+        try:
+            found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
+            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except (OSError, ValueError, x509.ExtensionNotFound):
+            return []
+        addresses = names.get_values_for_type(x509.IPAddress)
+        return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
         """A certificate for both ends of a link, with its key and ours, written to `directory`.

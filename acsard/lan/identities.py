@@ -9,12 +9,15 @@ from __future__ import annotations
 import os
 import re
 import socket
+import sys
 from collections.abc import Sequence
+from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.bus.certificates import CA
 from acsard.config.settings import Config
+from acsard.host.addresses import own_addresses
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 from acsard.values import ROLES
@@ -23,13 +26,16 @@ if TYPE_CHECKING:
     from acsard.lan.authority import Authority
 
 PORT = 7449
+CA_KEY = "ca-key.pem"
+"""The authority's, which no client has."""
+
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """A host name or IP address."""
 
 
-def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> None:
-    """Make an authority, the robot's certificate and one for each role."""
+def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
+    """Make an authority, the robot's certificate and one for each role; the robot's names."""
     if (directory / CA).exists() and not force:
         raise ExitError(
             Exit.FAILURE,
@@ -39,9 +45,11 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     maker = _maker()
     _writable(directory)
     authority = maker.make(directory, f"acsard at {socket.gethostname()}", days)
-    authority.issue(directory, "robot", _robot_names(addresses), days)
+    names = _robot_names(addresses)
+    authority.issue(directory, "robot", names, days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], days)
+    return names
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
@@ -55,15 +63,19 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
     return place
 
 
-def renew(directory: Path, addresses: Sequence[str], days: int) -> None:
-    """Replace the robot's own certificate."""
-    _load(directory).issue(directory, "robot", _robot_names(addresses), days)
+def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
+    """Replace the robot's own certificate; the names and addresses it has, the old ones too."""
+    authority = _load(directory)
+    names = [*_robot_names(authority.names_in(directory)), *addresses]
+    authority.issue(directory, "robot", names, days)
+    return list(dict.fromkeys(names))
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """What the robot is reached by: from elsewhere, by mDNS, and on itself."""
+    """What the robot is reached by: from elsewhere, by mDNS, on itself, by its addresses now."""
     host = socket.gethostname()
-    return [host, f"{host}.local", "localhost", "127.0.0.1", *more]
+    names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
+    return list(dict.fromkeys(names))
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
@@ -89,7 +101,7 @@ def _load(directory: Path) -> Authority:
     maker = _maker()
     _writable(directory)
     try:
-        return maker.load(directory)
+        return maker.load(directory, _password)
     except FileNotFoundError:
         raise ExitError(
             Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
@@ -98,14 +110,22 @@ def _load(directory: Path) -> Authority:
         raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
 
 
+def _password() -> str:
+    """Of an authority's key that somebody has encrypted."""
+    if not sys.stdin.isatty():
+        raise ExitError(
+            Exit.USAGE,
+            "the authority's key is encrypted: run it in a terminal, it asks for the password",
+        )
+    return getpass(f"password of {CA_KEY}: ")
+
+
 def _writable(directory: Path) -> None:
-    try:
-        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
-    except OSError as error:
+    """We may make it, or write to it; nothing is made yet."""
+    there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise ExitError(Exit.FAILURE, f"{there} is not a directory; use --directory")
+    if not os.access(there, os.W_OK | os.X_OK):
         raise ExitError(
-            Exit.NO_PERMISSION, f"cannot make {directory}: {error.strerror}; use --directory"
-        ) from None
-    if not os.access(directory, os.W_OK):
-        raise ExitError(
-            Exit.NO_PERMISSION, f"cannot write to {directory}: run it by sudo, or use --directory"
+            Exit.NO_PERMISSION, f"cannot write to {there}: run it by sudo, or use --directory"
         )

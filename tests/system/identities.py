@@ -48,7 +48,7 @@ class Certificates:
 
     def issue(self, directory: Path, name: str, days: float) -> None:
         """One more, by this robot's authority."""
-        Authority.load(self.robot).issue(directory, name, [], days)
+        Authority.load(self.robot, str).issue(directory, name, [], days)
 
     def config(self, who: Identity, plain: str, tls: str) -> zenoh.Config:
         """The settings of a client that comes as `who`; all of them know the robot's CA."""

@@ -284,6 +284,16 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
     assert "robot.id" in ended.err
 
 
+@pytest.mark.parametrize("robot_id", ["a/b*", "", "**", "robot 1"])
+def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
+    tmp_path: Path, robot_id: str
+) -> None:
+    for words in (["call", "clear"], ["echo", "odom"], ["hz", "odom"]):
+        ended = finish(acsard(*words, f"--id={robot_id}"), tmp_path)
+        assert (ended.code, ended.out) == (2, "")
+        assert f"{robot_id!r} is not a robot's id" in ended.err
+
+
 # call
 
 
@@ -297,10 +307,12 @@ def test_call_prints_the_answer_and_ends_with_1_when_refused(shared: Daemon, bus
     assert json.loads(clear.out)["success"] is True
     bus.comes_to("ready")
     again = tool(shared, "call", "clear")
-    assert (again.code, "nothing to clear" in again.out) == (1, True)
+    assert (again.code, "nothing to clear" in again.out) == (0, True)
 
 
-@pytest.mark.parametrize("pose", [("1", "2", "0.5"), ("-1.5", "-2", "-0.5")])
+@pytest.mark.parametrize(
+    "pose", [("1", "2", "0.5"), ("-1.5", "-2", "-0.5"), ("-1e-3", "0", "-.5E+0")]
+)
 def test_call_set_pose_sets_it(shared: Daemon, bus: Bus, pose: tuple[str, ...]) -> None:
     ended = tool(shared, "call", "set_pose", *pose)
     state = bus.state()

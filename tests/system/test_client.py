@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import signal
 import socket
@@ -14,7 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import zenoh
 
+from acsard import client as client_module
 from acsard.bus.subscription import Subscription
 from acsard.client import AsyncClient, Client, connect, connect_async
 from acsard.host.errors import (
@@ -239,6 +242,32 @@ def test_connecting_async_to_nobody_is_the_same_error() -> None:
 
     with pytest.raises(UnreachableError):
         asyncio.run(main())
+
+
+@pytest.mark.parametrize("robot_id", ["a/b*", "", "robot 1"])
+def test_what_is_no_id_is_a_value_error(robot_id: str) -> None:
+    with (
+        pytest.raises(UsageError, match="is not a robot's id"),
+        connect(free_endpoint(), robot_id=robot_id),
+    ):
+        pass
+
+
+def test_a_question_that_nobody_answers_in_time_is_a_timeout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(client_module, "REPLY_TIMEOUT_S", 0.3)
+    endpoint = free_endpoint()
+    unanswered: list[zenoh.Query] = []
+    settings = zenoh.Config()
+    settings.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(settings) as stuck:
+        stuck.declare_queryable("acsard/acsar/srv/*", unanswered.append)
+        with connect(endpoint) as robot, pytest.raises(NoAnswerError, match=r"within 0.3 s"):
+            robot.call("clear")
+        assert unanswered
+        unanswered.clear()
 
 
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", ""])

@@ -532,11 +532,19 @@ def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
 
 
 def test_a_refused_request_is_no_event() -> None:
-    bench = Bench().linked()
-    assert bench.answer("clear") == Answer(
-        7, False, "nothing to clear: neither stopped nor in fault"
-    )
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    assert bench.answer("activate") == Answer(7, False, "stopped: call srv/clear first")
     assert names(bench.out) == []
+
+
+def test_a_clear_of_nothing_succeeds_says_so_and_changes_nothing() -> None:
+    bench = Bench().driving()
+    mode, twist = bench.mode(), bench.out.applied
+    assert bench.step(GO, ask="clear").answers == (
+        Answer(7, True, "nothing to clear: neither stopped nor in fault"),
+    )
+    assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
 
 
 def test_a_stop_holds_over_a_lost_link() -> None:
@@ -657,12 +665,12 @@ def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:
 def test_several_requests_of_one_step_are_answered_in_order() -> None:
     bench = Bench().linked()
     bench.now_ns += 10 * MS
-    requests = (Request("deactivate", 1), Request("activate", 2), Request("clear", 3))
+    requests = (Request("stop", 1), Request("activate", 2), Request("reset_odometry", 3))
     out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests))
     assert [(answer.id, answer.success) for answer in out.answers] == [
         (1, True),
-        (2, True),
-        (3, False),
+        (2, False),
+        (3, True),
     ]
 
 

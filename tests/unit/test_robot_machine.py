@@ -39,6 +39,7 @@ from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,
     REST,
+    Answer,
     Command,
     Inputs,
     Instant,
@@ -148,6 +149,11 @@ class Books:
         if not self.live(at_ns):
             self.since_ns = at_ns
         self.wish, self.heard_ns = wish, at_ns
+
+
+def did(answer: Answer) -> bool:
+    """It was obeyed, and there was something to do."""
+    return answer.success and not answer.message.startswith("nothing")
 
 
 class RobotMachine(RuleBasedStateMachine):
@@ -508,7 +514,7 @@ class RobotMachine(RuleBasedStateMachine):
         over = over or any(event.name == "fault" for event in outputs.events)
         switched_off = self.before is None or self.before.mode == "inactive"
         for request, answer in zip(requests, outputs.answers, strict=True):
-            if answer.success:
+            if did(answer):
                 over = over or request.verb == "clear"
                 over = over or (request.verb == "activate" and switched_off)
                 switched_off = switched_off or request.verb == "deactivate"
@@ -538,7 +544,7 @@ class RobotMachine(RuleBasedStateMachine):
         )
 
     def check_mode(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
-        done = {r.verb for r, a in zip(requests, outputs.answers, strict=True) if a.success}
+        done = {r.verb for r, a in zip(requests, outputs.answers, strict=True) if did(a)}
         mode, was = outputs.mode, "" if self.before is None else self.before.mode
         if "stop" in done and "clear" not in done:
             assert mode in ("stopped", "fault", "leaving")

@@ -26,7 +26,7 @@ def test_the_name_in_a_certificate_is_told_and_of_none_that_can_be_used_no_name(
     tmp_path: Path,
 ) -> None:
     assert common_name(str(made(tmp_path))) == "robot"
-    Authority.load(tmp_path).issue(tmp_path / "anna", "laptop-anna", [], 10)
+    Authority.load(tmp_path, str).issue(tmp_path / "anna", "laptop-anna", [], 10)
     assert common_name(str(tmp_path / "anna")) == "laptop-anna"
     (tmp_path / "certificate.pem").write_text("junk")
     assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""

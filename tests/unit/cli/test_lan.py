@@ -18,11 +18,17 @@ import pytest
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
 from acsard.config.parsing import parse
+from acsard.host.addresses import own_addresses
 from acsard.host.exits import Exit
 
 ROLES = ("viewer", "operator", "maintainer")
@@ -459,3 +465,90 @@ def test_without_an_authority_nothing_is_renewed(
 ) -> None:
     assert lan("renew", "--directory", str(tmp_path)) == Exit.FAILURE
     assert "acsard lan init" in capsys.readouterr().err
+
+
+# what a person would lose
+
+
+def names_of(directory: Path) -> set[str]:
+    found = certificate(directory).extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    addresses = found.value.get_values_for_type(x509.IPAddress)
+    return {*found.value.get_values_for_type(x509.DNSName), *map(str, addresses)}
+
+
+def test_init_certifies_the_machine_s_addresses_and_prints_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lan("init", "--directory", str(tmp_path / "tls")) == 0
+    said = capsys.readouterr().out
+    expected = {"127.0.0.1", "localhost", os.uname().nodename, *own_addresses()}
+    assert expected <= names_of(tmp_path / "tls")
+    assert all(name in said.splitlines()[0] for name in expected)
+
+
+def test_renew_keeps_the_names_that_were_certified(own: Path) -> None:
+    before = names_of(own)
+    assert lan("renew", "--directory", str(own), "--address", "more.example") == 0
+    assert names_of(own) >= {*before, "more.example", "robot.example", "192.0.2.7"}
+
+
+def test_add_prints_a_list_that_keeps_who_is_there(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text('[access]\noperators = ["bob", "carol"]\n')
+    words = ("--role", "operator", "--directory", str(own), "--config", str(file))
+    assert lan("add", "anna", *words) == 0
+    printed = tables(capsys.readouterr().out)
+    assert parse(printed).access.operators == ("bob", "carol", "anna")
+
+
+@pytest.mark.parametrize("text", ["[bus\n", "[bus]\ncolour = 1\n"])
+def test_nothing_is_made_where_the_configuration_cannot_be_written(
+    tmp_path: Path, text: str
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(text)
+    words = ("--directory", str(tmp_path / "tls"), "--write", str(file))
+    assert lan("init", *words) == Exit.FAILURE
+    assert [path.name for path in tmp_path.iterdir()] == ["acsard.toml"]
+
+
+def test_add_and_renew_make_no_directory_and_then_fail(tmp_path: Path) -> None:
+    for words in (["add", "anna", "--role", "viewer"], ["renew"]):
+        assert lan(*words, "--directory", str(tmp_path / "none")) == Exit.FAILURE
+    assert not list(tmp_path.iterdir())
+
+
+def encrypt(own: Path, password: bytes) -> None:
+    key = load_pem_private_key((own / "ca-key.pem").read_bytes(), None)
+    (own / "ca-key.pem").write_bytes(
+        key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(password))
+    )
+
+
+def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
+    encrypt(own, b"secret")
+    words = [sys.executable, "-m", "acsard", "lan", "renew", "--directory", str(own)]
+    before = certificate(own).serial_number
+    leader, follower = os.openpty()
+    process = subprocess.Popen(
+        words, stdin=follower, stdout=follower, stderr=follower, start_new_session=True
+    )
+    os.close(follower)
+    said = b""
+    while b"password of ca-key.pem" not in said:
+        said += os.read(leader, 1024)
+    os.write(leader, b"secret\n")
+    assert process.wait(30.0) == 0
+    os.close(leader)
+    assert certificate(own).serial_number != before
+
+
+def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
+    encrypt(own, b"secret")
+    words = [sys.executable, "-m", "acsard", "lan", "renew", "--directory", str(own)]
+    done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
+    assert done.returncode == Exit.USAGE
+    assert "encrypted" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -109,7 +109,7 @@ def test_write_without_tomlkit_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(ExitError, match=r"pip install '\.\[mcu\]'"):
+    with pytest.raises(ExitError, match=r"pip install .*\[mcu\]'"):
         called(tmp_path, "--port", "sim", "--yes", "--write")
 
 
@@ -196,11 +196,13 @@ def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.Monk
     with os.fdopen(slave, "w") as end, monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", end)
         do()
-        end.write("$")  # so that there is something to read
+        end.write("$")  # the end, so that there is something to read
         end.flush()
-        written = os.read(master, 1 << 16).decode().removesuffix("$")
+        written = b""
+        while not written.endswith(b"$"):  # it comes in pieces
+            written += os.read(master, 1 << 16)
     os.close(master)
-    return written
+    return written.decode().removesuffix("$")
 
 
 @pytest.mark.parametrize("columns", [0, 40, 120])

@@ -330,6 +330,50 @@ def test_all_contradictions_are_told_at_once() -> None:
     assert len(found) == 6
 
 
+def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
+    found = problems_of(
+        """
+        colour = 1
+        [drive]
+        wheel_radius = "big"
+        [mcu]
+        baud_rate = 9600
+        [control]
+        rate = 100.0
+        [mcu.wheels]
+        front_left = "+a"
+        front_right = "+z"
+        [joints]
+        front_left = "wheel"
+        rear_left = "wheel"
+        [limits]
+        linear_jerk = 0.001
+        angular_jerk = "soft"
+        [bus]
+        mode = "peer"
+        listen = ["tcp/0.0.0.0:7448"]
+        """
+    )
+    starts = ["colour", "drive.wheel_radius", "control.rate", "mcu.wheels.front_right"]
+    starts += ["joints.rear_left", "limits.linear_jerk", "limits.angular_jerk", "bus.listen"]
+    assert [next(s for s in starts if line.startswith(s)) for line in found]
+    assert sorted(line.split(" = ")[0] for line in found) == sorted(starts)
+
+
+def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
+    """Of 100 Hz at the baud rate by default, of endpoints whose insecure was mistyped."""
+    text = """
+        [mcu]
+        baudrate = 9600
+        [control]
+        rate = 400.0
+        [bus]
+        insecur = true
+        listen = ["tcp/0.0.0.0:7448"]
+        """
+    assert [line.split(" = ")[0] for line in problems_of(text)] == ["mcu.baudrate", "bus.insecur"]
+
+
 def test_the_error_says_all_its_problems() -> None:
     with pytest.raises(ConfigError) as caught:
         parse(b"a = 1\nb = 2")

@@ -107,3 +107,10 @@ def test_a_fault_that_goes_on_does_not_put_its_clear_off() -> None:
     assert not life.fault("wheel", 50)
     life.clear(asked_ns=40, now_ns=50, linked=True)
     assert life.mode is Mode.READY
+
+
+def test_a_clear_of_nothing_changes_nothing() -> None:
+    life = ready()
+    life.fire(Trigger.COMMAND)
+    assert not life.clear(asked_ns=1, now_ns=1, linked=True)
+    assert life.mode is Mode.DRIVING

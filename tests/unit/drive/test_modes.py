@@ -24,10 +24,10 @@ LATCHED = {Mode.STOPPED, Mode.FAULT}
 #
 #            link_up link_lost command no_command fault leave stop clear activate deactivate
 DRAWN = """
-    inactive    .       .        .        .        F     L     S     -      W         .
-    waiting     R       .        .        .        F     L     S     -      .         I
-    ready       .       W        D        .        F     L     S     -      .         I
-    driving     .       W        .        R        F     L     S     -      .         I
+    inactive    .       .        .        .        F     L     S     .      W         .
+    waiting     R       .        .        .        F     L     S     .      .         I
+    ready       .       W        D        .        F     L     S     .      .         I
+    driving     .       W        .        R        F     L     S     .      .         I
     stopped     .       .        .        .        F     L     .     I      -         -
     fault       .       .        .        .        .     L     .     I      -         -
     leaving     .       .        .        .        .     .     .     -      -         -
@@ -101,9 +101,9 @@ def test_only_a_command_in_ready_begins_driving() -> None:
     assert begins == {(Mode.READY, Trigger.COMMAND)}
 
 
-def test_only_a_command_a_link_and_a_needless_activate_leave_driving_as_it_is() -> None:
+def test_only_a_command_a_link_and_a_needless_clear_or_activate_leave_driving_as_it_is() -> None:
     stays = {trigger for trigger in Trigger if TABLE.get((Mode.DRIVING, trigger)) is Mode.DRIVING}
-    assert stays == {Trigger.COMMAND, Trigger.LINK_UP, Trigger.ACTIVATE}
+    assert stays == {Trigger.COMMAND, Trigger.LINK_UP, Trigger.CLEAR, Trigger.ACTIVATE}
 
 
 def test_a_latched_mode_is_left_only_by_clear_a_fault_or_leaving() -> None:
@@ -123,7 +123,9 @@ def test_leaving_is_for_good() -> None:
 
 
 def test_clear_never_leads_straight_to_motion() -> None:
-    assert {to for (_, trigger), to in TABLE.items() if trigger is Trigger.CLEAR} == {Mode.INACTIVE}
+    assert {
+        to for (mode, trigger), to in TABLE.items() if trigger is Trigger.CLEAR and to is not mode
+    } == {Mode.INACTIVE}
 
 
 @pytest.mark.parametrize("mode", Mode)

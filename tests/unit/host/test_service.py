@@ -14,13 +14,14 @@ from acsard.host.service import (
     STOP,
     UNIT,
     Found,
+    admitted,
     files,
     installing,
-    misplaced,
     present,
+    strangers,
     uninstalling,
 )
-from acsard.host.steps import File, Keep, Remove, Run, Write
+from acsard.host.steps import File, Keep, Remove, RemoveAll, Run, Write
 
 ETC = Path("/etc/x")
 UNIT_FILE = File(ETC / UNIT, b"unit")
@@ -103,17 +104,50 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert set(present([unit])) == {unit.path}
 
 
-@pytest.mark.parametrize(
-    ("prefix", "base", "good"),
-    [
-        ("/opt/acsard/venv", "/usr", True),
-        ("/usr", "/usr", False),
-        ("/home/anna/venv", "/usr", False),
-        ("/root/venv", "/usr", False),
-        ("/tmp/venv", "/usr", False),
-    ],
+def test_each_that_stays_says_why_and_what_removes_it() -> None:
+    tls, own = Path("/etc/acsard/tls"), ETC / "own.conf"
+    found = there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, found, [tls, own], force=False)
+    assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
+        UNIT_FILE.path: "somebody has changed it; --force removes it",
+        STOP_FILE.path: f"{UNIT} stays and needs it",
+        OWN.path: "your configuration; --purge removes it",
+        tls: "certificates and their authority; --purge removes it",
+        own: "not of the service; --purge removes it",
+    }
+
+
+def test_a_purge_keeps_nothing() -> None:
+    tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, found, [tls], force=True, purge=True)
+    assert not [step for step in steps if isinstance(step, Keep)]
+    assert {step.path for step in steps if isinstance(step, (Remove, RemoveAll))} == {
+        *(file.path for file in ALL),
+        tls,
+    }
+
+
+def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "tls").mkdir()
+    (tmp_path / "acsard.toml").touch()
+    ours = File(tmp_path / "acsard.toml", b"", kept=True)
+    assert strangers([ours], [tmp_path, tmp_path / "missing"]) == [tmp_path / "tls"]
+
+
+DROP_IN = File(
+    ETC / "lan.conf", b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
 )
-def test_a_service_cannot_live_in_a_home_nor_outside_a_venv(
-    prefix: str, base: str, good: bool
-) -> None:
-    assert (misplaced(prefix, base) == "") is good
+
+
+def test_a_drop_in_comes_with_the_place_of_the_certificates() -> None:
+    step = admitted(DROP_IN, None, Path("/srv/tls"))
+    assert isinstance(step, Write)
+    assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
+
+
+def test_networks_that_somebody_has_narrowed_stay() -> None:
+    own = b"IPAddressAllow=10.1.2.0/24\nLoadCredential=key.pem:/srv/tls/key.pem\n"
+    assert isinstance(admitted(DROP_IN, own, Path("/srv/tls")), Keep)
+    moved = admitted(DROP_IN, own, Path("/etc/tls"))
+    assert isinstance(moved, Write)
+    assert moved.file.content == own.replace(b"/srv/tls", b"/etc/tls")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.exits import ExitError
-from acsard.host.steps import File, Remove, Run, Write
+from acsard.host.steps import File, Remove, RemoveAll, Run, Write
 
 
 def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
@@ -41,3 +41,19 @@ def test_a_command_that_fails_ends_it_unless_it_may() -> None:
     Run(words, may_fail=True).do()
     with pytest.raises(ExitError, match="no such program"):
         Run(("no such program",)).do()
+
+
+def test_a_whole_directory_goes_and_those_of_ours_that_are_empty_then(tmp_path: Path) -> None:
+    place = tmp_path / "acsard" / "tls"
+    (place / "clients").mkdir(parents=True)
+    (place / "clients" / "key.pem").touch()
+    RemoveAll(place).do()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    place = File(tmp_path / "acsard.toml", b"")
+    place.path.mkdir()
+    assert place.condition() == "unreadable"
+    with pytest.raises(ExitError, match=r"cannot read .*acsard\.toml"):
+        place.found()

@@ -1,0 +1,84 @@
+"""`acsard completion` and `acsard man`: what a shell and `man` know of the command line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+
+SHELLS = {
+    "bash": "~/.local/share/bash-completion/completions/acsard",
+    "zsh": "a directory of your $fpath, as _acsard",
+    "fish": "~/.config/fish/completions/acsard.fish",
+}
+"""Where each looks for its script."""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verbs."""
+    places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
+    completion = verbs.add_parser(
+        "completion",
+        help="the script by which a shell completes with Tab",
+        description="Print the script by which a shell completes verbs, options and files with "
+        f"Tab. Write it to where the shell looks ({places}). Needs the library shtab; without it, "
+        "it tells what to type.",
+    )
+    completion.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
+    completion.set_defaults(main=main_completion)
+    page = verbs.add_parser(
+        "man",
+        help="all of --help as a man page",
+        description="Print a man page of every verb and option, for example into "
+        "~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; without it, it "
+        "tells what to type.",
+    )
+    page.set_defaults(main=main_man)
+
+
+def main_completion(args: argparse.Namespace) -> int:
+    """Print the script."""
+    from acsard.cli import parser
+
+    try:
+        import shtab
+    except ImportError:
+        raise _missing("shtab") from None
+    whole = parser()
+    for action in _actions(whole):
+        kind = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}.get(
+            str(action.metavar)
+        )
+        if kind:
+            action.complete = kind  # type: ignore[attr-defined]
+    print(shtab.complete(whole, args.shell))
+    return 0
+
+
+def main_man(args: argparse.Namespace) -> int:
+    """Print the page."""
+    from acsard import __version__
+    from acsard.cli import parser
+
+    try:
+        from argparse_manpage.manpage import Manpage
+    except ImportError:
+        raise _missing("argparse-manpage") from None
+    about = {"project_name": "acsard", "version": __version__, "manual_title": "ACSAR robot"}
+    print(Manpage(parser(), about))
+    return 0
+
+
+def _missing(library: str) -> ExitError:
+    return ExitError(Exit.FAILURE, f"needs the library {library}; run: {install('shell')}")
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Every option and argument, of every verb."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from _actions(below)

@@ -1,0 +1,151 @@
+"""Each mistake on the way to a TLS endpoint has its own sentence, over real connections."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from threading import Thread
+
+import pytest
+import zenoh
+
+from acsard.bus.session import client_session
+from acsard.host.errors import CertificateError, MendableError, UnreachableError
+from acsard.lan import authority as making
+from acsard.lan.authority import Authority
+from tests.system.harness import free_endpoint
+
+ALL_NAMES = ["localhost", "127.0.0.1"]
+
+
+@pytest.fixture(scope="module", name="tls")
+def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An authority with a client's certificate, and one that has ended; and another authority's."""
+    place = tmp_path_factory.mktemp("tls")
+    ours = Authority.make(place / "ca", "ours", 10)
+    ours.issue(place / "client", "client", [], 1)
+    ours.issue(place / "ended", "client", [], -1)
+    ours.issue(place / "robot", "robot", ALL_NAMES, 1)
+    ours.issue(place / "robot ended", "robot", ALL_NAMES, -1)
+    ours.issue(place / "robot elsewhere", "robot", ["robot.example"], 1)
+    Authority.make(place / "other ca", "other", 10).issue(place / "stranger", "client", [], 1)
+    mixed = place / "mixed"  # knows the robot's authority, shows another's certificate
+    shutil.copytree(place / "stranger", mixed)
+    shutil.copy(place / "client" / "ca.pem", mixed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(making, "datetime", Later)
+        ours.issue(place / "robot later", "robot", ALL_NAMES, 1)
+    return place
+
+
+class Later(datetime):
+    """The clock of a machine that is two days ahead."""
+
+    @classmethod
+    def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+        return datetime.now(UTC) + timedelta(days=2)
+
+
+def listening(own: Path, endpoint: str) -> zenoh.Session:
+    settings = zenoh.Config()
+    settings.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    tls = {
+        "root_ca_certificate": str(own / "ca.pem"),
+        "listen_certificate": str(own / "certificate.pem"),
+        "listen_private_key": str(own / "key.pem"),
+        "enable_mtls": True,
+    }
+    settings.insert_json5("transport/link/tls", json.dumps(tls))
+    return zenoh.open(settings)
+
+
+@pytest.fixture(scope="module", name="robot")
+def _robot(tls: Path) -> Iterator[str]:
+    """Where a good one listens."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with listening(tls / "robot", endpoint):
+        yield endpoint
+
+
+def told(endpoint: str, directory: str) -> MendableError:
+    with pytest.raises(MendableError) as error:
+        client_session(endpoint, directory)
+    return error.value
+
+
+def test_with_the_right_certificate_it_connects(tls: Path, robot: str) -> None:
+    client_session(robot, str(tls / "client")).close()
+
+
+def test_without_a_directory_it_is_asked_for() -> None:
+    error = told("tls/no.such.host.invalid:7449", "")
+    assert isinstance(error, CertificateError)
+    assert "--tls DIRECTORY" in str(error)
+
+
+def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
+    error = told("tls/no.such.host.invalid:7449", str(tmp_path / "none"))
+    assert isinstance(error, CertificateError)
+    assert f"there is no directory {tmp_path / 'none'}" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("robot_has", "sentence"),
+    [
+        ("robot ended", "the certificate of 127.0.0.1 has ended, by this machine's clock"),
+        ("robot later", "does not count yet by this machine's clock"),
+        ("robot elsewhere", "lan renew --address 127.0.0.1"),
+    ],
+)
+def test_what_is_wrong_with_the_robot_s_certificate(
+    tls: Path, robot_has: str, sentence: str
+) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with listening(tls / robot_has, endpoint):
+        error = told(endpoint, str(tls / "client"))
+    assert isinstance(error, UnreachableError)
+    assert sentence in str(error)
+
+
+@pytest.mark.parametrize(
+    ("shown", "sentence"),
+    [
+        ("stranger", "is of another authority than"),
+        ("mixed", "it is of another authority than the robot's"),
+        ("ended", "has ended or does not count yet"),
+    ],
+)
+def test_what_is_wrong_with_ours(tls: Path, robot: str, shown: str, sentence: str) -> None:
+    assert sentence in str(told(robot, str(tls / shown)))
+
+
+def test_a_name_that_does_not_resolve(tls: Path) -> None:
+    error = told("tls/no.such.host.invalid:7449", str(tls / "client"))
+    assert "the name no.such.host.invalid does not resolve" in str(error)
+
+
+def test_a_port_where_nobody_listens(tls: Path) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    assert "nobody listens on port" in str(told(endpoint, str(tls / "client")))
+
+
+def test_one_that_speaks_no_tls(tls: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
+        server.settimeout(10.0)
+
+        def greet() -> None:
+            try:
+                while True:
+                    with server.accept()[0] as link:
+                        link.sendall(b"hello, this is no TLS\r\n" * 10)
+            except OSError:
+                pass
+
+        Thread(target=greet, daemon=True).start()
+        assert "does not speak TLS" in str(told(endpoint, str(tls / "client")))

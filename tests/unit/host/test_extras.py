@@ -1,0 +1,52 @@
+"""What an error tells to type for a library that is missing."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from importlib.metadata import Distribution, PathDistribution
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from acsard.host.extras import Extra, install, wanted_by
+from tests.system.harness import ROOT
+
+
+def installed(where: Path, **direct: object) -> Distribution:
+    """A distribution with two extras, installed from `direct`."""
+    info = where / "acsard-1.dist-info"
+    info.mkdir()
+    lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'lan'"]
+    lines += ["Requires-Dist: two; extra == 'lan'", "Requires-Dist: three; extra == 'top'"]
+    (info / "METADATA").write_text("\n".join(lines) + "\n\n")
+    if direct:
+        (info / "direct_url.json").write_text(json.dumps(direct))
+    return PathDistribution(info)
+
+
+@pytest.mark.parametrize("editable", [True, False])
+def test_from_a_clone_it_is_that_clone_again(tmp_path: Path, editable: bool) -> None:
+    clone = tmp_path / "my clone"
+    clone.mkdir()
+    (clone / "pyproject.toml").touch()
+    found = installed(tmp_path, url=clone.as_uri(), dir_info={"editable": editable})
+    assert wanted_by(found, "lan") == [*(["-e"] if editable else []), f"{clone}[lan]"]
+
+
+@pytest.mark.parametrize("url", ["file:///gone/away", "https://example.org/acsard.whl"])
+def test_from_what_is_gone_it_is_the_libraries_alone(tmp_path: Path, url: str) -> None:
+    assert wanted_by(installed(tmp_path, url=url), "lan") == ["one<2,>=1", "two"]
+
+
+def test_from_nobody_knows_where_it_is_the_libraries_alone(tmp_path: Path) -> None:
+    assert wanted_by(installed(tmp_path), "top") == ["three"]
+
+
+@pytest.mark.parametrize("extra", get_args(Extra))
+def test_what_is_told_is_for_the_venv_at_hand(extra: Extra) -> None:
+    words = shlex.split(install(extra))
+    assert words[:4] == [sys.executable, "-m", "pip", "install"]
+    assert words[-1] == f"{ROOT}[{extra}]"
