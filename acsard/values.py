@@ -155,7 +155,7 @@ EventName = Literal[
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_dropped", "wheels_turned", "wheels_doubted", "gyro", "imu_refused",
     "bus_stuck",
-    "missed_periods",
+    "missed_periods", "recording",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose",
@@ -344,6 +344,17 @@ class Measured(Struct, frozen=True):
     last_minute: Spread = Spread()
 
 
+class Recording(Struct, frozen=True):
+    """How the black box does."""
+
+    where: str = ""
+    """The directory, "" when nothing is recorded."""
+    trouble: str = ""
+    """Why it is not recorded just now, in words."""
+    missing: int = 0
+    """Steps that were not recorded."""
+
+
 class Snapshot(Struct, frozen=True):
     """What `state` and `diagnostics` show beyond one step's outputs."""
 
@@ -362,3 +373,4 @@ class Snapshot(Struct, frozen=True):
     """Which check the serial lines have, in words."""
     encoders: tuple[int, ...] = ()
     """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
+    recording: Recording = Recording()

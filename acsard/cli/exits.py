@@ -9,6 +9,7 @@ from acsard.host.errors import (
     NoAnswerError,
     NoPortError,
     NotPermittedError,
+    RecordingError,
     ReplyError,
     RouterFileError,
     UnreachableError,
@@ -18,6 +19,7 @@ from acsard.host.exits import Exit, ExitError
 
 CODES: dict[type[MendableError], Exit] = {
     ReplyError: Exit.FAILURE,
+    RecordingError: Exit.FAILURE,
     UsageError: Exit.USAGE,
     NoPortError: Exit.NO_PORT,
     UnreachableError: Exit.UNREACHABLE,

@@ -39,6 +39,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
     )
     parser.add_argument(
+        "--record",
+        metavar="DIRECTORY",
+        help="record all that comes in and the lines that leave there (record.directory); "
+        "`acsard log` reads it",
+    )
+    parser.add_argument(
         "--no-door",
         action="store_true",
         help="start no `acsard door` for the tls/ endpoints: it runs by itself, as a service",
@@ -53,6 +59,7 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("mcu", "port", args.port),
         ("mcu", "baud_rate", args.baud_rate),
         ("robot", "id", args.id),
+        ("record", "directory", args.record),
         ("bus", "listen", [args.listen] if args.listen else None),
     ):
         if value is not None:

@@ -47,6 +47,7 @@ from acsard.values import (
     GyroStatus,
     Instant,
     Outputs,
+    Recording,
     Snapshot,
     WheelsStatus,
 )
@@ -216,6 +217,7 @@ class Report:
             gyro=snapshot.gyro.does,
             encoders=list(snapshot.encoders),
             doubt=snapshot.doubt.text,
+            recording=snapshot.recording.trouble,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -277,6 +279,7 @@ class Report:
             ),
             ("wheels", *_wheels(snapshot.doubt, counters)),
             *self._gyro(snapshot.gyro),
+            *_recording(snapshot.recording),
             *([("certificate", *certificate, {})] if certificate[1] else []),
         )
         return DiagnosticArray(
@@ -311,6 +314,14 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> tuple[int, str, di
     }
     told = {k: str(v) for k, v in counters.items() if k.startswith("wheels")}
     return int(bool(doubt.text)), doubt.text or "front and rear agree", values | told
+
+
+def _recording(recording: Recording) -> list[tuple[str, int, str, dict[str, str]]]:
+    """The row of the black box, none without one."""
+    if not recording.where:
+        return []
+    missing = {"steps_missing": str(recording.missing)}
+    return [("recording", int(bool(recording.trouble)), recording.trouble or "on", missing)]
 
 
 def _spread(spread: Measurements) -> Spread:

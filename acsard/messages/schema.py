@@ -220,6 +220,8 @@ class RobotState(Message, frozen=True):
     """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
     doubt: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
+    recording: str = ""
+    """Why nothing is recorded just now, though it is asked for, in words; empty else."""
 
 
 class DoorState(Message, frozen=True):

@@ -6,6 +6,7 @@ Synchronous on purpose: the daemon calls `step` from one task, the tests call it
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 from msgspec.structs import replace
 
@@ -37,6 +38,7 @@ from acsard.values import (
     Inputs,
     Instant,
     Outputs,
+    Recording,
     Refusal,
     Request,
     Snapshot,
@@ -50,6 +52,19 @@ QUERIES_PER_STEP = 8
 
 
 BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
+
+
+class BlackBox(Protocol):
+    """What records every step, and never waits."""
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+
+    @property
+    def status(self) -> Recording:
+        """How it does."""
 
 
 class ControlLoop:
@@ -67,10 +82,12 @@ class ControlLoop:
         certificate_ends_ns: int | None = None,
         others: list[Event] | None = None,
         beside: Callable[[str], Message | None] | None = None,
+        recorder: BlackBox | None = None,
     ) -> None:
         """`others` are the events of the daemon's other parts; each step takes what is there.
 
-        `beside` has the present values of the keys that those parts publish.
+        `beside` has the present values of the keys that those parts publish; `recorder` is the
+        black box, that hears of every step.
         """
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
@@ -80,6 +97,7 @@ class ControlLoop:
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
         self._beside = beside
+        self._recorder = recorder
         stop = self.robot.session.codec.stop
         self._guard = Guard(
             stop,
@@ -153,6 +171,9 @@ class ControlLoop:
         self._turn_rates.clear()
         outputs = self.outputs = self.robot.step(inputs)
         went = self._send(outputs, now, inputs.tick)
+        if self._recorder is not None:
+            left = self._last if went else None
+            self._recorder.step(inputs, outputs, left, self.robot, self._last)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -261,4 +282,6 @@ class ControlLoop:
     def _look(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
-        return replace(self.robot.snapshot(now_ns), figures=self._stopwatch.measured(now_ns))
+        shot = self.robot.snapshot(now_ns)
+        recording = Recording() if self._recorder is None else self._recorder.status
+        return replace(shot, figures=self._stopwatch.measured(now_ns), recording=recording)

@@ -26,6 +26,7 @@ from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.messages.topics import offered, published
+from acsard.record.recorder import Recorder
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
@@ -84,6 +85,11 @@ async def _run(
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
+        events: list[Event] = []
+        recorder = None
+        if config.record.directory:
+            recorder = Recorder(config, events.append)
+            stack.callback(recorder.close)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
         path = config.mcu.port if simulated is None else simulated.path
         sources = tuple(source.name for source in config.commands.sources)
@@ -98,7 +104,6 @@ async def _run(
             offered(config),
             published(config),
         )
-        events: list[Event] = []
         period_ns = int(NS_PER_S / config.rate_hz)
         port = SerialPort(
             path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, events.append
@@ -114,7 +119,17 @@ async def _run(
         await stack.enter_async_context(port)
         info = _info(config, path)
         control = ControlLoop(
-            config, info, port, bus, clock.now(), log.event, clock.mono_ns, ends_ns, events, beside
+            config,
+            info,
+            port,
+            bus,
+            clock.now(),
+            log.event,
+            clock.mono_ns,
+            ends_ns,
+            events,
+            beside,
+            recorder,
         )
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)

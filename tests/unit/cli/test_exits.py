@@ -13,6 +13,7 @@ from acsard.host.exits import Exit, ExitError
 PROMISED = [
     (errors.UsageError, ValueError, 2),
     (errors.ReplyError, RuntimeError, 1),
+    (errors.RecordingError, ValueError, 1),
     (errors.NoPortError, FileNotFoundError, 66),
     (errors.UnreachableError, ConnectionError, 69),
     (errors.NoAnswerError, TimeoutError, 69),
