@@ -1,15 +1,17 @@
 """Whole numbers of one kind -> bytes that compress well, and back.
 
-Each is told by its difference from the median, small ones as small numbers whatever their sign;
-then all lowest bytes come first, and all next ones: what is noise and what is zero lie apart.
+Each is told by its difference from the median, in units of what divides all of them, small ones as
+small numbers whatever their sign; then all lowest bytes come first, and all next ones: what is
+noise and what is zero lie apart.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 
-_HEAD = struct.Struct("<qB")
+_HEAD = struct.Struct("<qqB")
 
 
 def pack(values: Sequence[int]) -> bytes:
@@ -17,10 +19,12 @@ def pack(values: Sequence[int]) -> bytes:
     if not values:
         return b""
     base = sorted(values)[len(values) // 2]
-    folded = [(v - base) << 1 if v >= base else ~((v - base) << 1) for v in values]
+    unit = math.gcd(*[v - base for v in values]) or 1
+    steps = [(v - base) // unit for v in values]
+    folded = [step << 1 if step >= 0 else ~(step << 1) for step in steps]
     width = (max(folded).bit_length() + 7) // 8
     data = struct.pack(f"<{len(folded)}Q", *folded)
-    return _HEAD.pack(base, width) + b"".join([data[n::8] for n in range(width)])
+    return _HEAD.pack(base, unit, width) + b"".join([data[n::8] for n in range(width)])
 
 
 def unpack(data: bytes, count: int) -> list[int]:
@@ -29,7 +33,7 @@ def unpack(data: bytes, count: int) -> list[int]:
         return []
     if len(data) < _HEAD.size:
         raise ValueError("a column without its head")
-    base, width = _HEAD.unpack_from(data)
+    base, unit, width = _HEAD.unpack_from(data)
     if width > 8 or len(data) != _HEAD.size + width * count:
         raise ValueError("a column of another length")
     planes = bytearray(8 * count)
@@ -37,4 +41,4 @@ def unpack(data: bytes, count: int) -> list[int]:
         start = _HEAD.size + n * count
         planes[n::8] = data[start : start + count]
     folded = struct.unpack(f"<{count}Q", planes)
-    return [base + (value >> 1 if value & 1 == 0 else ~(value >> 1)) for value in folded]
+    return [base + unit * (value >> 1 if value & 1 == 0 else ~(value >> 1)) for value in folded]

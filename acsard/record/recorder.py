@@ -152,8 +152,8 @@ class _Disk:
         self._writing: Writing | None = None
         self._start: _Start | None = _Start(0, b"")
         """What the next file begins with; None when steps before it are missing."""
-        self._before: Path | None = None
-        """The file before this one."""
+        self._recent: list[tuple[Path, int]] = []
+        """What ended less than a minute ago, and when; nothing has happened close to it yet."""
         self._number = self._began_ns = self._last_ns = 0
         self._happened_ns = -AROUND_NS
         self._keep = False
@@ -224,9 +224,10 @@ class _Disk:
         writing.add("events", now.wall_ns, msgspec.json.encode(told(event, now.wall_ns)))
         if event.name in HAPPENED:
             self._keep, self._happened_ns = True, now.mono_ns
-            if self._before is not None and now.mono_ns - self._began_ns < AROUND_NS:
-                ring.keep(self._before)
-                self._before = None
+            for path, ended_ns in self._recent:
+                if now.mono_ns - ended_ns < AROUND_NS:
+                    ring.keep(path)
+            self._recent.clear()
 
     def _flush(self, ring: Ring, over: bool) -> None:
         if self._writing is None:
@@ -243,7 +244,9 @@ class _Disk:
     def _finish(self, ring: Ring) -> None:
         writing, self._writing = self._writing, None
         if writing is not None:
-            self._before = ring.end(writing, self._keep)
+            path, last_ns = ring.end(writing, self._keep), self._last_ns
+            recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
+            self._recent = recent if self._keep else [*recent, (path, last_ns)]
 
     def _fail(self, error: OSError) -> None:
         text = f"{self.where}: {error.strerror or error}"
@@ -253,7 +256,7 @@ class _Disk:
         for open_one in (self._writing, self._ring):
             if open_one is not None:
                 open_one.close()
-        self._writing = self._ring = self._before = None
+        self._writing = self._ring = None
         self._pause = RETRY_ROUNDS
 
 

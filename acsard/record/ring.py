@@ -9,7 +9,9 @@ The number gives the order, whatever the clocks said. What is kept goes last.
 
 from __future__ import annotations
 
+import calendar
 import fcntl
+import math
 import os
 import time
 from pathlib import Path
@@ -32,6 +34,9 @@ FILES = 100
 
 S_PER_DAY = 86400
 
+STAMP = "%Y%m%dT%H%M%SZ"
+"""UTC, in the name of a file: when it began."""
+
 
 def listed(directory: Path) -> list[Path]:
     """The recordings in it, oldest first."""
@@ -42,6 +47,15 @@ def listed(directory: Path) -> list[Path]:
 def _number(path: Path) -> int | None:
     head, _, rest = path.name.partition("-")
     return int(head) if head.isdecimal() and rest.endswith((WHOLE, PART)) else None
+
+
+def _began_s(path: Path) -> float:
+    """Seconds since 1970 by its name; one without a time in it never gets old."""
+    stamp = path.name.partition("-")[2].partition(".")[0]
+    try:
+        return calendar.timegm(time.strptime(stamp, STAMP))
+    except ValueError:
+        return math.inf
 
 
 class Ring:
@@ -75,7 +89,7 @@ class Ring:
         """A new file, after the newest."""
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(about.wall_ns // 1_000_000_000))
+        stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
         writing = Writing(self._directory / f"{number:06}-{stamp}{PART}", about)
         self._sync()
         return writing
@@ -100,17 +114,17 @@ class Ring:
         ended = [path for path in listed(self._directory) if not path.name.endswith(PART)]
         kept = [path for path in ended if path.name.endswith(KEPT)]
         plain = [path for path in ended if not path.name.endswith(KEPT)]
-        sizes = {path: path.stat() for path in ended}
+        sizes = {path: path.stat().st_size for path in ended}
         oldest_s = wall_ns / 1e9 - self._days * S_PER_DAY
-        gone = [path for path in plain if sizes[path].st_mtime < oldest_s]
+        gone = [path for path in plain if _began_s(path) < oldest_s]
         gone += kept[: max(0, len(kept) - KEPT_FILES)]
-        room = self._bytes - self.file_bytes - sum(sizes[p].st_size for p in ended if p not in gone)
+        room = self._bytes - self.file_bytes - sum(sizes[p] for p in ended if p not in gone)
         for path in plain + kept:
             if room >= 0:
                 break
             if path not in gone:
                 gone.append(path)
-                room += sizes[path].st_size
+                room += sizes[path]
         for path in gone:
             path.unlink(missing_ok=True)
 

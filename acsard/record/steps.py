@@ -100,29 +100,40 @@ class _Rare(Struct, frozen=True, omit_defaults=True):
 _NOTHING = _Rare()
 
 
+class _Shape(NamedTuple):
+    """What one step has as many others have it."""
+
+    flags: int
+    reads: int
+    poses: int
+    line: int
+    """Bytes."""
+
+
 class _Batch(Struct, frozen=True, array_like=True):
     first: int
-    count: int
     mono_ns: int
     offset_ns: int
     """The two clocks at the first instant: what the columns are differences from."""
-    flags: bytes
+    shapes: tuple[_Shape, ...]
+    """The kinds of steps there are, few of them."""
+    count: int
+    kinds: bytes
+    """Which of the shapes each step has."""
     ticks: bytes
     """ns from the tick before (the first: from `mono_ns`) to each tick."""
     others: bytes
     """ns from the step before to each step that is none."""
     offsets: bytes
     """How the wall clock went against the other from instant to instant: reads, then the step."""
-    reads: bytes
-    """How many reads of the port each step had; of each its age in ns and its bytes."""
     ages: bytes
+    """ns of each read of the port, at its step; then how long it is, and all its bytes."""
     lengths: bytes
     received: bytes
-    lines: bytes
     written: bytes
-    poses: bytes
-    """How many each step had; then their differences."""
+    """All lines."""
     xs: bytes
+    """From pose to pose."""
     ys: bytes
     yaws: bytes
     checksum: int
@@ -162,28 +173,28 @@ def _micro(estimate: Estimate) -> Micropose:
 def encode(first: int, taken: Sequence[Taken]) -> bytes:
     """The bytes of these steps, the first of them number `first`; at least one."""
     start = _first_instant(taken[0].inputs)
+    offset_ns = start.wall_ns - start.mono_ns
     estimates = [e for t in taken for e in t.outputs.estimates]
     poses = [_micro(e) for e in estimates]
     reads = [(t.inputs.now, read) for t in taken for read in t.inputs.received]
-    lines = [t.outputs.line or b"" for t in taken]
+    shapes: dict[_Shape, int] = {}
+    kinds = [shapes.setdefault(_shape(t), len(shapes)) for t in taken]
     ticks, others = _instants(taken, start.mono_ns)
     return msgspec.msgpack.encode(
         _Batch(
             first=first,
-            count=len(taken),
             mono_ns=start.mono_ns,
-            offset_ns=start.wall_ns - start.mono_ns,
-            flags=bytes([_flags(t) for t in taken]),
+            offset_ns=offset_ns,
+            shapes=tuple(shapes),
+            count=len(taken),
+            kinds=pack(kinds),
             ticks=pack(ticks),
             others=pack(others),
-            offsets=pack(_offsets(taken, start.wall_ns - start.mono_ns)),
-            reads=pack([len(t.inputs.received) for t in taken]),
+            offsets=pack(_offsets(taken, offset_ns)),
             ages=pack([now.mono_ns - read.at.mono_ns for now, read in reads]),
             lengths=pack([len(read.data) for _, read in reads]),
             received=b"".join([read.data for _, read in reads]),
-            lines=pack([len(line) for line in lines]),
-            written=b"".join(lines),
-            poses=pack([len(t.outputs.estimates) for t in taken]),
+            written=b"".join([t.outputs.line or b"" for t in taken]),
             xs=_differences([pose[0] for pose in poses]),
             ys=_differences([pose[1] for pose in poses]),
             yaws=_differences([pose[2] for pose in poses]),
@@ -197,17 +208,18 @@ def _first_instant(inputs: Inputs) -> Instant:
     return inputs.received[0].at if inputs.received else inputs.now
 
 
-def _flags(taken: Taken) -> int:
-    inputs = taken.inputs
-    return (
+def _shape(taken: Taken) -> _Shape:
+    inputs, line = taken.inputs, taken.outputs.line
+    flags = (
         TICK * inputs.tick
         | OPEN * inputs.port_open
         | AT_ONCE * inputs.at_once
         | LEAVING * inputs.leaving
         | SUPERSEDED * inputs.superseded
-        | LINE * (taken.outputs.line is not None)
+        | LINE * (line is not None)
         | LEFT * (taken.left is not None)
     )
+    return _Shape(flags, len(inputs.received), len(taken.outputs.estimates), len(line or b""))
 
 
 def _instants(taken: Sequence[Taken], start_ns: int) -> tuple[list[int], list[int]]:
@@ -276,27 +288,27 @@ def decode(data: bytes) -> list[Step]:
 
 
 def _steps(batch: _Batch) -> Iterator[Step]:
-    if len(batch.flags) != batch.count:
-        raise ValueError("flags for another number of steps")
-    reads, nows = _reads(batch), iter(_nows(batch))
-    lines = _cut(batch.written, unpack(batch.lines, batch.count))
-    poses = _poses(batch)
+    shapes = _shapes(batch)
+    instants = _instants_of(batch, shapes)
+    data = _cut(batch.received, unpack(batch.lengths, sum(shape.reads for shape in shapes)))
+    lines = _cut(batch.written, [shape.line for shape in shapes])
+    poses = _poses(batch, shapes)
     rares = dict(batch.rare)
     opened, trouble, status = 0, "", ("", "", "", "")
-    for index, flags in enumerate(batch.flags):
-        rare = rares.get(index, _NOTHING)
+    for index, (shape, (ats, now)) in enumerate(zip(shapes, instants, strict=True)):
+        flags, rare = shape.flags, rares.get(index, _NOTHING)
         opened = opened if rare.opened is None else rare.opened
         trouble = trouble if rare.trouble is None else rare.trouble
         status = status if rare.status is None else rare.status
         line = next(lines)
         inputs = Inputs(
-            now=next(nows),
+            now=now,
             tick=bool(flags & TICK),
             at_once=bool(flags & AT_ONCE),
             port_open=bool(flags & OPEN),
             opened=opened,
             port_trouble=trouble,
-            received=next(reads),
+            received=tuple([Received(at, next(data)) for at in ats]),
             commands=rare.commands,
             requests=rare.requests,
             refusals=rare.refusals,
@@ -311,55 +323,47 @@ def _steps(batch: _Batch) -> Iterator[Step]:
             line=line if flags & LINE else None,
             left=(rare.left or line) if flags & LEFT else None,
             status=status,
-            poses=next(poses),
+            poses=tuple([next(poses) for _ in range(shape.poses)]),
             events=rare.told,
             checksum=batch.checksum if index == batch.count - 1 else None,
         )
         yield Step(batch.first + index, inputs, said, begins=index == 0)
 
 
-def _counts(data: bytes, count: int) -> list[int]:
-    counts = unpack(data, count)
-    if min(counts, default=0) < 0 or sum(counts) > 1 << 24:
-        raise ValueError("no such number")
-    return counts
+def _shapes(batch: _Batch) -> list[_Shape]:
+    """Of every step."""
+    if min([n for shape in batch.shapes for n in shape], default=0) < 0:
+        raise ValueError("a number below 0")
+    kinds = unpack(batch.kinds, batch.count)
+    if min(kinds, default=0) < 0:
+        raise ValueError("no such kind of step")
+    return [batch.shapes[kind] for kind in kinds]
 
 
-def _step_times(batch: _Batch) -> Iterator[int]:
-    ticks = sum(1 for flags in batch.flags if flags & TICK)
+def _times(batch: _Batch, shapes: list[_Shape]) -> Iterator[int]:
+    ticks = sum(1 for shape in shapes if shape.flags & TICK)
     tick_deltas = iter(unpack(batch.ticks, ticks))
     deltas = iter(unpack(batch.others, batch.count - ticks))
     last = last_tick = batch.mono_ns
-    for flags in batch.flags:
-        if flags & TICK:
+    for shape in shapes:
+        if shape.flags & TICK:
             last = last_tick = last_tick + next(tick_deltas)
         else:
             last += next(deltas)
         yield last
 
 
-def _instants_of(batch: _Batch) -> Iterator[tuple[list[Instant], Instant]]:
+def _instants_of(batch: _Batch, shapes: list[_Shape]) -> Iterator[tuple[list[Instant], Instant]]:
     """Of each step: when its reads were, and it itself."""
-    counts = _counts(batch.reads, batch.count)
-    ages = iter(unpack(batch.ages, sum(counts)))
-    deltas = unpack(batch.offsets, sum(counts) + batch.count)
+    reads = sum(shape.reads for shape in shapes)
+    ages = iter(unpack(batch.ages, reads))
+    deltas = unpack(batch.offsets, reads + batch.count)
     offsets = accumulate(deltas, initial=batch.offset_ns)
     next(offsets)
-    for now_ns, count in zip(_step_times(batch), counts, strict=True):
-        at = [now_ns - next(ages) for _ in range(count)]
-        instants = [Instant(ns, ns + next(offsets)) for ns in (*at, now_ns)]
+    for now_ns, shape in zip(_times(batch, shapes), shapes, strict=True):
+        times = [now_ns - next(ages) for _ in range(shape.reads)]
+        instants = [Instant(ns, ns + next(offsets)) for ns in (*times, now_ns)]
         yield instants[:-1], instants[-1]
-
-
-def _nows(batch: _Batch) -> list[Instant]:
-    return [now for _, now in _instants_of(batch)]
-
-
-def _reads(batch: _Batch) -> Iterator[tuple[Received, ...]]:
-    total = sum(_counts(batch.reads, batch.count))
-    data = _cut(batch.received, unpack(batch.lengths, total))
-    for ats, _ in _instants_of(batch):
-        yield tuple([Received(at, next(data)) for at in ats])
 
 
 def _cut(data: bytes, lengths: list[int]) -> Iterator[bytes]:
@@ -371,12 +375,10 @@ def _cut(data: bytes, lengths: list[int]) -> Iterator[bytes]:
         at += length
 
 
-def _poses(batch: _Batch) -> Iterator[tuple[Micropose, ...]]:
-    counts = _counts(batch.poses, batch.count)
-    columns = [accumulate(unpack(c, sum(counts))) for c in (batch.xs, batch.ys, batch.yaws)]
-    every = zip(*columns, strict=True)
-    for count in counts:
-        yield tuple([_three(*next(every)) for _ in range(count)])
+def _poses(batch: _Batch, shapes: list[_Shape]) -> Iterator[Micropose]:
+    count = sum(shape.poses for shape in shapes)
+    columns = [accumulate(unpack(column, count)) for column in (batch.xs, batch.ys, batch.yaws)]
+    return (_three(*pose) for pose in zip(*columns, strict=True))
 
 
 def _three(x: int, y: int, yaw: int) -> Micropose:
