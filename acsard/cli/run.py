@@ -6,6 +6,8 @@ import argparse
 import os
 import sys
 
+from msgspec.structs import replace
+
 from acsard.cli.common import Overrides, add_config, load
 from acsard.config.settings import Config
 
@@ -67,6 +69,13 @@ def overrides(args: argparse.Namespace) -> Overrides:
     return given
 
 
+def recorded(config: Config) -> Config:
+    """Where nothing else says where to record, the environment does: the service's unit."""
+    if config.record.directory or "ACSARD_RECORD" not in os.environ:
+        return config
+    return replace(config, record=replace(config.record, directory=os.environ["ACSARD_RECORD"]))
+
+
 def main(args: argparse.Namespace) -> int:
     """Run until a signal."""
     import asyncio
@@ -79,6 +88,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.values import Event
 
     where, config = load(args.config, overrides(args))
+    config = recorded(config)
     log, screen = Log(config.log), Writer(sys.stdout)
 
     def announce(device: str, trouble: str) -> None:

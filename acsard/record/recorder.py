@@ -164,7 +164,7 @@ class _Disk:
         written = 0
         try:
             if self._pause == 0 or over:
-                ring = self._ring = self._ring or Ring(self._config.record)
+                ring = self._ring = self._ring or Ring(self._config.record, not self.trouble)
                 for start, steps in _runs(items):
                     self._write(ring, start, steps)
                     written += len(steps)
@@ -230,11 +230,10 @@ class _Disk:
             self._recent.clear()
 
     def _flush(self, ring: Ring, over: bool) -> None:
-        if self._writing is None:
-            return
         if over:
             self._finish(ring)
             ring.close()
+        if self._writing is None:
             return
         self._writing.flush()
         long = self._last_ns - self._began_ns > LONGEST_NS

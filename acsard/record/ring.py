@@ -61,8 +61,8 @@ def _began_s(path: Path) -> float:
 class Ring:
     """Makes room, begins and ends files. Everything may raise `OSError`."""
 
-    def __init__(self, settings: RecordConfig) -> None:
-        """Take the directory, make whole what a crash has cut, and make room."""
+    def __init__(self, settings: RecordConfig, crashed: bool = True) -> None:
+        """Take the directory, and make whole what was cut: by a crash, or by a disk of late."""
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self.file_bytes = self._bytes // FILES
@@ -76,7 +76,7 @@ class Ring:
         try:
             for path in listed(self._directory):
                 if path.name.endswith(PART):
-                    _recover(path)
+                    _recover(path, KEPT if crashed else WHOLE)
         except OSError:
             self.close()
             raise
@@ -137,9 +137,9 @@ class Ring:
             os.close(handle)
 
 
-def _recover(path: Path) -> None:
+def _recover(path: Path, ending: str) -> None:
     """A finished file of what is whole of one that was cut; one without anything goes."""
-    whole = path.with_name(path.name.removesuffix(PART) + KEPT)
+    whole = path.with_name(path.name.removesuffix(PART) + ending)
     written = path.with_name(f".{path.name}.new")
     written.unlink(missing_ok=True)
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main
+from acsard.cli.log import SERVICE
 from acsard.config.settings import Config
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -137,3 +138,11 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "x").write_bytes(b"x")
     assert main(["log", "replay", str(tmp_path / "x")]) == 1
     assert "no recording of acsard" in capsys.readouterr().err
+
+
+def test_it_looks_where_the_service_records() -> None:
+    unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
+    says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
+    state = Path("/var/lib") / says["StateDirectory"]
+    assert says["Environment"] == f"ACSARD_RECORD=%S/{says['StateDirectory']}/record"
+    assert state / "record" == SERVICE

@@ -187,3 +187,25 @@ def test_the_loop_only_appends(bench: Bench) -> None:
     last = bench.recorder._queue[-1]
     assert last == (inputs, outputs, left)
     assert last[0] is inputs
+
+
+def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tls = tmp_path / "tls"
+    tls.mkdir()
+    for name in ("key.pem", "cert.pem", "ca.pem"):
+        (tls / name).write_text("-----BEGIN SECRET-----")
+    monkeypatch.setenv("ACSARD_SECRET", "BEGIN SECRET")
+    bench = Bench(tmp_path / "record", monkeypatch)
+    bench.end()
+    settings = config(tmp_path / "record")
+    settings = replace(settings, bus=replace(settings.bus, tls=str(tls), connect=("tls/r:7449",)))
+    recorder = Recorder(settings, bench.said.append)
+    world = World(settings, recorder=recorder)
+    world.put("cmd/app", b'{"password": "BEGIN SECRET"}')
+    world.drive(0.5, seconds=1.0)
+    recorder.close()
+    recording = Recording(listed(tmp_path / "record")[-1])
+    assert str(tls) in recording.about.config
+    read = [recording.about.config.encode(), *[data for _, _, data in recording.messages()]]
+    assert len(read) > 5
+    assert not any(b"BEGIN" in data for data in read)

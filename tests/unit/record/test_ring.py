@@ -125,6 +125,17 @@ def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
     again.close()
 
 
+def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, b"whole")
+    writing.flush()
+    writing.close()
+    one.close()
+    Ring(RecordConfig(str(tmp_path)), crashed=False)
+    assert [path.name for path in listed(tmp_path)] == [writing.path.name.removesuffix(".part")]
+
+
 def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())
