@@ -52,7 +52,7 @@ FIELDS = {
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
-        "encoders", "doubt",
+        "encoders", "doubt", "recording",
     },
     "diagnostics": {"header", "status"},
     "sim/pose": {"header", "pose"},
