@@ -32,6 +32,7 @@ PURE_AMONG_SHELLS = (
     "bench.record",
     "door.watch",
     "host.silence",
+    "record.batch",
     "record.columns",
     "record.merge",
     "record.replay",

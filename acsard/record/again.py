@@ -8,11 +8,12 @@ from typing import NamedTuple
 from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
+from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
 from acsard.record.replay import Difference, Replay, Seen, Tally
 from acsard.record.state import State, StateError, thaw
-from acsard.record.steps import MICRO, BatchError, Step, decode
+from acsard.record.steps import MICRO, Step
 from acsard.robot import Robot
 
 HUNDREDTHS = 100.0
@@ -50,8 +51,8 @@ def live(recording: Recording, other: Config | None = None) -> Lived:
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
     config = config_of(recording)
     state = _state(recording)
-    if state is not None and other is not None:
-        adopt(state.robot, Robot(config), Robot(other))
+    if state is not None:  # by newer code, its parts may have what it knows nothing of
+        adopt(state.robot, Robot(config), Robot(other or config))
     replay = Replay(other or config, *(state or ()))
     number: int | None = None
     for step in steps(recording):

@@ -13,6 +13,9 @@ from collections.abc import Sequence
 
 _HEAD = struct.Struct("<qqB")
 
+MOST = 1 << 24
+"""Numbers in a column: equal ones take no room, so a damaged count could ask for any."""
+
 
 def pack(values: Sequence[int]) -> bytes:
     """The bytes of `values`, each of at most 62 bits; their count has to be told elsewhere."""
@@ -31,8 +34,8 @@ def unpack(data: bytes, count: int) -> list[int]:
     """The `count` numbers again; raises `ValueError` when they do not fit."""
     if not count:
         return []
-    if len(data) < _HEAD.size:
-        raise ValueError("a column without its head")
+    if count > MOST or len(data) < _HEAD.size:
+        raise ValueError("a column without its head, or of too many numbers")
     base, unit, width = _HEAD.unpack_from(data)
     if width > 8 or len(data) != _HEAD.size + width * count:
         raise ValueError("a column of another length")

@@ -1,6 +1,6 @@
 """One recording as an MCAP file: written chunk by chunk, read whatever became of it.
 
-Three channels: `steps` (the batches of `steps.py`), `events` (JSON, one each), `state` (a robot as
+Three channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
 `state.py` writes it, first of all where the file does not begin with the daemon). A metadata
 record says whose it is, an attachment is its `acsard.toml`. A file that was cut has no end: what is
 whole of it is read all the same, and `rewrite` makes a finished file of it.
@@ -70,6 +70,13 @@ class Writing:
     def __init__(self, path: Path, about: About) -> None:
         self.path = path
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE), "wb")
+        try:
+            self._open(about)
+        except OSError:
+            self.close()
+            raise
+
+    def _open(self, about: About) -> None:
         os.fchmod(self._file.fileno(), MODE)  # whatever the umask takes away
         self._writer = Writer(
             self._file, CHUNK_BYTES, index_types=IndexType.ALL ^ IndexType.MESSAGE

@@ -20,10 +20,11 @@ from acsard import __version__
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
+from acsard.record.batch import encode
 from acsard.record.file import About, Writing
 from acsard.record.ring import Ring
 from acsard.record.state import freeze
-from acsard.record.steps import Taken, encode
+from acsard.record.steps import Taken
 from acsard.record.story import told
 from acsard.robot import Robot
 from acsard.values import NS_PER_S, Event, Inputs, Outputs, Recording
@@ -110,6 +111,8 @@ class Recorder:
     def status(self) -> Recording:
         """How it goes, for `state` and `diagnostics`."""
         trouble = "the disk is too slow" if self._full else self._disk.trouble
+        if not self._thread.is_alive():
+            trouble = "the recorder has ended by a fault of its own; the log has it"
         return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
 
     def close(self) -> None:
@@ -156,7 +159,7 @@ class _Disk:
         """What ended less than a minute ago, and when; nothing has happened close to it yet."""
         self._number = self._began_ns = self._last_ns = 0
         self._happened_ns = -AROUND_NS
-        self._keep = False
+        self._keep = self._told = False
         self._pause = 0
 
     def round(self, items: list[Taken | _Start], over: bool) -> None:
@@ -215,9 +218,6 @@ class _Disk:
         self._keep = now.mono_ns - self._happened_ns < AROUND_NS
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)
-        if start.number == 0 or self.trouble:
-            self.trouble = ""
-            self._say(Event("recording", f"to {self._writing.path.parent}"))
 
     def _event(self, ring: Ring, writing: Writing, event: Event, outputs: Outputs) -> None:
         now = outputs.now
@@ -236,6 +236,9 @@ class _Disk:
         if self._writing is None:
             return
         self._writing.flush()
+        if self.trouble or not self._told:
+            self.trouble, self._told = "", True
+            self._say(Event("recording", f"to {self.where}"))
         long = self._last_ns - self._began_ns > LONGEST_NS
         if long or self._writing.size > ring.file_bytes:
             self._ask()

@@ -11,10 +11,11 @@ import msgspec
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
+from acsard.record.batch import decode, encode
 from acsard.record.file import About, Writing
 from acsard.record.replay import Replay
 from acsard.record.state import freeze, thaw
-from acsard.record.steps import Step, Taken, decode, encode
+from acsard.record.steps import Step, Taken
 from acsard.record.story import told
 from acsard.robot import Robot
 from acsard.sim.fake_mcu import FakeMcu

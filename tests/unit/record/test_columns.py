@@ -36,3 +36,5 @@ def test_a_column_of_another_length_is_refused(values: list[int], more: int) -> 
         unpack(data + b"\x00", len(values))
     with pytest.raises(ValueError, match="column"):
         unpack(data[:5], len(values))
+    with pytest.raises(ValueError, match="column"):
+        unpack(pack([7] * 200), 1 << 60)

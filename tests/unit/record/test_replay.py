@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from acsard.config.settings import Config
+from acsard.record.batch import decode, encode
 from acsard.record.replay import Replay
-from acsard.record.steps import decode, encode
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 

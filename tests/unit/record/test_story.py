@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.record.steps import decode, encode
+from acsard.record.batch import decode, encode
 from acsard.record.story import Story, Told, summary
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
