@@ -13,7 +13,7 @@ from acsard.cli.common import load
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.record.file import Recording
+    from acsard.record.file import Closing, Recording
     from acsard.record.story import Told
 
 SERVICE = Path("/var/lib/acsard/record")
@@ -70,22 +70,31 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
     from acsard.host.errors import RecordingError
-    from acsard.record.file import Recording
+    from acsard.record.file import Recording, closing
 
     where, files = _files(args)
     if not files:
         print(f"no recordings in {where}")
     for path in files:
         try:
-            print(_row(Recording(path)))
+            last = closing(path)
+            print(_row(path, last) if last else _row_of_all(Recording(path)))
         except RecordingError as error:
             print(f"{path.name}  {error}")
     return int(Exit.OK)
 
 
-def _row(recording: Recording) -> str:
+def _row(path: Path, last: Closing) -> str:
+    began = _clock(last.wall_ns / 1e9, day=True)
+    seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
+    return f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}".rstrip()
+
+
+def _row_of_all(recording: Recording) -> str:
+    """Of one without an end: all of it has to be read."""
     import msgspec
 
+    from acsard.record.file import Closing
     from acsard.record.story import Told, summary
 
     events: list[Told] = []
@@ -94,11 +103,8 @@ def _row(recording: Recording) -> str:
         last = max(last, wall_ns)
         if topic == "events":
             events.append(msgspec.json.decode(data, type=Told))
-    row = (
-        f"{recording.path.name}  {_clock(first / 1e9, day=True)}  {(last - first) / 1e9:6.0f} s  "
-        f"{recording.path.stat().st_size / 1000:7.0f} kB  {summary(events)}"
-    )
-    return f"{row.rstrip()}{_state(recording)}"
+    row = _row(recording.path, Closing(first, last, summary(events)))
+    return row + _state(recording)
 
 
 def _state(recording: Recording) -> str:

@@ -18,13 +18,15 @@ from typing import Literal
 import msgspec
 import zstandard
 from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import IndexType, Writer
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
-from acsard.record.story import Told
+from acsard.record.story import NEWS, Told, summary
+from acsard.values import NS_PER_S
 
 CHUNK_BYTES = 32 * 1024
 """Uncompressed; what is not flushed before is written then."""
@@ -44,7 +46,7 @@ CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
 """In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
 
 DAMAGE = (
-    McapError, struct.error, ValueError, OverflowError, EOFError, zstandard.ZstdError, MemoryError,
+    McapError, msgspec.MsgspecError, struct.error, ValueError, OverflowError, EOFError, zstandard.ZstdError, MemoryError,
 )  # fmt: skip
 """All that the library raises for bytes that are no MCAP."""
 
@@ -64,11 +66,24 @@ class About(Struct, frozen=True):
     format: str = FORMAT
 
 
+class Closing(Struct, frozen=True):
+    """What a finished file says of itself at its end, so that a list need not read all of it."""
+
+    wall_ns: int
+    """When it began."""
+    last_ns: int
+    """When its last message begins."""
+    said: str
+    """What happened, in a few words."""
+
+
 class Writing:
     """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
 
     def __init__(self, path: Path, about: About) -> None:
         self.path = path
+        self._about, self._last_ns = about, about.wall_ns
+        self._news: list[Told] = []
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE), "wb")
         try:
             self._open(about)
@@ -104,7 +119,15 @@ class Writing:
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
         """Write a message; it is in the file when its chunk is full, or by `flush`."""
+        self._last_ns = max(self._last_ns, wall_ns)
         self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
+
+    def event(self, told: Told) -> None:
+        """Write an event, and remember what a list says of it."""
+        wall_ns = int(told.seconds * NS_PER_S)
+        self.add("events", wall_ns, msgspec.json.encode(told))
+        if told.name in NEWS:
+            self._news.append(told)
 
     def flush(self) -> None:
         """What was added is a whole chunk, and on the disk."""
@@ -113,6 +136,9 @@ class Writing:
 
     def finish(self) -> None:
         """Write the end of the file and close it."""
+        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news))
+        fields = msgspec.to_builtins(last)
+        self._writer.add_metadata("acsard end", {key: str(value) for key, value in fields.items()})
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -184,7 +210,7 @@ class Recording:
             if config is None:
                 raise ValueError("its beginning is missing")
             about = msgspec.convert({**found, "config": config}, About, strict=False)
-        except ValueError as error:
+        except (ValueError, msgspec.ValidationError) as error:
             raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
         if about.format != FORMAT:
             raise RecordingError(
@@ -194,20 +220,37 @@ class Recording:
         return about
 
 
+def closing(path: Path) -> Closing | None:
+    """What the file says of itself at its end; None where it has none, or it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            for metadata in make_reader(stream).iter_metadata():
+                if metadata.name == "acsard end":
+                    return msgspec.convert(metadata.metadata, Closing, strict=False)
+    except (OSError, *DAMAGE):
+        pass  # who reads all of it will say what is wrong
+    return None
+
+
 def rewrite(recording: Recording, path: Path) -> int:
     """All that is whole of it as a new, finished file; the number of messages.
 
-    Raises `OSError` and leaves nothing behind where it cannot be written.
+    Raises `OSError`, and leaves nothing behind where it cannot be written.
     """
     writing = Writing(path, recording.about)
     try:
         count = 0
         for topic, wall_ns, data in recording.messages():
-            writing.add(topic, wall_ns, data)
+            if topic == "events":
+                writing.event(msgspec.json.decode(data, type=Told))
+            else:
+                writing.add(topic, wall_ns, data)
             count += 1
         writing.finish()
-    except OSError:
+    except (OSError, msgspec.MsgspecError) as error:
         writing.close()
         path.unlink()
-        raise
+        if isinstance(error, OSError):
+            raise
+        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None
     return count

@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
 from acsard import __version__
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
@@ -221,7 +219,7 @@ class _Disk:
 
     def _event(self, ring: Ring, writing: Writing, event: Event, outputs: Outputs) -> None:
         now = outputs.now
-        writing.add("events", now.wall_ns, msgspec.json.encode(told(event, now.wall_ns)))
+        writing.event(told(event, now.wall_ns))
         if event.name in HAPPENED:
             self._keep, self._happened_ns = True, now.mono_ns
             for path, ended_ns in self._recent:

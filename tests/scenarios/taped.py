@@ -6,8 +6,6 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
-
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
@@ -71,8 +69,7 @@ class Tape:
             writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
             for _, outputs, _ in batch:
                 for event in outputs.events:
-                    said = told(event, outputs.now.wall_ns)
-                    writing.add("events", outputs.now.wall_ns, msgspec.json.encode(said))
+                    writing.event(told(event, outputs.now.wall_ns))
             writing.flush()
         writing.finish()
 

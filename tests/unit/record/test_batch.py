@@ -30,6 +30,7 @@ from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 
 INSTANTS = st.builds(Instant, st.integers(0, 1 << 60), st.integers(0, 1 << 60))
+READS = st.builds(Received, INSTANTS, st.binary(max_size=9))
 TEXT = st.text(max_size=20)
 COMMANDS = st.builds(
     Command,
@@ -49,26 +50,26 @@ REQUESTS = st.builds(
     pose=st.none() | st.builds(Pose, st.floats(-9, 9)),
     by=TEXT,
 )
-PARTS: dict[str, st.SearchStrategy[object]] = dict(
-    now=INSTANTS,
-    tick=st.booleans(),
-    port_open=st.booleans(),
-    opened=st.integers(0, 3),
-    port_trouble=st.sampled_from(["", "gone"]),
-    received=st.lists(st.builds(Received, INSTANTS, st.binary(max_size=9)), max_size=3).map(tuple),
-    commands=st.lists(COMMANDS, max_size=2).map(tuple),
-    requests=st.lists(REQUESTS, max_size=2).map(tuple),
-    gyro=st.lists(
+PARTS: dict[str, st.SearchStrategy[object]] = {
+    "now": INSTANTS,
+    "tick": st.booleans(),
+    "port_open": st.booleans(),
+    "opened": st.integers(0, 3),
+    "port_trouble": st.sampled_from(["", "gone"]),
+    "received": st.lists(READS, max_size=3).map(tuple),
+    "commands": st.lists(COMMANDS, max_size=2).map(tuple),
+    "requests": st.lists(REQUESTS, max_size=2).map(tuple),
+    "gyro": st.lists(
         st.builds(GyroSample, st.integers(0, 1 << 60), st.none(), st.floats(-1, 1)), max_size=2
     ).map(tuple),
-    refusals=st.lists(st.builds(Refusal, TEXT, TEXT), max_size=2).map(tuple),
-    guard_trip=st.sampled_from(["", "a wheel grows"]),
-    superseded=st.booleans(),
-    missed=st.integers(0, 5),
-    events=st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
-    at_once=st.booleans(),
-    leaving=st.booleans(),
-)
+    "refusals": st.lists(st.builds(Refusal, TEXT, TEXT), max_size=2).map(tuple),
+    "guard_trip": st.sampled_from(["", "a wheel grows"]),
+    "superseded": st.booleans(),
+    "missed": st.integers(0, 5),
+    "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
+    "at_once": st.booleans(),
+    "leaving": st.booleans(),
+}
 INPUTS = st.builds(Inputs, **PARTS)
 
 

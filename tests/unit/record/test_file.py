@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record.again import config_of, live, steps
-from acsard.record.file import MODE, Recording, rewrite
+from acsard.record.file import MODE, Closing, Recording, closing, rewrite
 from tests.scenarios.taped import BATCH, Tape
 from tests.scenarios.world import World
 
@@ -163,3 +163,22 @@ def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_pat
     assert tally.steps == 2 * BATCH
     assert tally.same
     assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
+
+
+def test_a_finished_file_says_at_its_end_what_happened(
+    tape: Tape, whole: Path, tmp_path: Path
+) -> None:
+    first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
+    said = closing(whole)
+    assert said is not None
+    assert (said.wall_ns, said.said) == (
+        first.wall_ns,
+        "1 takeover, 1 stop (stopped by unnamed (native))",
+    )
+    assert 0 <= last.wall_ns - said.last_ns < 2e9
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    assert closing(cut) is None
+    rewrite(Recording(cut), new)
+    assert closing(new) == said == Closing(said.wall_ns, said.last_ns, said.said)
+    assert closing(tmp_path / "none") is None
