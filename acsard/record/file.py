@@ -46,7 +46,8 @@ CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
 """In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
 
 DAMAGE = (
-    McapError, msgspec.MsgspecError, struct.error, ValueError, OverflowError, EOFError, zstandard.ZstdError, MemoryError,
+    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
+    ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
 """All that the library raises for bytes that are no MCAP."""
 

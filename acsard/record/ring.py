@@ -66,7 +66,9 @@ class Ring:
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self.file_bytes = self._bytes // FILES
-        self._directory.mkdir(DIRECTORY_MODE, parents=True, exist_ok=True)
+        if not self._directory.is_dir():
+            self._directory.mkdir(parents=True)
+            self._directory.chmod(DIRECTORY_MODE)  # whatever the umask takes away
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -45,10 +45,16 @@ def test_files_are_numbered_on_whatever_the_clock_says(tmp_path: Path) -> None:
     assert record(again).name.startswith("000004")
 
 
-def test_the_directory_is_the_services_and_its_groups(tmp_path: Path) -> None:
-    ring(tmp_path / "a" / "b")
-    mode = (tmp_path / "a" / "b").stat().st_mode & 0o777
-    assert mode & ~DIRECTORY_MODE == 0
+@pytest.mark.parametrize("umask", [0, 0o077])
+def test_the_directory_is_the_services_and_its_groups(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        one = ring(tmp_path / "b")
+        path = record(one)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "b").stat().st_mode & 0o777 == DIRECTORY_MODE == 0o750
+    assert path.stat().st_mode & 0o777 == 0o640
 
 
 def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path: Path) -> None:
