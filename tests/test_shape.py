@@ -34,6 +34,7 @@ PURE_AMONG_SHELLS = (
     "host.silence",
     "record.batch",
     "record.columns",
+    "record.layout",
     "record.merge",
     "record.replay",
     "record.steps",

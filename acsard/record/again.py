@@ -39,12 +39,16 @@ def config_of(recording: Recording) -> Config:
 
 def steps(recording: Recording) -> Iterator[Step]:
     """Every step that can be read, in order; where some are missing their numbers say so."""
+    reason = ""
     for topic, _, data in recording.messages():
         if topic == "steps":
             try:
-                yield from decode(data)
+                batch = decode(data, reason)
             except BatchError:
                 recording.damaged += 1
+                continue
+            yield from batch
+            reason = batch[-1].said.status[1] if batch else reason
 
 
 def live(recording: Recording, other: Config | None = None) -> Lived:

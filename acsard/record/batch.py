@@ -1,118 +1,67 @@
 """Steps <-> bytes: a batch of at most a second, what is alike in them next to each other.
 
-What lives here: the shape of the bytes. All that is in a `Step` comes back exactly. What must not:
-files, threads, what a step means.
+The shape of the bytes is `layout.py`'s. All that is in a `Step` comes back exactly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
-from typing import NamedTuple
 
 import msgspec
-from msgspec import Struct
 
 from acsard.record.columns import pack, unpack
+from acsard.record.layout import (
+    AT_ONCE,
+    LEAVING,
+    LEFT,
+    LINE,
+    NOTHING,
+    OPEN,
+    SUPERSEDED,
+    TICK,
+    Batch,
+    Rare,
+    Shape,
+)
 from acsard.record.steps import Micropose, Said, Status, Step, Taken, checksum, micropose, status_of
 from acsard.values import (
     AcsardError,
-    Command,
-    Event,
-    GyroSample,
     Inputs,
     Instant,
     Received,
-    Refusal,
-    Request,
 )
 
-TICK, OPEN, AT_ONCE, LEAVING, SUPERSEDED, LINE, LEFT = (1 << n for n in range(7))
+SAME = "\x00"
+"""In place of a reason: as before."""
 
 
 class BatchError(AcsardError):
     """These bytes are no batch of steps."""
 
 
-class _Rare(Struct, frozen=True, omit_defaults=True):
-    """What most steps have not: absent is as in the step before, or nothing."""
-
-    opened: int | None = None
-    trouble: str | None = None
-    status: Status | None = None
-    left: bytes = b""
-    """What left in place of the line."""
-    missed: int = 0
-    guard_trip: str = ""
-    commands: tuple[Command, ...] = ()
-    requests: tuple[Request, ...] = ()
-    refusals: tuple[Refusal, ...] = ()
-    gyro: tuple[GyroSample, ...] = ()
-    heard: tuple[Event, ...] = ()
-    told: tuple[Event, ...] = ()
-
-
-_NOTHING = _Rare()
-
-
-class _Shape(NamedTuple):
-    """What one step has as many others have it."""
-
-    flags: int
-    reads: int
-    poses: int
-    line: int
-    """Bytes."""
-
-
-class _Batch(Struct, frozen=True, array_like=True):
-    first: int
-    mono_ns: int
-    offset_ns: int
-    """The two clocks at the first instant: what the columns are differences from."""
-    shapes: tuple[_Shape, ...]
-    """The kinds of steps there are, few of them."""
-    count: int
-    kinds: bytes
-    """Which of the shapes each step has."""
-    ticks: bytes
-    """ns from the tick before (the first: from `mono_ns`) to each tick."""
-    others: bytes
-    """ns from the step before to each step that is none."""
-    offsets: bytes
-    """How the wall clock went against the other from instant to instant: reads, then the step."""
-    ages: bytes
-    """ns of each read of the port, at its step; then how long it is, and all its bytes."""
-    lengths: bytes
-    received: bytes
-    written: bytes
-    """All lines."""
-    xs: bytes
-    """From pose to pose."""
-    ys: bytes
-    yaws: bytes
-    checksum: int
-    rare: tuple[tuple[int, _Rare], ...]
-
-
-_decoder = msgspec.msgpack.Decoder(_Batch)
+_decoder = msgspec.msgpack.Decoder(Batch)
 
 
 # encode
 
 
-def encode(first: int, taken: Sequence[Taken]) -> bytes:
-    """The bytes of these steps, the first of them number `first`; at least one."""
+def encode(first: int, taken: Sequence[Taken], reason: str | None = None) -> bytes:
+    """The bytes of these steps, the first of them number `first`; at least one.
+
+    `reason` is the last one of the batch before, where there is one in the same file: long words
+    that stay the same for hours.
+    """
     start = _first_instant(taken[0].inputs)
     offset_ns = start.wall_ns - start.mono_ns
     estimates = [e for t in taken for e in t.outputs.estimates]
     poses = [micropose(e) for e in estimates]
     reads = [(t.inputs.now, read) for t in taken for read in t.inputs.received]
-    shapes: dict[_Shape, int] = {}
+    shapes: dict[Shape, int] = {}
     kinds = [shapes.setdefault(_shape(t), len(shapes)) for t in taken]
     ticks, others = _instants(taken, start.mono_ns)
     return msgspec.msgpack.encode(
-        _Batch(
+        Batch(
             first=first,
             mono_ns=start.mono_ns,
             offset_ns=offset_ns,
@@ -130,7 +79,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
             ys=_differences([pose[1] for pose in poses]),
             yaws=_differences([pose[2] for pose in poses]),
             checksum=checksum(estimates, 0),
-            rare=tuple(_rare(taken)),
+            rare=tuple(_rare(taken, reason)),
         )
     )
 
@@ -139,7 +88,7 @@ def _first_instant(inputs: Inputs) -> Instant:
     return inputs.received[0].at if inputs.received else inputs.now
 
 
-def _shape(taken: Taken) -> _Shape:
+def _shape(taken: Taken) -> Shape:
     inputs, line = taken.inputs, taken.outputs.line
     flags = (
         TICK * inputs.tick
@@ -150,7 +99,7 @@ def _shape(taken: Taken) -> _Shape:
         | LINE * (line is not None)
         | LEFT * (taken.left is not None)
     )
-    return _Shape(flags, len(inputs.received), len(taken.outputs.estimates), len(line or b""))
+    return Shape(flags, len(inputs.received), len(taken.outputs.estimates), len(line or b""))
 
 
 def _instants(taken: Sequence[Taken], start_ns: int) -> tuple[list[int], list[int]]:
@@ -181,16 +130,16 @@ def _differences(values: list[int]) -> bytes:
     return pack([b - a for a, b in zip([0, *values], values, strict=False)])
 
 
-def _rare(taken: Sequence[Taken]) -> Iterator[tuple[int, _Rare]]:
+def _rare(taken: Sequence[Taken], reason: str | None) -> Iterator[tuple[int, Rare]]:
     opened: int | None = None
     trouble: str | None = None
     status: Status | None = None
     for index, (inputs, outputs, left) in enumerate(taken):
         now = status_of(outputs)
-        rare = _Rare(
+        rare = Rare(
             opened=inputs.opened if inputs.opened != opened else None,
             trouble=inputs.port_trouble if inputs.port_trouble != trouble else None,
-            status=now if now != status else None,
+            status=_brief(now, reason) if now != status else None,
             left=left if left is not None and left != outputs.line else b"",
             missed=inputs.missed,
             guard_trip=inputs.guard_trip,
@@ -201,24 +150,32 @@ def _rare(taken: Sequence[Taken]) -> Iterator[tuple[int, _Rare]]:
             heard=inputs.events,
             told=outputs.events,
         )
-        opened, trouble, status = inputs.opened, inputs.port_trouble, now
-        if rare != _NOTHING:
+        opened, trouble, status, reason = inputs.opened, inputs.port_trouble, now, now[1]
+        if rare != NOTHING:
             yield index, rare
+
+
+def _brief(status: Status, reason: str | None) -> Status:
+    mode, now, link, source = status
+    return mode, SAME if now == reason else now, link, source
 
 
 # decode
 
 
-def decode(data: bytes) -> list[Step]:
-    """The steps again; raises `BatchError` for bytes that are none."""
+def decode(data: bytes, reason: str = "") -> list[Step]:
+    """The steps again; raises `BatchError` for bytes that are none.
+
+    `reason` is the last one of the batch before.
+    """
     try:
         batch = _decoder.decode(data)
-        return list(_steps(batch))
+        return list(_steps(batch, reason))
     except (msgspec.DecodeError, ValueError, IndexError, StopIteration, RuntimeError) as error:
         raise BatchError(f"not a batch of steps: {error}") from None
 
 
-def _steps(batch: _Batch) -> Iterator[Step]:
+def _steps(batch: Batch, reason: str) -> Iterator[Step]:
     shapes = _shapes(batch)
     instants = _instants_of(batch, shapes)
     data = _cut(batch.received, unpack(batch.lengths, sum(shape.reads for shape in shapes)))
@@ -227,10 +184,13 @@ def _steps(batch: _Batch) -> Iterator[Step]:
     rares = dict(batch.rare)
     opened, trouble, status = 0, "", ("", "", "", "")
     for index, (shape, (ats, now)) in enumerate(zip(shapes, instants, strict=True)):
-        flags, rare = shape.flags, rares.get(index, _NOTHING)
+        flags, rare = shape.flags, rares.get(index, NOTHING)
         opened = opened if rare.opened is None else rare.opened
         trouble = trouble if rare.trouble is None else rare.trouble
-        status = status if rare.status is None else rare.status
+        if rare.status is not None:
+            mode, told, link, source = rare.status
+            reason = reason if told == SAME else told
+            status = mode, reason, link, source
         line = next(lines)
         inputs = Inputs(
             now=now,
@@ -261,7 +221,7 @@ def _steps(batch: _Batch) -> Iterator[Step]:
         yield Step(batch.first + index, inputs, said, begins=index == 0)
 
 
-def _shapes(batch: _Batch) -> list[_Shape]:
+def _shapes(batch: Batch) -> list[Shape]:
     """Of every step."""
     if min([n for shape in batch.shapes for n in shape], default=0) < 0:
         raise ValueError("a number below 0")
@@ -271,7 +231,7 @@ def _shapes(batch: _Batch) -> list[_Shape]:
     return [batch.shapes[kind] for kind in kinds]
 
 
-def _times(batch: _Batch, shapes: list[_Shape]) -> Iterator[int]:
+def _times(batch: Batch, shapes: list[Shape]) -> Iterator[int]:
     ticks = sum(1 for shape in shapes if shape.flags & TICK)
     tick_deltas = iter(unpack(batch.ticks, ticks))
     deltas = iter(unpack(batch.others, batch.count - ticks))
@@ -284,7 +244,7 @@ def _times(batch: _Batch, shapes: list[_Shape]) -> Iterator[int]:
         yield last
 
 
-def _instants_of(batch: _Batch, shapes: list[_Shape]) -> Iterator[tuple[list[Instant], Instant]]:
+def _instants_of(batch: Batch, shapes: list[Shape]) -> Iterator[tuple[list[Instant], Instant]]:
     """Of each step: when its reads were, and it itself."""
     reads = sum(shape.reads for shape in shapes)
     ages = iter(unpack(batch.ages, reads))
@@ -306,7 +266,7 @@ def _cut(data: bytes, lengths: list[int]) -> Iterator[bytes]:
         at += length
 
 
-def _poses(batch: _Batch, shapes: list[_Shape]) -> Iterator[Micropose]:
+def _poses(batch: Batch, shapes: list[Shape]) -> Iterator[Micropose]:
     count = sum(shape.poses for shape in shapes)
     columns = [accumulate(unpack(column, count)) for column in (batch.xs, batch.ys, batch.yaws)]
     return (_three(*pose) for pose in zip(*columns, strict=True))

@@ -157,6 +157,8 @@ class _Disk:
         """What ended less than a minute ago, and when; nothing has happened close to it yet."""
         self._number = self._began_ns = self._last_ns = 0
         self._happened_ns = -AROUND_NS
+        self._reason: str | None = None
+        """The last one written to this file."""
         self._keep = self._told = False
         self._pause = 0
 
@@ -193,7 +195,10 @@ class _Disk:
         assert self._writing is not None
         for at in range(0, len(steps), BATCH):
             batch = steps[at : at + BATCH]
-            self._writing.add("steps", batch[0].inputs.now.wall_ns, encode(self._number, batch))
+            self._writing.add(
+                "steps", batch[0].inputs.now.wall_ns, encode(self._number, batch, self._reason)
+            )
+            self._reason = batch[-1].outputs.reason
             self._number += len(batch)
             self._last_ns = batch[-1].inputs.now.mono_ns
             for _, outputs, _ in batch:
@@ -212,7 +217,7 @@ class _Disk:
             config=self._text,
         )
         self._writing, self._start = ring.begin(about), None
-        self._began_ns = now.mono_ns
+        self._began_ns, self._reason = now.mono_ns, None
         self._keep = now.mono_ns - self._happened_ns < AROUND_NS
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)

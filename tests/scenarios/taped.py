@@ -66,7 +66,8 @@ class Tape:
         writing = Writing(path, about)
         for at in range(0, len(self.taken), BATCH):
             batch = self.taken[at : at + BATCH]
-            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
+            before = self.taken[at - 1].outputs.reason if at else None
+            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch, before))
             for _, outputs, _ in batch:
                 for event in outputs.events:
                     writing.event(told(event, outputs.now.wall_ns))

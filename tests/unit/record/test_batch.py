@@ -106,6 +106,15 @@ def test_what_went_out_comes_back() -> None:
             assert said.events == outputs.events
 
 
+def test_a_reason_that_stays_is_told_once_and_comes_back() -> None:
+    for at in range(100, len(TAKEN), 100):
+        reason, batch = TAKEN[at - 1].outputs.reason, TAKEN[at : at + 100]
+        brief = encode(at, batch, reason)
+        assert decode(brief, reason) == decode(encode(at, batch))
+        if batch[0].outputs.reason == reason:
+            assert len(brief) < len(encode(at, batch))
+
+
 def test_a_second_at_rest_takes_little() -> None:
     tape = Tape()
     World(recorder=tape).run(3.0)

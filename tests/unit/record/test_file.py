@@ -13,6 +13,7 @@ from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record.again import config_of, live, steps
 from acsard.record.file import MODE, Closing, Recording, closing, rewrite
+from acsard.record.steps import status_of
 from tests.scenarios.taped import BATCH, Tape
 from tests.scenarios.world import World
 
@@ -52,6 +53,7 @@ def test_all_comes_back(tape: Tape, whole: Path) -> None:
     recording = Recording(whole)
     read = list(steps(recording))
     assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
+    assert [step.said.status for step in read] == [status_of(t.outputs) for t in tape.taken]
     assert (recording.whole, recording.damaged) == (True, 0)
     assert config_of(recording) == Config()
     assert live(recording).tally.same
