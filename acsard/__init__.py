@@ -34,6 +34,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     host/          S  the machine: clock, timers, threads, files, systemd, journal, logs, errors
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
+    record/        S  the black box: steps <-> MCAP, a ring of files, replay (its core is pure)
     runtime/       S  the control loop and the daemon; figures of itself
     door/          S  `acsard door`: where TLS ends, a process of its own
     client.py      S  drive and follow a robot from Python

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from acsard.config.settings import Source
+from acsard.config.settings import Config, Source
 from acsard.values import Outputs
 
 Wheels = tuple[int, int, int, int]
@@ -36,6 +36,12 @@ class Guard:
         self._require_check = require_check
         self._most = int(wheel_speed * 100 + 1)
         self._timeouts = {source.name: source.timeout * 1e9 for source in sources}
+
+    @classmethod
+    def of(cls, stop: bytes, config: Config) -> Guard:
+        """That of a configuration."""
+        check = config.mcu.link_check == "require"
+        return cls(stop, config.limits.wheel_speed, config.commands.sources, require_check=check)
 
     def check(self, outputs: Outputs, last: bytes) -> tuple[bytes | None, str]:
         """The line that may really go out, and why it is not the one these outputs have, or "".

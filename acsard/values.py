@@ -169,7 +169,7 @@ EventName = Literal[
     "lines_rejected", "lines_dropped", "lines_lost", "wheels_turned", "wheels_doubted",
     "gyro", "imu_refused",
     "bus_stuck", "router_missing", "router_found",
-    "missed_periods",
+    "missed_periods", "recording",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
@@ -372,6 +372,17 @@ class Measured(Struct, frozen=True):
     last_minute: Spread = Spread()
 
 
+class Recording(Struct, frozen=True):
+    """How the black box does."""
+
+    where: str = ""
+    """The directory, "" when nothing is recorded."""
+    trouble: str = ""
+    """Why it is not recorded just now, in words."""
+    missing: int = 0
+    """Steps that were not recorded."""
+
+
 class Snapshot(Struct, frozen=True):
     """What `state` and `diagnostics` show beyond one step's outputs."""
 
@@ -397,3 +408,4 @@ class Snapshot(Struct, frozen=True):
     sender: str = ""
     """Whose command counts, of the senders of one source; "" when nobody's does."""
     routers: RoutersStatus = RoutersStatus()
+    recording: Recording = Recording()

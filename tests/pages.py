@@ -108,6 +108,7 @@ How = Run | Elsewhere | InCi | Collected | Shown
 HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
+LOG = "tests/unit/cli/test_log.py"
 SERVICE = "tests/systemd/test_service.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
@@ -308,6 +309,15 @@ COMMANDS: dict[str, How] = {
         SERVICE,
         "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
         "pip is not called again",
+    ),
+    "sudo /opt/acsard/venv/bin/acsard log": Elsewhere(
+        LOG, "test_the_list_has_a_line_each_and_says_what_happened"
+    ),
+    "sudo /opt/acsard/venv/bin/acsard log show --from 14:05": Elsewhere(
+        LOG, "test_a_part_of_a_story_by_seconds_and_by_the_time_of_day"
+    ),
+    "sudo /opt/acsard/venv/bin/acsard log replay": Elsewhere(
+        LOG, "test_a_replay_says_that_all_is_the_same"
     ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(

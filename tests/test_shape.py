@@ -32,6 +32,13 @@ PURE_AMONG_SHELLS = (
     "bench.record",
     "door.watch",
     "host.silence",
+    "record.batch",
+    "record.columns",
+    "record.layout",
+    "record.merge",
+    "record.replay",
+    "record.steps",
+    "record.story",
     "top.sections",
     "top.roster",
     "top.seen",
@@ -45,7 +52,7 @@ PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
     "functools", "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re",
     "rich.cells", "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit",
-    "tomllib", "typing", "xxhash",
+    "tomllib", "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
 itself, knows the time or anything of chance."""
@@ -59,7 +66,7 @@ CLOCKS = {
 """What reads a clock in module `time`. `time.sleep` is not among them, and client.py and cli/ are
 tools that a person waits for: they may use `time.monotonic`."""
 
-DAEMON_ROOMS = ("host", "serial", "bus", "door", "runtime")
+DAEMON_ROOMS = ("host", "serial", "bus", "door", "record", "runtime")
 """What the daemon is made of: one clock for all."""
 
 LONG_FILE, LONG_FUNCTION = 300, 50

@@ -10,6 +10,7 @@ from acsard.host.errors import (
     NoPortError,
     NotDrivenError,
     NotPermittedError,
+    RecordingError,
     ReplyError,
     RouterFileError,
     UnreachableError,
@@ -20,6 +21,7 @@ from acsard.host.exits import Exit, ExitError
 CODES: dict[type[MendableError], Exit] = {
     ReplyError: Exit.FAILURE,
     NotDrivenError: Exit.FAILURE,
+    RecordingError: Exit.FAILURE,
     UsageError: Exit.USAGE,
     NoPortError: Exit.NO_PORT,
     UnreachableError: Exit.UNREACHABLE,

@@ -6,6 +6,8 @@ import argparse
 import os
 import sys
 
+from msgspec.structs import replace
+
 from acsard.cli.common import Overrides, add_config, load
 from acsard.config.settings import Config
 
@@ -39,6 +41,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
     )
     parser.add_argument(
+        "--record",
+        metavar="DIRECTORY",
+        help="record all that comes in and the lines that leave there (record.directory); "
+        "`acsard log` reads it",
+    )
+    parser.add_argument(
         "--no-door",
         action="store_true",
         help="start no `acsard door` for the tls/ endpoints: it runs by itself, as a service",
@@ -53,11 +61,19 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("mcu", "port", args.port),
         ("mcu", "baud_rate", args.baud_rate),
         ("robot", "id", args.id),
+        ("record", "directory", args.record),
         ("bus", "listen", [args.listen] if args.listen else None),
     ):
         if value is not None:
             given.setdefault(section, {})[key] = value
     return given
+
+
+def recorded(config: Config) -> Config:
+    """Where nothing else says where to record, the environment does: the service's unit."""
+    if config.record.directory or "ACSARD_RECORD" not in os.environ:
+        return config
+    return replace(config, record=replace(config.record, directory=os.environ["ACSARD_RECORD"]))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -72,6 +88,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.values import Event
 
     where, config = load(args.config, overrides(args))
+    config = recorded(config)
     log, screen = Log(config.log), Writer(sys.stdout)
 
     def announce(device: str, trouble: str) -> None:

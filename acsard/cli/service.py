@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.host.errors import MendableError
@@ -77,6 +78,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
         service.strangers(files, service.own_places()),
         force=args.force or args.purge,
         purge=args.purge,
+        recorded=Path(service.RECORDINGS).exists(),
     )
     _do(steps, args.dry_run)
     print(f"\nkept as well: the program, in {sys.prefix}; removing that directory removes it")

@@ -275,6 +275,15 @@ class LogConfig(Struct, frozen=True):
     format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
 
 
+class RecordConfig(Struct, frozen=True):
+    directory: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
+    ] = ""
+    megabytes: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "MB"})] = 1000.0
+    days: Annotated[float, Meta(ge=0.01, le=3650.0, extra={"unit": "days"})] = 14.0
+
+
 class SimConfig(Struct, frozen=True):
     motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
     encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
@@ -307,6 +316,7 @@ class Config(Struct, frozen=True):
     access: AccessConfig = AccessConfig()
     ros: RosConfig = RosConfig()
     log: LogConfig = LogConfig()
+    record: RecordConfig = RecordConfig()
     sim: SimConfig = SimConfig()
 
     @property

@@ -2,6 +2,9 @@
 
 The monotonic one is the raw one: NTP slews the other, by up to 8 %, and with it every distance
 that is speed times time, and every delay that a command seems to have had.
+
+An `Instant` is in whole us: what is below is only how long the reading took, and a recording that
+had to keep it would be twice as large.
 """
 
 from __future__ import annotations
@@ -21,11 +24,13 @@ TOGETHER_NS = 50_000
 
 TRIES = 5
 
+NS_PER_US = 1000
+
 
 def now() -> Instant:
     """Both clocks, read together."""
     for _ in range(TRIES):
-        at = Instant(mono_ns(), time.time_ns())
-        if mono_ns() - at.mono_ns < TOGETHER_NS:
+        mono, wall = mono_ns(), time.time_ns()
+        if mono_ns() - mono < TOGETHER_NS:
             break
-    return at
+    return Instant(mono - mono % NS_PER_US, wall - wall % NS_PER_US)

@@ -53,3 +53,7 @@ class RouterFileError(MendableError, ValueError):
 
 class CertificateError(MendableError, ValueError):
     """The certificates that the configuration names cannot be used."""
+
+
+class RecordingError(MendableError, ValueError):
+    """A file is no recording of acsard's, or cannot be lived again."""

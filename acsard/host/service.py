@@ -23,6 +23,7 @@ UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
 LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
+RECORDINGS = "/var/lib/acsard"
 """Where `lan.conf` believes the certificates to be."""
 
 Found = Mapping[Path, bytes | None]
@@ -141,10 +142,12 @@ def uninstalling(
     *,
     force: bool,
     purge: bool = False,
+    recorded: bool = False,
 ) -> list[Step]:
     """The steps that undo it, and what stays with the reason.
 
-    What somebody has changed stays unless forced, a `kept` file and `others` unless purged.
+    What somebody has changed stays unless forced; a `kept` file, `others` and what the service has
+    `recorded` unless purged.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}
@@ -164,6 +167,11 @@ def uninstalling(
     for path in others:
         what = "certificates and their authority" if path == Path(TLS) else "not of the service"
         steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
+    if recorded:
+        where = Path(RECORDINGS)
+        kept = Keep(where, "what it has recorded; --purge removes it")
+        # systemd knows where it truly is; it must still know the unit.
+        steps.insert(0, Run(("systemctl", "clean", "--what=state", UNIT)) if purge else kept)
     units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]

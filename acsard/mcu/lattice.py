@@ -13,7 +13,7 @@ when it is asked again, so that no step waits for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 
 from msgspec import Struct
 
@@ -59,35 +59,59 @@ class Lattice(Struct, frozen=True):
         return round(exact) if near else 0
 
 
-Search = Generator[None, None, Lattice | None]
-"""Each `next` is a slice of the work; it returns what it has found."""
+class Search:
+    """For the lattice of these speeds, in slices.
 
+    No generator: what a robot has in hand must be bytes at any moment (`record/state.py`).
+    """
 
-def search(seen: Mapping[float, int]) -> Search:
-    """The lattice of these speeds, rad/s above 0, and how often each was seen; None if none is."""
-    speeds = sorted(seen)
-    spare = max(1, int(STRAYS * sum(seen.values())))
-    anchor, tried = _anchor(speeds, seen, spare), 0
-    slope = ROUNDING / anchor
-    for part in range(1, int(anchor / FINEST) + 1):
-        quantum, strays = anchor / part, 0
-        for speed in speeds:
-            tried += 1
+    def __init__(self, seen: Mapping[float, int]) -> None:
+        """`seen`: speeds, rad/s above 0, and how often each was."""
+        self.found: Lattice | None = None
+        """Once it is over: the lattice, None if there is none."""
+        self._seen = seen
+        self._speeds: list[float] = []
+        self._spare = self._part = self._tried = 0
+        self._anchor = 0.0
+        self._fits = False
+        """All speeds lie on the lattice at hand: the next slice takes a closer look."""
+
+    def go_on(self) -> bool:
+        """Do a slice of the work; whether it is over."""
+        if not self._speeds:
+            self._speeds = sorted(self._seen)
+            self._spare = max(1, int(STRAYS * sum(self._seen.values())))
+            self._anchor = _anchor(self._speeds, self._seen, self._spare)
+        while True:
+            if self._fits:
+                self._fits = False
+                quantum = self._anchor / self._part
+                self.found = _fitted(self._seen, quantum, self._spare, self._part)
+                if self.found is not None:
+                    return True
+            else:
+                self._part += 1
+                if self._part > int(self._anchor / FINEST):
+                    return True
+                if self._all_on(self._anchor / self._part):
+                    self._fits = True
+                    return False
+            if self._tried >= TRIALS:
+                self._tried = 0
+                return False
+
+    def _all_on(self, quantum: float) -> bool:
+        """All speeds but a few are multiples of it, roughly."""
+        strays, slope = 0, ROUNDING / self._anchor
+        for speed in self._speeds:
+            self._tried += 1
             off = abs(speed - quantum * round(speed / quantum))
             # The anchor is rounded too, and speeds are off by their share of that.
             if off > ROUNDING + slope * speed:
-                strays += seen[speed]
-                if strays > spare:
-                    break
-        else:
-            yield
-            found = _fitted(seen, quantum, spare, part)
-            if found is not None:
-                return found
-        if tried >= TRIALS:
-            tried = 0
-            yield
-    return None
+                strays += self._seen[speed]
+                if strays > self._spare:
+                    return False
+        return True
 
 
 def _anchor(speeds: list[float], seen: Mapping[float, int], spare: int) -> float:

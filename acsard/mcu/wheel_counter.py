@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.mcu.lattice import FINEST, ROUNDING, Lattice, Search, on, search
+from acsard.mcu.lattice import FINEST, ROUNDING, Lattice, Search, on
 from acsard.mcu.steps import FLICKER, Steps
 
 LEARNED_FROM = 100
@@ -62,22 +62,20 @@ class WheelCounter:
             if fresh and room and size >= FINEST:
                 self._seen[size] = self._seen.get(size, 0) + 1
             if self._missing <= 0 and self._seen:
-                self._search = search(self._seen)
+                self._search = Search(self._seen)
 
     def go_on(self) -> bool:
         """Search a little further, if it does; whether it has just found a lattice."""
         if self._search is None:
             return False
-        try:
-            next(self._search)
-        except StopIteration as end:
-            self.lattice, self._search = end.value, None
-            if self.lattice is None:
-                self._seen = {}
-            self._missing = self._patience
-            self._patience = min(2 * self._patience, LONGEST_WAIT)
-            return self.lattice is not None
-        return False
+        if not self._search.go_on():
+            return False
+        self.lattice, self._search = self._search.found, None
+        if self.lattice is None:
+            self._seen = {}
+        self._missing = self._patience
+        self._patience = min(2 * self._patience, LONGEST_WAIT)
+        return self.lattice is not None
 
     def turned(self, speed: float, own: float, missing: float) -> float:
         """rad in the `own` s of this line; `missing` s more went by that no line reported."""

@@ -19,6 +19,7 @@ from acsard.values import (
     GyroStatus,
     Measured,
     Outputs,
+    Recording,
     RoutersStatus,
     Snapshot,
     WheelsStatus,
@@ -58,6 +59,7 @@ def diagnostics(
         _wheels(snapshot.doubt, snapshot.counters),
         *_gyro(config, snapshot.gyro),
         *_routers(snapshot.routers),
+        *_recording(snapshot.recording),
         *([Row("certificate", *certificate, {})] if certificate[1] else []),
     ]
     return DiagnosticArray(
@@ -149,6 +151,15 @@ def _routers(routers: RoutersStatus) -> list[Row]:
     values = dict.fromkeys(connected, "connected") | dict.fromkeys(missing, "not connected")
     words = f"not connected to {', '.join(missing)}" if missing else "connected"
     return [Row("router", WARN if missing else OK, words, values)] if values else []
+
+
+def _recording(recording: Recording) -> list[Row]:
+    """The row of the black box, none without one."""
+    if not recording.where:
+        return []
+    missing = {"steps_missing": str(recording.missing)}
+    level, message = WARN if recording.trouble else OK, recording.trouble or "on"
+    return [Row("recording", level, message, missing)]
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:

@@ -215,6 +215,7 @@ class Report:
             encoders=list(snapshot.encoders),
             doubt=snapshot.doubt.text,
             sender=snapshot.sender,
+            recording=snapshot.recording.trouble,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:

@@ -231,6 +231,8 @@ class RobotState(Message, frozen=True):
     """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
     sender: str = ""
     """Which of the senders of `source` is followed, by the name it gives itself."""
+    recording: str = ""
+    """Why nothing is recorded just now, though it is asked for, in words; empty else."""
 
 
 class DoorState(Message, frozen=True):

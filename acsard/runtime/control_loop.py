@@ -6,6 +6,7 @@ Synchronous on purpose: the daemon calls `step` from one task, the tests call it
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 from msgspec.structs import replace
 
@@ -38,6 +39,7 @@ from acsard.values import (
     Inputs,
     Instant,
     Outputs,
+    Recording,
     Refusal,
     Request,
     Snapshot,
@@ -51,6 +53,19 @@ QUERIES_PER_STEP = 8
 
 
 BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
+
+
+class BlackBox(Protocol):
+    """What records every step, and never waits."""
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+
+    @property
+    def status(self) -> Recording:
+        """How it does."""
 
 
 class ControlLoop:
@@ -69,11 +84,13 @@ class ControlLoop:
         others: list[Event] | None = None,
         beside: Callable[[str], Message | None] | None = None,
         adopted: Callable[[Config], None] | None = None,
+        recorder: BlackBox | None = None,
     ) -> None:
         """`others` are the events of the daemon's other parts; each step takes what is there.
 
         `beside` has the present values of the keys that those parts publish; `adopted` hears of a
-        configuration that is in force from now on.
+        configuration that is in force from now on; `recorder` is the black box, that hears of every
+        step.
         """
         self.robot = Robot(config)
         self.report = Report(config, start, certificate_ends_ns)
@@ -84,8 +101,9 @@ class ControlLoop:
         self._others = [] if others is None else others
         self._beside = beside
         self._config, self._adopted = config, adopted
+        self._recorder = recorder
         stop = self.robot.session.codec.stop
-        self._guard = _guard(stop, config)
+        self._guard = Guard.of(stop, config)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
@@ -156,6 +174,9 @@ class ControlLoop:
         if adopts:
             self._adopt(self.robot.config)
         went = self._send(outputs, now, inputs.tick)
+        if self._recorder is not None:
+            left = self._last if went else None
+            self._recorder.step(inputs, outputs, left, self.robot, self._last)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -169,7 +190,7 @@ class ControlLoop:
     def _adopt(self, config: Config) -> None:
         """Go by the configuration that the robot goes by since this step."""
         self._config = config
-        self._guard = _guard(self.robot.session.codec.stop, config)
+        self._guard = Guard.of(self.robot.session.codec.stop, config)
         self.report.use(config)
         self._queries.use(config)
 
@@ -281,13 +302,5 @@ class ControlLoop:
             figures=self._stopwatch.measured(now_ns),
             missed_last_minute=self._stopwatch.missed(now_ns),
             routers=self._routers.status,
+            recording=Recording() if self._recorder is None else self._recorder.status,
         )
-
-
-def _guard(stop: bytes, config: Config) -> Guard:
-    return Guard(
-        stop,
-        config.limits.wheel_speed,
-        config.commands.sources,
-        require_check=config.mcu.link_check == "require",
-    )

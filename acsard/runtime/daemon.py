@@ -26,6 +26,7 @@ from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.mcu.frames import Codec
 from acsard.messages.schema import Info
 from acsard.messages.topics import offered, published
+from acsard.record.recorder import Recorder
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
@@ -84,6 +85,11 @@ async def _run(
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
+        events: list[Event] = []
+        recorder = None
+        if config.record.directory:
+            recorder = Recorder(config, events.append)
+            stack.callback(recorder.close)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
         path = config.mcu.port if simulated is None else simulated.path
         sources = tuple(source.name for source in config.commands.sources)
@@ -98,7 +104,6 @@ async def _run(
             offered(config),
             published(config),
         )
-        events: list[Event] = []
         period_ns = int(NS_PER_S / config.rate_hz)
         port = SerialPort(
             path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, events.append
@@ -125,6 +130,7 @@ async def _run(
             events,
             beside,
             lambda adopted: log.use(adopted.log),
+            recorder,
         )
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)

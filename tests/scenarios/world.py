@@ -22,7 +22,7 @@ from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.signature import Signature
 from acsard.messages.topics import PUBLISHED
-from acsard.runtime.control_loop import ControlLoop
+from acsard.runtime.control_loop import BlackBox, ControlLoop
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.told import turn_rate
@@ -120,7 +120,13 @@ class MemoryBus:
 class World:
     """A robot on a bench that exists only in numbers."""
 
-    def __init__(self, config: Config | None = None, *, plugged: bool = True) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        plugged: bool = True,
+        recorder: BlackBox | None = None,
+    ) -> None:
         self.config = config or Config()
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
@@ -154,6 +160,7 @@ class World:
             self.instant,
             self.events.append,
             lambda: self.now_ns,
+            recorder=recorder,
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}

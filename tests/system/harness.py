@@ -72,7 +72,7 @@ def free_endpoint() -> str:
 
 def environment(**more: str) -> dict[str, str]:
     """The environment of a shell that knows nothing of this test run."""
-    hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "RUST_LOG")
+    hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "ACSARD_RECORD", "RUST_LOG")
     env = {key: value for key, value in os.environ.items() if key not in hidden}
     paths = [str(ROOT), *filter(None, [env.get("PYTHONPATH")])]
     return env | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"} | more

@@ -52,7 +52,7 @@ FIELDS = {
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
-        "encoders", "doubt", "sender",
+        "encoders", "doubt", "sender", "recording",
     },
     "diagnostics": {"header", "status"},
     "sim/pose": {"header", "pose"},

@@ -14,6 +14,7 @@ PROMISED = [
     (errors.UsageError, ValueError, 2),
     (errors.ReplyError, RuntimeError, 1),
     (errors.NotDrivenError, RuntimeError, 1),
+    (errors.RecordingError, ValueError, 1),
     (errors.NoPortError, FileNotFoundError, 66),
     (errors.UnreachableError, ConnectionError, 69),
     (errors.NoAnswerError, TimeoutError, 69),

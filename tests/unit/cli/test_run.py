@@ -53,3 +53,14 @@ def test_the_banner_tells_a_simulator_from_a_robot() -> None:
     assert "none yet: /dev/ttyUSB0 is not there" in missing
     assert "/dev/ttyUSB0 at 115200 baud" in real
     assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))
+
+
+def test_it_records_where_the_option_the_file_or_the_service_says_in_this_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    named = parse(b'[record]\ndirectory = "/file"', given_by("--record", "/option"))
+    in_file = parse(b'[record]\ndirectory = "/file"')
+    assert run.recorded(Config()).record.directory == ""
+    monkeypatch.setenv("ACSARD_RECORD", "/service")
+    found = [run.recorded(one).record.directory for one in (named, in_file, Config())]
+    assert found == ["/option", "/file", "/service"]

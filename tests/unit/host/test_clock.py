@@ -18,7 +18,7 @@ class Machine:
         self.takes, self.ns = takes, 5_000_000_000
 
     def mono_ns(self) -> int:
-        self.ns += 500
+        self.ns += 1500
         return self.ns
 
     def wall_ns(self) -> int:
@@ -41,4 +41,11 @@ def test_a_machine_that_always_does_ends_the_trying(monkeypatch: pytest.MonkeyPa
     machine = Machine(1000)
     monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
     monkeypatch.setattr(time, "time_ns", machine.wall_ns)
-    assert clock.now().wall_ns - WALL_NS == machine.ns - 500
+    assert clock.now().wall_ns - WALL_NS == (machine.ns - 1500) // 1000 * 1000
+
+
+def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "mono_ns", Machine(0).mono_ns)
+    monkeypatch.setattr(time, "time_ns", lambda: WALL_NS + 1_999)
+    at = clock.now()
+    assert (at.mono_ns % 1000, at.wall_ns) == (0, WALL_NS + 1_000)

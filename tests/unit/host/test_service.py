@@ -11,6 +11,7 @@ from acsard.host.service import (
     DOOR,
     GONE,
     INSTALLED,
+    RECORDINGS,
     STOP,
     UNIT,
     Found,
@@ -125,6 +126,17 @@ def test_a_purge_keeps_nothing() -> None:
         *(file.path for file in ALL),
         tls,
     }
+
+
+@pytest.mark.parametrize("purge", [False, True])
+def test_what_it_has_recorded_stays_unless_purged(purge: bool) -> None:
+    steps = uninstalling(ALL, there(), force=False, purge=purge, recorded=True)
+    kept = [str(step.path) for step in steps if isinstance(step, Keep)]
+    clean = Run(("systemctl", "clean", "--what=state", UNIT))
+    assert kept == ([] if purge else [RECORDINGS])
+    assert (clean in steps) is purge
+    if purge:  # while systemd still knows the unit, which does not run any more
+        assert steps.index(clean) == 1
 
 
 def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:

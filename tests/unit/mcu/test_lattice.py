@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.mcu.lattice import FINEST, ROUNDING, Lattice, on, search
+from acsard.mcu.lattice import FINEST, ROUNDING, Lattice, Search, on
 
 PERIOD = 0.01
 
@@ -22,13 +22,10 @@ def found(speeds: list[float]) -> Lattice | None:
 
 def sliced(speeds: list[float]) -> tuple[Lattice | None, int]:
     """What the search ends with, and in how many slices."""
-    searching, slices = search(Counter(speeds)), 1
-    while True:
-        try:
-            next(searching)
-        except StopIteration as end:
-            return end.value, slices
+    searching, slices = Search(Counter(speeds)), 1
+    while not searching.go_on():
         slices += 1
+    return searching.found, slices
 
 
 def told(quantum: float, wholes: list[int]) -> list[float]:

@@ -1,0 +1,223 @@
+"""`acsard log`: what the black box has recorded, and what happened in it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import load
+from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.record.file import Closing, Recording
+    from acsard.record.story import Told
+
+SERVICE = Path("/var/lib/acsard/record")
+"""Where the service records."""
+
+DESCRIPTION = """\
+What the daemon has recorded. Without a verb: the recordings, oldest first, and what happened in
+each. FILE is a recording, or its number in that list; without it the newest.
+"""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser("log", help="what was recorded, told or lived again",
+                              description=DESCRIPTION)  # fmt: skip
+    _directory(parser, None)
+    parser.set_defaults(main=list_all)
+    inner = parser.add_subparsers(title="verbs", metavar="VERB")
+    show = inner.add_parser("show", help="tell what happened, sentence by sentence")
+    show.add_argument("file", nargs="?", metavar="FILE")
+    when = "seconds after the beginning, or HH:MM:SS of its day"
+    show.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
+    show.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+    show.add_argument("--json", action="store_true", help="print one JSON object a line")
+    show.set_defaults(main=show_one)
+    replay = inner.add_parser(
+        "replay",
+        help="run the robot over it again, and compare every line, mode and pose",
+        description="Run the robot over what came in, and compare every line, mode and pose with "
+        "what was recorded. With --config it tells what another configuration would have done.",
+    )
+    replay.add_argument("file", nargs="?", metavar="FILE")
+    replay.add_argument("--config", metavar="FILE", help="another acsard.toml in place of its own")
+    replay.set_defaults(main=replay_one)
+    recover = inner.add_parser(
+        "recover", help="write what is whole of an unfinished or damaged one as a finished file"
+    )
+    recover.add_argument("file", metavar="FILE")
+    recover.add_argument("new", metavar="NEW", help="the file to write")
+    recover.set_defaults(main=recover_one)
+    for one in (show, replay, recover):
+        _directory(one, argparse.SUPPRESS)
+
+
+def _directory(parser: argparse.ArgumentParser, default: object) -> None:
+    parser.add_argument(
+        "--directory",
+        default=default,
+        metavar="DIRECTORY",
+        help=f"where the recordings are (else record.directory, or {SERVICE})",
+    )
+
+
+def list_all(args: argparse.Namespace) -> int:
+    """Print a line for each recording."""
+    from acsard.host.errors import RecordingError
+    from acsard.record.file import Recording, closing
+
+    where, files = _files(args)
+    if not files:
+        print(f"no recordings in {where}")
+    for path in files:
+        try:
+            last = closing(path)
+            print(_row(path, last) if last else _row_of_all(Recording(path)))
+        except RecordingError as error:
+            print(f"{path.name}  {error}")
+    return int(Exit.OK)
+
+
+def _row(path: Path, last: Closing) -> str:
+    began = _clock(last.wall_ns / 1e9, day=True)
+    seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
+    return f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}".rstrip()
+
+
+def _row_of_all(recording: Recording) -> str:
+    """Of one without an end: all of it has to be read."""
+    import msgspec
+
+    from acsard.record.file import Closing
+    from acsard.record.story import Told, summary
+
+    events: list[Told] = []
+    first = last = recording.about.wall_ns
+    for topic, wall_ns, data in recording.messages():
+        last = max(last, wall_ns)
+        if topic == "events":
+            events.append(msgspec.json.decode(data, type=Told))
+    row = _row(recording.path, Closing(first, last, summary(events)))
+    return row + _state(recording)
+
+
+def _state(recording: Recording) -> str:
+    """What is missing of it, once it has been read."""
+    if recording.damaged:
+        return f"  [{recording.damaged} damaged chunks are left out]"
+    return "" if recording.whole else "  [no end: cut, or being written]"
+
+
+def show_one(args: argparse.Namespace) -> int:
+    """Tell its story."""
+    import msgspec
+
+    from acsard.record.again import steps
+    from acsard.record.story import Story
+
+    recording = _recording(args)
+    story, began_s = Story(), recording.about.wall_ns / 1e9
+    begin, end = (_seconds(text, began_s) for text in (args.begin, args.end))
+    for step in steps(recording):
+        for one in story.step(step):
+            if (begin is None or one.seconds >= begin) and (end is None or one.seconds <= end):
+                print(msgspec.json.encode(one).decode() if args.json else _sentence(one))
+    note = _state(recording)
+    if note:
+        print(f"{recording.path}:{note}", file=sys.stderr)
+    return int(Exit.OK)
+
+
+def replay_one(args: argparse.Namespace) -> int:
+    """Live it again; 1 where it does not come out the same."""
+    from acsard.record.again import differs, live, otherwise, verdict
+
+    recording = _recording(args)
+    other = None if args.config is None else load(args.config)[1]
+    tally, trouble = live(recording, other)
+    print(verdict(tally))
+    if tally.first is not None:
+        print("\n".join([*differs(tally.first, recording.about.mono_ns), *otherwise(tally)]))
+    note = trouble or _state(recording).strip()
+    if note:
+        print(f"{recording.path}: {note}", file=sys.stderr)
+    return int(Exit.OK if tally.same or other is not None else Exit.FAILURE)
+
+
+def recover_one(args: argparse.Namespace) -> int:
+    """Write a finished file."""
+    from acsard.record.file import rewrite
+
+    recording, new = _recording(args), Path(args.new)
+    try:
+        count = rewrite(recording, new)
+    except OSError as error:
+        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
+    print(f"{count} messages in {new}{_state(recording)}")
+    return int(Exit.OK)
+
+
+def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
+    from acsard.record.ring import listed
+
+    where = Path(args.directory or load(None)[1].record.directory or SERVICE)
+    try:
+        return where, listed(where)
+    except OSError as error:
+        raise ExitError(
+            Exit.NO_PERMISSION if isinstance(error, PermissionError) else Exit.FAILURE,
+            f"cannot read {where}: {error.strerror}; say where with --directory, or use sudo",
+        ) from None
+
+
+def _recording(args: argparse.Namespace) -> Recording:
+    from acsard.record.file import Recording
+
+    name = args.file
+    if name is not None and not re.fullmatch(r"\d{1,9}", name):
+        return Recording(Path(name))
+    where, files = _files(args)
+    if name is not None:
+        files = [path for path in files if int(path.name.partition("-")[0]) == int(name)]
+    if not files:
+        which = "recording" if name is None else f"recording {name}"
+        raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard log` lists them")
+    return Recording(files[-1])
+
+
+def _when(text: str) -> str:
+    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
+        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
+    return text
+
+
+def _seconds(text: str | None, began_s: float) -> float | None:
+    """Wall-clock time of what `_when` let through."""
+    if text is None:
+        return None
+    if ":" not in text:
+        return began_s + float(text)
+    hours, minutes, seconds = [*text.split(":"), "0"][:3]
+    day = time.localtime(began_s)
+    midnight = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, 0, 0, 0, 0, 0, -1))
+    return midnight + int(hours) * 3600 + int(minutes) * 60 + float(seconds)
+
+
+def _sentence(one: Told) -> str:
+    by = f" (by {one.by})" if one.by else ""
+    times = f" ({one.count} times)" if one.count > 1 else ""
+    mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
+    return f"{_clock(one.seconds)}  {mark}{one.name.replace('_', ' ')}: {one.text}{by}{times}"
+
+
+def _clock(seconds: float, day: bool = False) -> str:
+    local = time.localtime(seconds)
+    if day:
+        return time.strftime("%Y-%m-%d %H:%M:%S", local)
+    return time.strftime("%H:%M:%S", local) + f".{int(seconds % 1 * 1000):03}"

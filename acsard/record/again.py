@@ -1,0 +1,137 @@
+"""A recording lived again: file -> replay -> what to say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from acsard.config.parsing import ConfigError, parse
+from acsard.config.settings import Config
+from acsard.host.errors import RecordingError
+from acsard.record.batch import BatchError, decode
+from acsard.record.file import Recording
+from acsard.record.merge import adopt
+from acsard.record.replay import Difference, Replay, Seen, Tally
+from acsard.record.state import State, StateError, thaw
+from acsard.record.steps import MICRO, Step
+from acsard.robot import Robot
+
+HUNDREDTHS = 100.0
+
+
+class Lived(NamedTuple):
+    """What came of it."""
+
+    tally: Tally
+    trouble: str
+    """Why it was not lived to the end of the file, "" when it was."""
+
+
+def config_of(recording: Recording) -> Config:
+    """The configuration it was made with; raises `RecordingError`."""
+    try:
+        return parse(recording.about.config.encode())
+    except ConfigError as error:
+        raise RecordingError(
+            f"the configuration in {recording.path} is none for this version: {error}"
+        ) from None
+
+
+def steps(recording: Recording) -> Iterator[Step]:
+    """Every step that can be read, in order; where some are missing their numbers say so."""
+    reason = ""
+    for topic, _, data in recording.messages():
+        if topic == "steps":
+            try:
+                batch = decode(data, reason)
+            except BatchError:
+                recording.damaged += 1
+                continue
+            yield from batch
+            reason = batch[-1].said.status[1] if batch else reason
+
+
+def live(recording: Recording, other: Config | None = None) -> Lived:
+    """Replay it with its own configuration, or with another; raises `RecordingError`."""
+    config = config_of(recording)
+    state = _state(recording)
+    if state is not None:  # by newer code, its parts may have what it knows nothing of
+        adopt(state.robot, Robot(config), Robot(other or config))
+    replay = Replay(other or config, *(state or ()))
+    number: int | None = None
+    for step in steps(recording):
+        if number is None and state is None and step.number > 0:
+            raise RecordingError(f"{recording.path}: its first steps are missing or damaged")
+        if number is not None and step.number != number + 1:
+            missing = step.number - number - 1
+            return Lived(replay.tally, f"{missing} steps are missing after step {number}")
+        number = step.number
+        replay.step(step)
+    if number is None:
+        raise RecordingError(f"{recording.path} has no whole second of steps")
+    return Lived(replay.tally, "")
+
+
+def _state(recording: Recording) -> State | None:
+    for topic, _, data in recording.messages():
+        if topic == "state":
+            try:
+                return thaw(data)
+            except StateError as error:
+                raise RecordingError(
+                    f"{recording.path}: {error}; it was recorded by acsard "
+                    f"{recording.about.version}, whose replay can read it"
+                ) from None
+        if topic == "steps":
+            return None
+    return None
+
+
+def verdict(tally: Tally) -> str:
+    """The answer in one line."""
+    lines = f"{tally.lines_same:,} of {tally.lines:,} lines the same".replace(",", " ")
+    poses = f"{tally.poses_same:,} of {tally.poses:,} poses".replace(",", " ")
+    modes = f"{tally.modes_same:,} of {tally.steps:,} modes".replace(",", " ")
+    bits = "" if not tally.same or tally.exact else " (poses to the um, not to the last bit)"
+    return f"{lines}, {poses}, {modes}{bits}"
+
+
+def differs(difference: Difference, began_ns: int) -> list[str]:
+    """What each side knew where they first part, in lines."""
+    seconds = (difference.at.mono_ns - began_ns) / 1e9
+    what = ", ".join(difference.what)
+    return [
+        f"the first that differs, by its {what}: step {difference.number}, {seconds:.3f} s after "
+        "the beginning",
+        *_side("then", difference.then),
+        *_side("now", difference.now),
+    ]
+
+
+def _side(name: str, seen: Seen) -> list[str]:
+    mode, reason, link, source = seen.status
+    line = "no line" if seen.line is None else seen.line.decode(errors="replace").strip()
+    poses = [[f"{value / MICRO:.6f}" for value in pose] for pose in seen.poses]
+    rows = [
+        f"  {name:4}  {line}",
+        f"        mode {mode} ({reason}), link {link}, source {source or 'none'}",
+        *[f"        pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
+    ]
+    return [*rows, f"        the guard: {seen.trip}"] if seen.trip else rows
+
+
+def otherwise(tally: Tally) -> list[str]:
+    """What another configuration, or other code, would have done, in words and figures."""
+    then_most, now_most = (speed / HUNDREDTHS for speed in tally.fastest)
+    rows = [
+        f"{tally.lines - tally.lines_same} of {tally.lines} lines would be others, "
+        f"{tally.steps - tally.modes_same} of {tally.steps} steps in another mode",
+        f"the fastest wheel: {then_most:.2f} rad/s then, {now_most:.2f} rad/s now",
+    ]
+    if tally.end is not None:
+        (x, y, _), (here_x, here_y, _) = tally.end
+        rows.append(
+            f"the end by odometry: x {x / MICRO:.3f} y {y / MICRO:.3f} then, "
+            f"x {here_x / MICRO:.3f} y {here_y / MICRO:.3f} now; at most {tally.apart:.3f} m apart"
+        )
+    return rows

@@ -1,0 +1,257 @@
+"""One recording as an MCAP file: written chunk by chunk, read whatever became of it.
+
+Three channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
+`state.py` writes it, first of all where the file does not begin with the daemon). A metadata
+record says whose it is, an attachment is its `acsard.toml`. A file that was cut has no end: what is
+whole of it is read all the same, and `rewrite` makes a finished file of it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Attachment, Chunk, Footer, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import IndexType, Writer
+from msgspec import Struct
+
+from acsard.host.errors import RecordingError
+from acsard.record.story import NEWS, Told, summary
+from acsard.values import NS_PER_S
+
+CHUNK_BYTES = 32 * 1024
+"""Uncompressed; what is not flushed before is written then."""
+
+MODE = 0o640
+"""The service's group may read it."""
+
+FORMAT = "1"
+"""Of the messages in it; another number is another meaning."""
+
+LARGEST_RECORD = 1 << 26
+"""bytes; a longer one is damage."""
+
+Topic = Literal["steps", "events", "state"]
+
+CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
+"""In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
+
+DAMAGE = (
+    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
+    ValueError, OverflowError, EOFError, MemoryError,
+)  # fmt: skip
+"""All that the library raises for bytes that are no MCAP."""
+
+
+class About(Struct, frozen=True):
+    """Whose recording it is."""
+
+    robot: str
+    version: str
+    """Of acsard."""
+    python: str
+    mono_ns: int
+    wall_ns: int
+    """Both clocks when it began."""
+    config: str = ""
+    """The `acsard.toml` in force, all keys in it."""
+    format: str = FORMAT
+
+
+class Closing(Struct, frozen=True):
+    """What a finished file says of itself at its end, so that a list need not read all of it."""
+
+    wall_ns: int
+    """When it began."""
+    last_ns: int
+    """When its last message begins."""
+    said: str
+    """What happened, in a few words."""
+
+
+class Writing:
+    """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
+
+    def __init__(self, path: Path, about: About) -> None:
+        self.path = path
+        self._about, self._last_ns = about, about.wall_ns
+        self._news: list[Told] = []
+        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE), "wb")
+        try:
+            self._open(about)
+        except OSError:
+            self.close()
+            raise
+
+    def _open(self, about: About) -> None:
+        os.fchmod(self._file.fileno(), MODE)  # whatever the umask takes away
+        self._writer = Writer(
+            self._file, CHUNK_BYTES, index_types=IndexType.ALL ^ IndexType.MESSAGE
+        )
+        self._writer.start("acsard", f"acsard {about.version}")
+        meta = msgspec.to_builtins(about)
+        del meta["config"]
+        self._writer.add_metadata("acsard", {key: str(value) for key, value in meta.items()})
+        self._writer.add_attachment(
+            about.wall_ns, about.wall_ns, "acsard.toml", "text/plain", about.config.encode()
+        )
+        schema = msgspec.json.encode(msgspec.json.schema(Told))
+        of_events = self._writer.register_schema("acsard.Told", "jsonschema", schema)
+        kinds = {"steps": ("acsard-steps", 0), "state": ("acsard-state", 0)}
+        self._channels = {
+            topic: self._writer.register_channel(topic, *kinds.get(topic, ("json", of_events)))
+            for topic in CHANNELS
+        }
+        self.flush()
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far."""
+        return self._file.tell()
+
+    def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
+        """Write a message; it is in the file when its chunk is full, or by `flush`."""
+        self._last_ns = max(self._last_ns, wall_ns)
+        self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
+
+    def event(self, told: Told) -> None:
+        """Write an event, and remember what a list says of it."""
+        wall_ns = int(told.seconds * NS_PER_S)
+        self.add("events", wall_ns, msgspec.json.encode(told))
+        if told.name in NEWS:
+            self._news.append(told)
+
+    def flush(self) -> None:
+        """What was added is a whole chunk, and on the disk."""
+        self._writer.flush()
+        os.fsync(self._file.fileno())
+
+    def finish(self) -> None:
+        """Write the end of the file and close it."""
+        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news))
+        fields = msgspec.to_builtins(last)
+        self._writer.add_metadata("acsard end", {key: str(value) for key, value in fields.items()})
+        self._writer.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def close(self) -> None:
+        """Close it as it is: without an end, if it has none yet."""
+        try:
+            self._file.close()
+        except OSError:
+            pass  # a disk that takes nothing takes no rest of a buffer either
+
+
+class Recording:
+    """A file read from its beginning to where it is whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises `RecordingError` if it cannot be read, or is no recording of acsard's."""
+        self.path = path
+        try:
+            self._data = path.read_bytes()
+        except OSError as error:
+            raise RecordingError(f"cannot read {path}: {error.strerror}") from None
+        self.whole = False
+        """It was read to its end, and has one."""
+        self.damaged = 0
+        """Chunks that could not be read, in the midst of others."""
+        self.about = self._about()
+
+    def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
+        """Topic, wall-clock time in ns and bytes of each; sets `whole` and `damaged`."""
+        self.whole, self.damaged = False, 0
+        topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
+        for record in self._records():
+            if isinstance(record, Footer):
+                self.whole = not self.damaged
+                return
+            if not isinstance(record, Chunk):
+                continue
+            try:
+                inside = breakup_chunk(record, validate_crc=True)
+            except DAMAGE:
+                self.damaged += 1
+                continue
+            for one in inside:
+                if isinstance(one, Message) and one.channel_id in topics:
+                    yield topics[one.channel_id], one.log_time, one.data
+
+    def _records(self) -> Iterator[object]:
+        reader = StreamReader(
+            io.BytesIO(self._data), emit_chunks=True, record_size_limit=LARGEST_RECORD
+        )
+        try:
+            yield from reader.records
+        except DAMAGE:
+            return  # cut, or damaged from here on
+
+    def _about(self) -> About:
+        found: dict[str, str] = {}
+        config = None
+        for record in self._records():
+            if isinstance(record, Metadata) and record.name == "acsard":
+                found = record.metadata
+            elif isinstance(record, Attachment) and record.name == "acsard.toml":
+                config = record.data.decode(errors="replace")
+            elif isinstance(record, Chunk):
+                break
+        try:
+            if config is None:
+                raise ValueError("its beginning is missing")
+            about = msgspec.convert({**found, "config": config}, About, strict=False)
+        except (ValueError, msgspec.ValidationError) as error:
+            raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
+        if about.format != FORMAT:
+            raise RecordingError(
+                f"{self.path} has the format {about.format}, this acsard reads {FORMAT}: "
+                f"it was written by acsard {about.version}"
+            )
+        return about
+
+
+def closing(path: Path) -> Closing | None:
+    """What the file says of itself at its end; None where it has none, or it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            for metadata in make_reader(stream).iter_metadata():
+                if metadata.name == "acsard end":
+                    return msgspec.convert(metadata.metadata, Closing, strict=False)
+    except (OSError, *DAMAGE):
+        pass  # who reads all of it will say what is wrong
+    return None
+
+
+def rewrite(recording: Recording, path: Path) -> int:
+    """All that is whole of it as a new, finished file; the number of messages.
+
+    Raises `OSError`, and leaves nothing behind where it cannot be written.
+    """
+    writing = Writing(path, recording.about)
+    try:
+        count = 0
+        for topic, wall_ns, data in recording.messages():
+            if topic == "events":
+                writing.event(msgspec.json.decode(data, type=Told))
+            else:
+                writing.add(topic, wall_ns, data)
+            count += 1
+        writing.finish()
+    except (OSError, msgspec.MsgspecError) as error:
+        writing.close()
+        path.unlink()
+        if isinstance(error, OSError):
+            raise
+        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None
+    return count

@@ -1,0 +1,77 @@
+"""Puts another configuration under a state, for "what would it have done".
+
+Three robots: one as it was in the middle of a drive, one as it begins by the same configuration,
+one as it begins by another. What the first still has as the second began with, it takes from the
+third; what happened to it since stays. No part of a robot has to know of this.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import msgspec
+
+from acsard.robot import Robot
+
+PLAIN = (bool, int, float, str, bytes, type(None))
+
+
+def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
+    """Change `robot` in place; `begun` and `other` are as their configurations make them."""
+    _Walk().into(robot, begun, other)
+
+
+class _Walk:
+    def __init__(self) -> None:
+        self._seen: dict[int, Any] = {}
+        """Kept alive, so that no other gets its number."""
+
+    def into(self, now: Any, begun: Any, other: Any) -> None:
+        """Go through the parts of an object."""
+        if id(now) in self._seen:
+            return
+        self._seen[id(now)] = now
+        for name in _names(other):
+            theirs = getattr(other, name)
+            if not hasattr(now, name):  # of another version: it begins as a new one does
+                setattr(now, name, theirs)
+                continue
+            mine = getattr(now, name)
+            merged = self.merged(mine, getattr(begun, name, mine), theirs)
+            if merged is not mine:
+                setattr(now, name, merged)
+
+    def merged(self, now: Any, begun: Any, other: Any) -> Any:
+        """What to have in place of `now`: itself, perhaps with other parts, or `other`."""
+        if type(now) is not type(other):
+            return other if _same(now, begun) else now
+        match now:
+            case dict():
+                for key, theirs in other.items():
+                    mine = now.get(key, theirs)
+                    now[key] = self.merged(mine, begun.get(key, mine), theirs)
+                return now
+            case list() | tuple() if len(now) == len(begun) == len(other):
+                parts = [self.merged(*three) for three in zip(now, begun, other, strict=True)]
+                if all(a is b for a, b in zip(parts, now, strict=True)):
+                    return now
+                return parts if isinstance(now, list) else type(now)(parts)
+            case list() | tuple() | set() | frozenset() | deque() | msgspec.Struct():
+                return other if now == begun else now
+            case _ if isinstance(now, PLAIN):
+                return other if _same(now, begun) else now
+        if _names(now):
+            self.into(now, begun, other)
+        return now
+
+
+def _same(now: Any, begun: Any) -> bool:
+    return type(now) is type(begun) and bool(now == begun)
+
+
+def _names(thing: object) -> list[str]:
+    """The attributes an object has of its own."""
+    slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+    named = [*getattr(thing, "__dict__", ()), *slots]
+    return [name for name in named if hasattr(thing, name)]

@@ -1,0 +1,279 @@
+"""The black box of a running daemon: takes each step's inputs and outputs, never waits.
+
+The loop puts references into a bounded queue. A thread makes bytes of them, a chunk a second, each
+synced to the disk. A queue that is full, because the disk is slow or stuck, loses steps and counts
+them; what follows begins a new file with the robot's state, so that it can be lived again.
+"""
+
+from __future__ import annotations
+
+import platform
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from acsard import __version__
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.config.writing import document
+from acsard.record.batch import encode
+from acsard.record.file import About, Writing
+from acsard.record.ring import Ring
+from acsard.record.state import freeze
+from acsard.record.steps import Taken
+from acsard.record.story import told
+from acsard.robot import Robot
+from acsard.values import NS_PER_S, Event, Inputs, Outputs, Recording
+
+MOST = 4096
+"""Steps that wait for the thread: a disk may take 10 s, at 100 Hz, before any is lost."""
+
+FLUSH_S = 0.9
+"""Between two chunks; with the sync there is one each second."""
+
+RETRY_ROUNDS = 5
+"""Between two tries of a disk that refused."""
+
+BATCH = 256
+"""Steps in a message at most: as many as a second has, unless commands pour in."""
+
+AROUND_NS = 60 * NS_PER_S
+"""Before and after something that happened, what is kept."""
+
+LONGEST_NS = 3600 * NS_PER_S
+"""What a file holds at most."""
+
+HAPPENED = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
+"""Events whose minutes are kept."""
+
+CLOSE_S = 0.5
+"""How long the end waits for the last chunk."""
+
+
+class _Start(NamedTuple):
+    """What a file begins with: the robot after the step before number `number`."""
+
+    number: int
+    state: bytes
+    config: Config
+    """In force then: settings may have been changed since the daemon began."""
+
+
+class Recorder:
+    """`step` is for the control loop; everything else happens in the thread."""
+
+    def __init__(self, config: Config, tell: Callable[[Event], None]) -> None:
+        """`tell` takes the recorder's own events, from within `step`."""
+        self._queue: deque[Taken | _Start] = deque()
+        self._tell = tell
+        self._said: deque[Event] = deque()
+        self._number = 0
+        """Steps so far."""
+        self._missing = 0
+        """Steps that found the queue full."""
+        self._full = False
+        self._wants_state = False
+        """Set by the thread, cleared by `step`: begin a new file."""
+        self._disk = _Disk(config, self._say, self._ask)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="record", daemon=True)
+        self._thread.start()
+
+    # the control loop's side
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+        queue = self._queue
+        self._number += 1
+        if self._said:
+            self._tell(self._said.popleft())
+        if self._full:
+            self._missing += 1
+            if len(queue) > MOST // 2:
+                return
+            self._full, self._wants_state = False, True
+        elif len(queue) >= MOST:
+            self._full = True
+            self._missing += 1
+            self._tell(Event("recording", "the disk is too slow; steps are lost", "warning"))
+            return
+        else:
+            queue.append(Taken(inputs, outputs, left))
+        if self._wants_state:
+            self._wants_state = False
+            queue.append(_Start(self._number, freeze(robot, last), robot.config))
+
+    @property
+    def status(self) -> Recording:
+        """How it goes, for `state` and `diagnostics`."""
+        trouble = "the disk is too slow" if self._full else self._disk.trouble
+        if not self._thread.is_alive():
+            trouble = "the recorder has ended by a fault of its own; the log has it"
+        return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
+
+    def close(self) -> None:
+        """Write the last chunk and the end of the file, if the disk lets us in time."""
+        self._over.set()
+        self._thread.join(CLOSE_S)
+
+    # the thread's side
+
+    def _say(self, event: Event) -> None:
+        self._said.append(event)
+
+    def _ask(self) -> None:
+        self._wants_state = True
+
+    def _work(self) -> None:
+        over = False
+        while not over:
+            over = self._over.wait(FLUSH_S)
+            self._disk.round(self._taken(), over)
+
+    def _taken(self) -> list[Taken | _Start]:
+        queue = self._queue
+        return [queue.popleft() for _ in range(len(queue))]
+
+
+class _Disk:
+    """What the thread has: the ring, the file, and how the disk takes it."""
+
+    def __init__(
+        self, config: Config, say: Callable[[Event], None], ask: Callable[[], None]
+    ) -> None:
+        self.where = config.record.directory
+        self.trouble = ""
+        self.missing = 0
+        """Steps that came while the disk took nothing."""
+        self._config, self._say, self._ask = config, say, ask
+        self._ring: Ring | None = None
+        self._writing: Writing | None = None
+        self._start: _Start | None = _Start(0, b"", config)
+        """What the next file begins with; None when steps before it are missing."""
+        self._recent: list[tuple[Path, int]] = []
+        """What ended less than a minute ago, and when; nothing has happened close to it yet."""
+        self._number = self._began_ns = self._last_ns = 0
+        self._happened_ns = -AROUND_NS
+        self._reason: str | None = None
+        """The last one written to this file."""
+        self._keep = self._told = False
+        self._pause = 0
+
+    def round(self, items: list[Taken | _Start], over: bool) -> None:
+        """Write what came, or count it as missing."""
+        written = 0
+        try:
+            if self._pause == 0 or over:
+                ring = self._ring = self._ring or Ring(self._config.record, not self.trouble)
+                for start, steps in _runs(items):
+                    self._write(ring, start, steps)
+                    written += len(steps)
+                self._flush(ring, over)
+            else:
+                self._pause -= 1
+        except OSError as error:
+            self._fail(error)
+        missed = sum(isinstance(item, Taken) for item in items) - written
+        if missed:
+            self.missing += missed
+            self._start = None
+        if self._start is None and self._writing is None and self._pause == 0:
+            self._ask()
+
+    def _write(self, ring: Ring, start: _Start | None, steps: list[Taken]) -> None:
+        if start is not None:
+            self._finish(ring)
+            self._start, self._number = start, start.number
+        if self._writing is None:
+            if self._start is None or not steps:
+                self.missing += len(steps)
+                return
+            self._begin(ring, self._start, steps[0])
+        assert self._writing is not None
+        for at in range(0, len(steps), BATCH):
+            batch = steps[at : at + BATCH]
+            self._writing.add(
+                "steps", batch[0].inputs.now.wall_ns, encode(self._number, batch, self._reason)
+            )
+            self._reason = batch[-1].outputs.reason
+            self._number += len(batch)
+            self._last_ns = batch[-1].inputs.now.mono_ns
+            for _, outputs, _ in batch:
+                for event in outputs.events:
+                    self._event(ring, self._writing, event, outputs)
+
+    def _begin(self, ring: Ring, start: _Start, first: Taken) -> None:
+        now = first.inputs.now
+        ring.trim(now.wall_ns)
+        about = About(
+            robot=self._config.robot.id,
+            version=__version__,
+            python=platform.python_version(),
+            mono_ns=now.mono_ns,
+            wall_ns=now.wall_ns,
+            config="\n".join(document(effective(start.config))) + "\n",
+        )
+        self._writing, self._start = ring.begin(about), None
+        self._began_ns, self._reason = now.mono_ns, None
+        self._keep = now.mono_ns - self._happened_ns < AROUND_NS
+        if start.state:
+            self._writing.add("state", now.wall_ns, start.state)
+
+    def _event(self, ring: Ring, writing: Writing, event: Event, outputs: Outputs) -> None:
+        now = outputs.now
+        writing.event(told(event, now.wall_ns))
+        if event.name in HAPPENED:
+            self._keep, self._happened_ns = True, now.mono_ns
+            for path, ended_ns in self._recent:
+                if now.mono_ns - ended_ns < AROUND_NS:
+                    ring.keep(path)
+            self._recent.clear()
+
+    def _flush(self, ring: Ring, over: bool) -> None:
+        if over:
+            self._finish(ring)
+            ring.close()
+        if self._writing is None:
+            return
+        self._writing.flush()
+        if self.trouble or not self._told:
+            self.trouble, self._told = "", True
+            self._say(Event("recording", f"to {self.where}"))
+        long = self._last_ns - self._began_ns > LONGEST_NS
+        if long or self._writing.size > ring.file_bytes:
+            self._ask()
+
+    def _finish(self, ring: Ring) -> None:
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            path, last_ns = ring.end(writing, self._keep), self._last_ns
+            recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
+            self._recent = recent if self._keep else [*recent, (path, last_ns)]
+
+    def _fail(self, error: OSError) -> None:
+        text = f"{self.where}: {error.strerror or error}"
+        if text != self.trouble:
+            self.trouble = text
+            self._say(Event("recording", f"{text}; driving goes on", "warning"))
+        for open_one in (self._writing, self._ring):
+            if open_one is not None:
+                open_one.close()
+        self._writing = self._ring = None
+        self._pause = RETRY_ROUNDS
+
+
+def _runs(items: list[Taken | _Start]) -> Iterator[tuple[_Start | None, list[Taken]]]:
+    """What follows without a break, and what it begins with if it begins anew."""
+    start: _Start | None = None
+    steps: list[Taken] = []
+    for item in items:
+        if isinstance(item, Taken):
+            steps.append(item)
+            continue
+        yield start, steps
+        start, steps = item, []
+    yield start, steps

@@ -1,0 +1,83 @@
+"""A step as a recording tells it: all that came in, and what went out.
+
+The poses are told in um and urad; a checksum holds every bit of all estimates. How many steps
+become bytes is `batch.py`'s.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from acsard.values import Estimate, Event, Inputs, Outputs
+
+MICRO = 1e6
+
+Status = tuple[str, str, str, str]
+"""Mode, reason, link, source."""
+
+Micropose = tuple[int, int, int]
+"""x, y in um and yaw in urad."""
+
+_DOUBLES = struct.Struct("<9d")
+
+
+class Taken(NamedTuple):
+    """A step as the control loop hands it over: references, nothing copied."""
+
+    inputs: Inputs
+    outputs: Outputs
+    left: bytes | None
+    """What was handed to the port, None when nothing went."""
+
+
+class Said(Struct, frozen=True):
+    """What a step decided."""
+
+    line: bytes | None
+    left: bytes | None
+    status: Status
+    poses: tuple[Micropose, ...]
+    """One for each feedback line that was believed."""
+    events: tuple[Event, ...] = ()
+    checksum: int | None = None
+    """Of all estimates since the first step of the batch, to the last bit; with its last step."""
+
+
+class Step(Struct, frozen=True):
+    """One step again; `number` counts them since the start of the daemon."""
+
+    number: int
+    inputs: Inputs
+    said: Said
+    begins: bool = False
+    """The first of its batch: `checksum` begins anew."""
+
+
+def checksum(estimates: Sequence[Estimate], before: int) -> int:
+    """Goes on from `before`, over all that odometry says, to the last bit."""
+    for e in estimates:
+        pose, twist = e.pose, e.twist
+        data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
+        before = zlib.crc32(data, before)
+    return before
+
+
+def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:
+    """The poses of all of them."""
+    return tuple([micropose(estimate) for estimate in estimates])
+
+
+def status_of(outputs: Outputs) -> Status:
+    """What `state` says first."""
+    return outputs.mode, outputs.reason, outputs.link, outputs.source
+
+
+def micropose(estimate: Estimate) -> Micropose:
+    """Its pose as a recording tells it."""
+    pose = estimate.pose
+    return round(pose.x * MICRO), round(pose.y * MICRO), round(pose.yaw * MICRO)

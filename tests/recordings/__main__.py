@@ -1,0 +1,68 @@
+"""Writes the recordings anew: do it when a change of behaviour is wanted, and say why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from acsard.config.settings import Config
+from tests.scenarios.taped import Tape, drive_through_faults
+from tests.scenarios.world import World
+
+HERE = Path(__file__).parent
+
+PLAIN = Config()
+CHECKED = replace(
+    PLAIN,
+    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    odometry=replace(PLAIN.odometry, gyro=True),
+)
+
+
+def quiet(world: World) -> None:
+    """Two commanders, a stop and a clear."""
+    world.drive(0.5, 0.3, 2.0, source="nav")
+    world.drive(0.3, -0.8, 2.0, source="teleop")
+    world.call("stop")
+    world.run(1.0)
+    world.call("clear")
+    world.drive(-0.4, 0.0, 1.0)
+    world.loop.leaving = True
+    world.run(0.7)
+
+
+def stuck(world: World) -> None:
+    """A wheel whose encoder stands: left out, then a fault."""
+    world.drive(0.5, 0.0, 1.0)
+    with world.mcu.stuck_encoder(0):
+        world.hold(0.5, 0.4, seconds=3.0)
+
+
+def faults(world: World) -> None:
+    """The first dozen faults of the simulator, for half a second each."""
+    drive_through_faults(world, 12.0)
+
+
+DRIVES = (
+    ("quiet", PLAIN, quiet),
+    ("stuck", PLAIN, stuck),
+    ("faults", PLAIN, faults),
+    ("checked", CHECKED, quiet),
+)
+
+
+def main() -> None:
+    for name, config, drive in DRIVES:
+        tape = Tape()
+        world = World(config, recorder=tape)
+        world.bus.wanted = set()
+        drive(world)
+        path = HERE / f"{name}.mcap"
+        path.unlink(missing_ok=True)
+        tape.write(path, config)
+        print(f"{path.name}: {path.stat().st_size} bytes, {len(tape.taken)} steps")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Drives in virtual time, recorded in memory or in a file, for the tests of the black box."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.config.writing import document
+from acsard.record.batch import decode, encode
+from acsard.record.file import About, Writing
+from acsard.record.replay import Replay
+from acsard.record.state import freeze, thaw
+from acsard.record.steps import Step, Taken
+from acsard.record.story import told
+from acsard.robot import Robot
+from acsard.sim.fake_mcu import FakeMcu
+from acsard.sim.faults import FAULTS, Fault
+from acsard.values import Inputs, Outputs, Recording
+from tests.scenarios.world import World
+
+BATCH = 200
+"""Steps; about a second."""
+
+WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
+    "stuck_encoder": (0,), "frozen_encoder": (1,), "dead_motor": (2,), "reversed_motor": (3,),
+    "reversed_encoder": (0,), "reversed_wheel": (1,), "swapped_motors": (0, 1),
+    "swapped_encoders": (2, 3), "swapped_wheels": (1, 2), "bias": (0, 1.2), "other_baud": (57600,),
+    "pushed": (0.2,), "stalls": (0.5, 0.12),
+}  # fmt: skip
+"""A case of every fault that needs arguments."""
+
+
+class Tape:
+    """A black box in memory."""
+
+    def __init__(self, every: int = 0) -> None:
+        """`every`: how many steps lie between two states that it takes by itself."""
+        self._every = every
+        self.taken: list[Taken] = []
+        self.states: dict[int, bytes] = {}
+        """The robot before the step of that number, of those asked for by `cut`."""
+        self.cut = False
+        self.status = Recording("memory")
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        self.taken.append(Taken(inputs, outputs, left))
+        if self.cut or (self._every and len(self.taken) % self._every == 0):
+            self.cut = False
+            self.states[len(self.taken)] = freeze(robot, last)
+
+    def steps(self, first: int = 0) -> list[Step]:
+        """What a recording from that step on says."""
+        starts = range(first, len(self.taken), BATCH)
+        return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
+
+    def write(self, path: Path, config: Config) -> None:
+        """The file that the daemon would have written."""
+        now = self.taken[0].inputs.now
+        text = "\n".join(document(effective(config))) + "\n"
+        about = About(config.robot.id, "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, text)
+        writing = Writing(path, about)
+        for at in range(0, len(self.taken), BATCH):
+            batch = self.taken[at : at + BATCH]
+            before = self.taken[at - 1].outputs.reason if at else None
+            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch, before))
+            for _, outputs, _ in batch:
+                for event in outputs.events:
+                    writing.event(told(event, outputs.now.wall_ns))
+            writing.flush()
+        writing.finish()
+
+
+def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
+    """The tape lived again, from the start or from a state it has."""
+    state = thaw(tape.states[first]) if first else ()
+    replay = Replay(config, *state)
+    for step in tape.steps(first):
+        replay.step(step)
+    return replay
+
+
+def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
+    """Each fault of the simulator as a `with` block to be."""
+    plain = [(name, getattr(mcu, name)) for name in FAULTS]
+    cases = WITH_ARGUMENTS.items()
+    return plain + [
+        (name, lambda name=name, given=given: getattr(mcu, name)(*given)) for name, given in cases
+    ]
+
+
+def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[str]:
+    """Drive with each fault in turn for half a second, then what else happens to a robot."""
+    dice, end_ns, had = random.Random(seed), world.now_ns + int(seconds * 1e9), []
+    while True:
+        for name, fault in every_fault(world.mcu):
+            world.drive(dice.uniform(-1.5, 1.5), dice.uniform(-3, 3), 0.4, hz=20.0)
+            with fault():
+                world.hold(dice.uniform(-1, 1), dice.uniform(-2, 2), seconds=0.5)
+            if world.state.mode == "fault":
+                world.send(0.0)
+                world.run(0.5)
+                world.call("clear")
+            had.append(name)
+            if world.now_ns > end_ns:
+                return had
+        _happenings(world, dice)
+
+
+def _happenings(world: World, dice: random.Random) -> None:
+    world.call("stop")
+    world.hold(0.5, seconds=0.3)
+    world.call("clear")
+    world.call("set_pose", b'{"x": 1.5, "y": -2.0, "yaw": 0.3}')
+    world.put("cmd/app", b'{"linear": {"x": "fast"}}')
+    world.stall(dice.uniform(0.05, 0.4))
+    world.drive(0.5, 0.1, 0.5, source="teleop")
+    world.stall_in_step(0.03)
+    world.hold(0.5, seconds=0.3, source="teleop")
+    world.port.takes = 7
+    world.run(0.1)
+    world.port.blocked = True
+    world.hold(0.5, seconds=0.2)
+    world.port.blocked = False
+    world.wall_offset_ns += dice.randrange(-(10**12), 10**12)
+    world.port.unplug()
+    world.port.trouble = "the serial port was lost; reopening it"
+    world.run(0.5)
+    world.port.trouble = ""
+    world.port.plug(world.mcu)
+    world.mcu.reset(world.now_ns)
+    world.run(1.0)
+    world.call("deactivate")
+    world.call("activate")

@@ -1,0 +1,184 @@
+"""What was recorded is lived again, to the byte; and a change of anything shows."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.settings import Config
+from acsard.record.merge import adopt
+from acsard.record.replay import Replay
+from acsard.record.state import thaw
+from acsard.robot import Robot
+from acsard.sim.faults import FAULTS
+from tests.scenarios.taped import (
+    WITH_ARGUMENTS,
+    Tape,
+    drive_through_faults,
+    replayed,
+)
+from tests.scenarios.world import World
+
+PLAIN = Config()
+FULL = replace(
+    PLAIN,
+    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    odometry=replace(PLAIN.odometry, gyro=True),
+)
+SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
+
+
+def taped(config: Config, seconds: float) -> Tape:
+    tape = Tape()
+    world = World(config, recorder=tape)
+    world.bus.wanted = set()
+    drive_through_faults(world, seconds)
+    return tape
+
+
+def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) -> None:
+    tally = replayed(tape, config, first).tally
+    assert tally.first is None
+    assert tally.exact
+    assert tally.steps == tally.modes_same == len(tape.taken) - first
+    assert tally.lines == tally.lines_same >= least
+    assert tally.poses == tally.poses_same >= least
+
+
+@pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
+def test_a_drive_through_every_fault_is_lived_again_to_the_last_bit(config: Config) -> None:
+    tape = Tape()
+    world = World(config, recorder=tape)
+    world.bus.wanted = set()
+    assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS}
+    inputs = [taken.inputs for taken in tape.taken]
+    for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
+        assert any(getattr(one, has) for one in inputs), has
+    lives_again(tape, config)
+
+
+def test_settings_that_were_changed_meanwhile_are_lived_again_too() -> None:
+    tape = Tape()
+    world = World(PLAIN, recorder=tape)
+    world.drive(0.5, seconds=1.0)
+    world.call("stop")
+    world.run(2.0)
+    settings = {"limits.wheel_speed": 60.0, "limits.linear_speed": 2.5}
+    assert world.call("set", msgspec.json.encode({"settings": settings})).success
+    tape.cut = True
+    world.call("clear")
+    (first,) = tape.states
+    world.drive(2.5, seconds=4.0)
+    fastest = max(max(map(abs, t.outputs.speeds.as_tuple())) for t in tape.taken)
+    assert fastest > PLAIN.limits.wheel_speed
+    lives_again(tape, PLAIN)
+    lives_again(tape, PLAIN, first)
+
+
+def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
+    tape = Tape(every=397)
+    world = World(FULL, recorder=tape)
+    world.bus.wanted = set()
+    drive_through_faults(world, 20.0)
+    assert len(tape.states) > 5
+    for first in tape.states:
+        lives_again(tape, FULL, first, 1)
+
+
+@pytest.mark.slow
+def test_ten_minutes_through_every_fault_are_lived_again() -> None:
+    lives_again(taped(FULL, 600.0), FULL)
+
+
+@pytest.mark.soak
+def test_an_hour_through_every_fault_is_lived_again() -> None:
+    lives_again(taped(PLAIN, 3600.0), PLAIN)
+
+
+@pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
+def test_a_recording_that_begins_in_a_drive_goes_on_from_its_state(config: Config) -> None:
+    tape = Tape()
+    world = World(config, recorder=tape)
+    world.drive(0.6, 0.4, seconds=2.0)
+    tape.cut = True
+    world.hold(0.6, -0.4, seconds=3.0)
+    (first,) = tape.states
+    assert tape.taken[first].outputs.mode == "driving"
+    lives_again(tape, config, first)
+
+
+def test_a_line_that_was_otherwise_is_named_with_what_each_side_knew() -> None:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
+    number = len(tape.taken) - 3
+    while tape.taken[number].outputs.line is None:
+        number -= 1
+    taken = tape.taken[number]
+    other = replace(taken.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    tape.taken[number] = taken._replace(outputs=other)
+    first = replayed(tape, PLAIN).tally.first
+    assert first is not None
+    assert (first.number, first.what) == (number, ("line",))
+    assert (first.then.line, first.now.line) == (other.line, taken.outputs.line)
+
+
+def test_a_command_that_had_not_come_makes_another_drive() -> None:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
+    moves = [n for n, t in enumerate(tape.taken) for c in t.inputs.commands if c.twist.linear]
+    number = moves[0]
+    taken = tape.taken[number]
+    tape.taken[number] = taken._replace(inputs=replace(taken.inputs, commands=()))
+    first = replayed(tape, PLAIN).tally.first
+    assert first is not None
+    assert number <= first.number <= number + 1
+    assert "line" in first.what or "mode" in first.what
+
+
+def test_one_bit_of_a_pose_is_told_from_none() -> None:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
+    number = max(n for n, t in enumerate(tape.taken) if t.outputs.estimates)
+    taken = tape.taken[number]
+    (estimate,) = taken.outputs.estimates
+    nudged = replace(estimate, pose=replace(estimate.pose, x=estimate.pose.x + 1e-15))
+    tape.taken[number] = taken._replace(outputs=replace(taken.outputs, estimates=(nudged,)))
+    tally = replayed(tape, PLAIN).tally
+    assert (tally.same, tally.exact) == (True, False)
+
+
+def test_other_limits_name_the_first_line_that_differs() -> None:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, seconds=2.0)
+    replay = Replay(SLOW_LIMITS)
+    for step in tape.steps():
+        replay.step(step)
+    first, tally = replay.tally.first, replay.tally
+    assert first is not None
+    assert first.what == ("line", "left")
+    assert first.then.status[0] == first.now.status[0] == "driving"
+    assert tally.fastest == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
+
+
+def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.3, seconds=2.0)
+    tape.cut = True
+    world.hold(0.5, 0.3, seconds=2.0)
+    (first,) = tape.states
+    state = thaw(tape.states[first])
+    adopt(state.robot, Robot(PLAIN), Robot(SLOW_LIMITS))
+    replay = Replay(SLOW_LIMITS, *state)
+    for step in tape.steps(first):
+        replay.step(step)
+    tally = replay.tally
+    assert tally.modes_same == tally.steps
+    assert tally.first is not None
+    line = tape.steps(first)[-1].said.line
+    assert line is not None
+    last = replay.step(tape.steps(first)[-1])
+    assert last is not None
+    assert last.now.line is not None
+    assert last.now.line < line  # slower, both forwards

@@ -1,0 +1,171 @@
+"""The black box of the real process: killed, on a full disk, on a slow one, on none at all."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system import bystander
+from tests.system.harness import Bus, Daemon, acsard, environment, finish, until
+
+LOST_S = 1.5
+"""What a kill or a power cut may cost at most."""
+
+SLOW_DISK = """\
+import os, time
+
+_fsync = os.fsync
+
+def fsync(fd):
+    time.sleep(2.0)
+    _fsync(fd)
+
+os.fsync = fsync
+"""
+"""As `sitecustomize`: each sync of this process takes 2 s."""
+
+
+@contextmanager
+def recording(where: Path, name: str = "daemon", **how: Any) -> Iterator[tuple[Daemon, Bus]]:
+    """A daemon that records to `where/record`, linked, and a client of it."""
+    words = ["--record", str(where / "record")]
+    with Daemon(where, name=name, words=words, **how) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["link"] == "up", 5.0, "link up")
+        yield daemon, bus
+
+
+def files(where: Path) -> list[Path]:
+    return sorted(where.glob("record/*.mcap*"))
+
+
+def replayed(where: Path, path: Path) -> int:
+    """The number of lines, all of which come out the same."""
+    ended = finish(acsard("log", "replay", str(path)), where)
+    assert ended.code == 0, ended
+    found = re.match(r"([\d ]+) of ([\d ]+) lines the same", ended.out)
+    assert found, ended
+    assert found[1] == found[2]
+    return int(found[1].replace(" ", ""))
+
+
+def last_s(where: Path, path: Path) -> float:
+    """When the last step that can be read was, wall clock."""
+    code = (
+        "import sys, pathlib; from acsard.record import again, file;"
+        "recording = file.Recording(pathlib.Path(sys.argv[1]));"
+        "print(max(step.inputs.now.wall_ns for step in again.steps(recording)))"
+    )
+    return int(finish([sys.executable, "-c", code, str(path)], where).out) / 1e9
+
+
+def killed(where: Path, seconds: float) -> None:
+    began = time.monotonic()
+    with recording(where) as (daemon, bus):
+        with bus.commanding(0.3):
+            time.sleep(seconds)
+        daemon.process.kill()
+        end_s, end = time.time(), time.monotonic()
+        daemon.process.wait()
+    (path,) = [path for path in files(where) if path.name.endswith(".part")]
+    late = bystander.lost(began, end)
+    assert end_s - last_s(where, path) < LOST_S + late
+    assert replayed(where, path) > 50
+
+
+def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: Path) -> None:
+    killed(tmp_path, 1.5)
+    (cut,) = files(tmp_path)
+    lines = replayed(tmp_path, cut)
+    with recording(tmp_path):
+        until(lambda: len(files(tmp_path)) == 2, 5.0, "a new file")
+    whole, new = files(tmp_path)
+    assert whole.name.endswith(".kept.mcap")
+    assert new.name > whole.name
+    assert replayed(tmp_path, whole) == lines
+    listed = finish(acsard("log", "--directory", str(tmp_path / "record")), tmp_path)
+    assert whole.name in listed.out.splitlines()[0]
+    assert "no end" not in listed.out.splitlines()[0]
+
+
+@pytest.mark.soak
+def test_fifty_kills_cost_little_each(tmp_path: Path) -> None:
+    for number in range(50):
+        where = tmp_path / str(number)
+        where.mkdir()
+        killed(where, 1.5 + 0.03 * number)
+
+
+def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
+    tmp_path: Path,
+) -> None:
+    with recording(tmp_path, before=["sh", "-c", 'umask 0; exec "$@"', "sh"]) as (daemon, bus):
+        with bus.commanding(0.3):
+            until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")
+        daemon.process.terminate()
+        assert daemon.ended(5.0) == 0
+    (path,) = files(tmp_path)
+    assert path.name.endswith("Z.mcap")
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert path.parent.stat().st_mode & 0o777 == 0o750
+    assert replayed(tmp_path, path) > 3
+
+
+@pytest.mark.slow
+def test_a_slow_disk_costs_no_period(tmp_path: Path) -> None:
+    slow = tmp_path / "slow"
+    slow.mkdir()
+    (slow / "sitecustomize.py").write_text(SLOW_DISK)
+    env = environment()
+    env["PYTHONPATH"] = f"{slow}:{env['PYTHONPATH']}"
+    other = tmp_path / "other"
+    other.mkdir()
+    with (
+        recording(tmp_path, env=env) as (daemon, bus),
+        Daemon(other) as plain,
+        Bus(plain.endpoint) as beside,
+    ):
+        began = time.monotonic()
+        before, others = bus.count("missed_periods"), beside.count("missed_periods")
+        time.sleep(5.0)
+        missed = bus.count("missed_periods") - before
+        others = beside.count("missed_periods") - others
+        late = bystander.lost(began)
+        assert missed < others + 50 + 100 * late  # a sync in the loop would cost 200
+        assert bus.state()["recording"] == ""
+        daemon.process.terminate()
+        daemon.ended(5.0)
+    (path,) = files(tmp_path)
+    assert replayed(tmp_path, path) > 50
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
+    full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes a file
+    with recording(tmp_path, before=full) as (daemon, bus):
+        with bus.commanding(0.3):
+            until(lambda: "File too large" in bus.state()["recording"], 30.0, "it is said")
+            assert bus.state()["mode"] == "driving"
+            row = next(r for r in bus.get("diagnostics")["status"] if "recording" in r["name"])
+            assert row["level"] == 1
+        assert any(e["level"] == "warning" for e in daemon.events("recording"))
+        until(lambda: bus.state()["recording"] == "", 30.0, "it is tried again")
+    for path in files(tmp_path):
+        assert replayed(tmp_path, path) > 0
+
+
+def test_a_directory_that_cannot_be_made_is_said_and_the_robot_runs(tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,
+        Bus(daemon.endpoint) as bus,
+    ):
+        until(lambda: "/proc/nowhere" in bus.state()["recording"], 10.0, "it is said")
+        bus.linked()
+        with bus.commanding(0.3):
+            until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")

@@ -1,0 +1,35 @@
+"""Every drive in `tests/recordings` comes out as it did when it was recorded.
+
+One that fails names the first line, mode or pose that is another now. Where the change is wanted,
+`python -m tests.recordings` writes those anew that are the simulator's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acsard.record.again import differs, live
+from acsard.record.file import Recording
+
+RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
+
+MOST_BYTES = 100_000
+
+
+def test_there_are_some_and_each_is_small() -> None:
+    assert len(RECORDINGS) >= 3
+    sizes = {path.name: path.stat().st_size for path in RECORDINGS}
+    assert {name: size for name, size in sizes.items() if size > MOST_BYTES} == {}
+
+
+@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
+def test_it_comes_out_as_it_did(path: Path) -> None:
+    recording = Recording(path)
+    tally, trouble = live(recording)
+    assert trouble == ""
+    if tally.first is not None:
+        pytest.fail("\n".join(differs(tally.first, recording.about.mono_ns)))
+    assert tally.lines == tally.lines_same > 100
+    assert tally.modes_same == tally.steps

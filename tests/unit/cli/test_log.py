@@ -1,0 +1,148 @@
+"""`acsard log`: the list, the story, the replay, the recovered file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from acsard.cli import main
+from acsard.cli.log import SERVICE
+from acsard.config.settings import Config
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+@pytest.fixture(scope="module")
+def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recordings, the second cut."""
+    where = tmp_path_factory.mktemp("record")
+    for number, seconds in ((1, 2.0), (2, 4.0)):
+        tape = Tape()
+        world = World(recorder=tape)
+        world.drive(0.5, seconds=seconds)
+        world.call("stop")
+        world.run(0.5)
+        path = where / f"00000{number}-20270115T080000Z.mcap"
+        tape.write(path, Config())
+    path.rename(path.with_name(path.name + ".part"))
+    path = path.with_name(path.name + ".part")
+    path.write_bytes(path.read_bytes()[:-2000])
+    return where
+
+
+def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[int, str, str]:
+    code = main(["log", *words, "--directory", str(where)])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+def test_the_list_has_a_line_each_and_says_what_happened(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = log(capsys, where)
+    first, second = out.splitlines()
+    assert code == 0
+    assert "000001-20270115T080000Z.mcap" in first
+    assert first.endswith("1 takeover, 1 stop (stopped by unnamed (native))")
+    assert second.endswith("[no end: cut, or being written]")
+
+
+def test_a_story_is_told_in_order_as_sentences_or_json(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, where, "show", "1")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].endswith("start: the daemon starts")
+    assert any("drive: drove 0.85 m in 2.0 s (by app)" in line for line in lines)
+    _, out, _ = log(capsys, where, "show", "1", "--json")
+    told = [json.loads(line) for line in out.splitlines()]
+    assert len(told) == len(lines)
+    assert [one["seconds"] for one in told] == sorted(one["seconds"] for one in told)
+
+
+def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
+    where: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def names(*words: str) -> set[str]:
+        _, out, _ = log(capsys, where, "show", "1", "--json", *words)
+        return {json.loads(line)["name"] for line in out.splitlines()}
+
+    assert "start" in names("--to", "1")
+    assert names("--from", "1.5", "--to", "2.5") == {"stop", "drive", "mode"}
+    first = log(capsys, where, "show", "1")[1].split(" ")[0]
+    hours, minutes, seconds = first.split(":")
+    after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
+    assert names("--from", after) == names("--from", "1.5")
+
+
+@pytest.mark.parametrize("when", ["late", "12:3", "-1", "12:00:00:00"])
+def test_a_time_that_is_none_is_refused(
+    where: Path, when: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        log(capsys, where, "show", "1", f"--from={when}")
+    assert "neither seconds nor HH:MM:SS" in capsys.readouterr().err
+
+
+def test_a_replay_says_that_all_is_the_same(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, where, "replay", "1")
+    assert (code, err) == (0, "")
+    same, _, rest = out.partition(" lines the same, ")
+    now, _, then = same.partition(" of ")
+    assert now == then
+    assert " poses, " in rest
+
+
+def test_a_replay_of_what_was_cut_says_so(where: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = log(capsys, where, "replay")  # without a name: the newest
+    assert code == 0
+    assert "no end" in err
+
+
+def test_with_another_configuration_it_tells_what_would_have_been(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "slow.toml"
+    other.write_text("[limits]\nlinear_speed = 0.3\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    assert code == 0
+    assert "the first that differs, by its line, left: step " in out
+    assert "  then  ap" in out
+    assert "the fastest wheel: 10.00 rad/s then, 6.00 rad/s now" in out
+
+
+def test_what_was_cut_is_written_as_a_finished_file(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.mcap"
+    (cut,) = where.glob("*.part")
+    code, out, _ = log(capsys, where, "recover", str(cut), str(new))
+    assert code == 0
+    assert f"messages in {new}" in out
+    assert main(["log", "replay", str(new)]) == 0
+    assert capsys.readouterr().err == ""
+    assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
+
+
+def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert log(capsys, tmp_path)[:2] == (0, f"no recordings in {tmp_path}\n")
+    code, _, err = log(capsys, tmp_path, "show")
+    assert (code, "no recording in" in err) == (1, True)
+    code, _, err = log(capsys, tmp_path / "none")
+    assert (code, "--directory" in err) == (1, True)
+    (tmp_path / "x").write_bytes(b"x")
+    assert main(["log", "replay", str(tmp_path / "x")]) == 1
+    assert "no recording of acsard" in capsys.readouterr().err
+
+
+def test_it_looks_where_the_service_records() -> None:
+    unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
+    says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
+    state = Path("/var/lib") / says["StateDirectory"]
+    assert says["Environment"] == f"ACSARD_RECORD=%S/{says['StateDirectory']}/record"
+    assert state / "record" == SERVICE

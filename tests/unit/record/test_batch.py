@@ -1,0 +1,137 @@
+"""A batch of steps says exactly what came in and what went out."""
+
+from __future__ import annotations
+
+import random
+
+import msgspec
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.config.settings import Config
+from acsard.record.batch import BatchError, decode, encode
+from acsard.record.steps import Taken, microposes, status_of
+from acsard.robot import Robot
+from acsard.values import (
+    Command,
+    Event,
+    GyroSample,
+    Inputs,
+    Instant,
+    Pose,
+    Received,
+    Refusal,
+    Request,
+    Twist,
+)
+from tests.scenarios.taped import Tape, drive_through_faults
+from tests.scenarios.world import World
+
+INSTANTS = st.builds(Instant, st.integers(0, 1 << 60), st.integers(0, 1 << 60))
+READS = st.builds(Received, INSTANTS, st.binary(max_size=9))
+TEXT = st.text(max_size=20)
+COMMANDS = st.builds(
+    Command,
+    source=TEXT,
+    twist=st.builds(Twist, st.floats(-9, 9), st.floats(-9, 9)),
+    arrived_ns=st.integers(0, 1 << 60),
+    stamp_ns=st.none() | st.integers(-(1 << 61), 1 << 61),
+    sender=TEXT,
+    sequence=st.none() | st.integers(0, (1 << 63) - 1),
+    cancelled=st.booleans(),
+    shared=st.booleans(),
+)
+REQUESTS = st.builds(
+    Request,
+    verb=st.sampled_from(["stop", "clear", "set_pose"]),
+    id=st.integers(0, 1 << 40),
+    pose=st.none() | st.builds(Pose, st.floats(-9, 9)),
+    by=TEXT,
+)
+PARTS: dict[str, st.SearchStrategy[object]] = {
+    "now": INSTANTS,
+    "tick": st.booleans(),
+    "port_open": st.booleans(),
+    "opened": st.integers(0, 3),
+    "port_trouble": st.sampled_from(["", "gone"]),
+    "received": st.lists(READS, max_size=3).map(tuple),
+    "commands": st.lists(COMMANDS, max_size=2).map(tuple),
+    "requests": st.lists(REQUESTS, max_size=2).map(tuple),
+    "gyro": st.lists(
+        st.builds(GyroSample, st.integers(0, 1 << 60), st.none(), st.floats(-1, 1)), max_size=2
+    ).map(tuple),
+    "refusals": st.lists(st.builds(Refusal, TEXT, TEXT), max_size=2).map(tuple),
+    "guard_trip": st.sampled_from(["", "a wheel grows"]),
+    "superseded": st.booleans(),
+    "missed": st.integers(0, 5),
+    "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
+    "at_once": st.booleans(),
+    "leaving": st.booleans(),
+}
+INPUTS = st.builds(Inputs, **PARTS)
+
+
+def test_whatever_comes_into_a_step_is_recorded() -> None:
+    assert set(PARTS) == set(Inputs.__struct_fields__)
+
+
+@given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
+def test_all_that_can_come_in_comes_back(inputs: list[Inputs], first: int) -> None:
+    outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
+    steps = decode(encode(first, [Taken(one, outputs, b"other") for one in inputs]))
+    assert [step.inputs for step in steps] == inputs
+    assert [step.number for step in steps] == [first + n for n in range(len(inputs))]
+    assert {step.said.left for step in steps} == {b"other"}
+
+
+def driven() -> list[Taken]:
+    tape = Tape()
+    drive_through_faults(World(recorder=tape), 3.0)
+    return tape.taken
+
+
+TAKEN = driven()
+
+
+def test_what_went_out_comes_back() -> None:
+    for at in range(0, len(TAKEN), 100):
+        batch = TAKEN[at : at + 100]
+        for taken, step in zip(batch, decode(encode(at, batch)), strict=True):
+            said, outputs = step.said, taken.outputs
+            assert (said.line, said.left) == (outputs.line, taken.left)
+            assert said.status == status_of(outputs)
+            assert said.poses == microposes(outputs.estimates)
+            assert said.events == outputs.events
+
+
+def test_a_reason_that_stays_is_told_once_and_comes_back() -> None:
+    for at in range(100, len(TAKEN), 100):
+        reason, batch = TAKEN[at - 1].outputs.reason, TAKEN[at : at + 100]
+        brief = encode(at, batch, reason)
+        assert decode(brief, reason) == decode(encode(at, batch))
+        if batch[0].outputs.reason == reason:
+            assert len(brief) < len(encode(at, batch))
+
+
+def test_a_second_at_rest_takes_little() -> None:
+    tape = Tape()
+    World(recorder=tape).run(3.0)
+    batch = tape.taken[-200:]
+    assert len(zstandard.compress(encode(0, batch))) < 3 * len(batch)
+
+
+def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
+    whole, dice = encode(0, TAKEN[:100]), random.Random(1)
+    for _ in range(500):
+        data = bytearray(whole)
+        for _ in range(dice.randint(1, 4)):
+            data[dice.randrange(len(data))] = dice.randrange(256)
+        try:
+            decode(bytes(data[: dice.randint(1, 3 * len(data))]))
+        except BatchError:
+            pass
+    for other in (b"", b"\x90", msgspec.msgpack.encode({"first": 1})):
+        with pytest.raises(BatchError):
+            decode(other)

@@ -1,0 +1,186 @@
+"""A recording is read whatever became of its file: all that is whole, and never a traceback."""
+
+from __future__ import annotations
+
+import random
+import struct
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from acsard.config.settings import Config
+from acsard.host.errors import RecordingError
+from acsard.record.again import config_of, live, steps
+from acsard.record.file import MODE, Closing, Recording, closing, rewrite
+from acsard.record.steps import status_of
+from tests.scenarios.taped import BATCH, Tape
+from tests.scenarios.world import World
+
+
+@pytest.fixture(scope="module")
+def tape() -> Tape:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=6.0)
+    world.call("stop")
+    return tape
+
+
+@pytest.fixture(scope="module")
+def whole(tape: Tape, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("record") / "whole.mcap"
+    tape.write(path, Config())
+    return path
+
+
+def chunks(data: bytes) -> list[tuple[int, int]]:
+    """Where each chunk's record begins and ends, by the format's own words."""
+    found, at = [], 8
+    while at < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        if opcode == 6:
+            found.append((at, at + 9 + length))
+        at += 9 + length
+    return found
+
+
+def numbers(path: Path) -> list[int]:
+    return [step.number for step in steps(Recording(path))]
+
+
+def test_all_comes_back(tape: Tape, whole: Path) -> None:
+    recording = Recording(whole)
+    read = list(steps(recording))
+    assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
+    assert [step.said.status for step in read] == [status_of(t.outputs) for t in tape.taken]
+    assert (recording.whole, recording.damaged) == (True, 0)
+    assert config_of(recording) == Config()
+    assert live(recording).tally.same
+
+
+def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
+    with whole.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        got = [channel.topic for _, channel, _ in reader.iter_messages()]
+        (config,) = list(reader.iter_attachments())
+    assert got.count("steps") == -(-len(tape.taken) // BATCH)
+    assert summary.statistics.message_count == len(got)
+    assert config.name == "acsard.toml"
+
+
+def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> None:
+    assert whole.stat().st_mode & 0o777 == MODE == 0o640
+
+
+@pytest.mark.parametrize("cuts", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
+    whole: Path, tmp_path: Path, cuts: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(1), tmp_path / "cut.mcap"
+    (first, _), *_ = ends = chunks(data)
+    every = numbers(whole)
+    for _ in range(cuts):
+        size = dice.randrange(len(data))
+        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
+        path.write_bytes(data[:size] + tail)
+        kept = sum(end <= size for _, end in ends)
+        if size < first:
+            continue
+        got = numbers(path)
+        assert got == every[: len(got)]
+        assert len(got) >= kept * BATCH or got == every
+
+
+@pytest.mark.parametrize("files", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_of_a_file_with_damaged_chunks_all_others_are_read(
+    whole: Path, tmp_path: Path, files: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(2), tmp_path / "damaged.mcap"
+    spans, hits = chunks(data), 0
+    for _ in range(files):
+        bad = bytearray(data)
+        hit = dice.randrange(len(spans))
+        start, end = spans[hit]
+        at = dice.randrange(start + 60, end)
+        bad[at] ^= 1 << dice.randrange(8)
+        path.write_bytes(bad)
+        recording = Recording(path)
+        got = [step.number for step in steps(recording)]
+        assert recording.damaged == 1 or got == numbers(whole)  # a bit that says nothing
+        assert recording.whole == (recording.damaged == 0)
+        hits += recording.damaged
+        assert set(range(max(numbers(whole)) + 1)) - set(got) <= set(
+            range(hit * BATCH, (hit + 1) * BATCH)
+        )
+    assert hits > 0.8 * files
+
+
+def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_path: Path) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
+    said: list[str] = []
+    for _ in range(100):
+        bad = bytearray(data)
+        for _ in range(dice.randint(1, 20)):
+            bad[dice.randrange(len(bad))] = dice.randrange(256)
+        path.write_bytes(bad)
+        try:
+            live(Recording(path))
+        except RecordingError as error:
+            said.append(str(error))
+    assert said
+    assert all(str(path) in text for text in said)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
+def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "other"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="no recording of acsard"):
+        Recording(path)
+    with pytest.raises(RecordingError, match="cannot read"):
+        Recording(tmp_path / "none")
+
+
+def test_what_was_cut_becomes_a_finished_file(whole: Path, tmp_path: Path) -> None:
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    cut.write_bytes(whole.read_bytes()[: chunks(whole.read_bytes())[3][1] + 20])
+    rewrite(Recording(cut), new)
+    recording = Recording(new)
+    assert [step.number for step in steps(recording)] == numbers(cut) == list(range(4 * BATCH))
+    assert recording.whole
+    assert recording.about == Recording(whole).about
+    with new.open("rb") as stream:
+        assert len(list(make_reader(stream).iter_messages())) > 0
+
+
+def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_path: Path) -> None:
+    data, path = whole.read_bytes(), tmp_path / "gap.mcap"
+    start, _ = chunks(data)[2]
+    path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
+    tally, trouble = live(Recording(path))
+    assert tally.steps == 2 * BATCH
+    assert tally.same
+    assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
+
+
+def test_a_finished_file_says_at_its_end_what_happened(
+    tape: Tape, whole: Path, tmp_path: Path
+) -> None:
+    first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
+    said = closing(whole)
+    assert said is not None
+    assert (said.wall_ns, said.said) == (
+        first.wall_ns,
+        "1 takeover, 1 stop (stopped by unnamed (native))",
+    )
+    assert 0 <= last.wall_ns - said.last_ns < 2e9
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    assert closing(cut) is None
+    rewrite(Recording(cut), new)
+    assert closing(new) == said == Closing(said.wall_ns, said.last_ns, said.said)
+    assert closing(tmp_path / "none") is None

@@ -1,0 +1,211 @@
+"""The recorder between a loop that never waits and a disk that may do anything."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.settings import Config, RecordConfig
+from acsard.record import recorder as module
+from acsard.record.again import live, steps
+from acsard.record.file import Recording
+from acsard.record.recorder import MOST, Recorder
+from acsard.record.ring import KEPT, listed
+from acsard.values import Event
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def config(where: Path, megabytes: float = 10.0) -> Config:
+    return replace(Config(), record=RecordConfig(str(where), megabytes))
+
+
+class Bench:
+    """A world whose recorder writes when told: its thread waits for the end."""
+
+    def __init__(self, where: Path, monkeypatch: pytest.MonkeyPatch, megabytes: float = 10.0):
+        monkeypatch.setattr(module, "FLUSH_S", 1000.0)
+        monkeypatch.setattr(module, "CLOSE_S", 20.0)
+        self.said: list[Event] = []
+        self.where = where
+        self.recorder = Recorder(config(where, megabytes), self.said.append)
+        self.world = World(config(where, megabytes), recorder=self.recorder)
+
+    def write(self) -> None:
+        """What the thread does each second."""
+        self.recorder._disk.round(self.recorder._taken(), False)
+
+    def drive(self, seconds: float) -> None:
+        """Drive on, and write each second."""
+        for _ in range(round(seconds)):
+            self.world.hold(0.5, 0.2, seconds=1.0)
+            self.write()
+
+    def end(self) -> list[Path]:
+        self.recorder.close()
+        return listed(self.where)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(tmp_path, monkeypatch)
+
+
+def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+    assert lived.tally.steps == bench.world.steps
+    assert [event.text for event in bench.said] == [f"to {bench.where}"]
+    assert bench.recorder.status.missing == 0
+
+
+def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LONGEST_NS", 3_000_000_000)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(10.0)
+    paths = bench.end()
+    assert len(paths) > 2
+    count = 0
+    for path in paths:
+        lived = live(Recording(path))
+        assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+        count += lived.tally.steps
+    assert count == bench.world.steps
+
+
+def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    while bench.recorder.status.missing == 0:
+        bench.world.hold(0.5, 0.2, seconds=1.0)
+    assert bench.recorder.status.trouble == "the disk is too slow"
+    bench.world.hold(0.5, 0.2, seconds=1.0)
+    assert len(bench.recorder._queue) == MOST
+    bench.drive(3.0)
+    missing = bench.recorder.status.missing
+    assert bench.recorder.status.trouble == ""
+    assert missing > 100
+    before, after = bench.end()
+    assert [e.level for e in bench.said].count("warning") == 1
+    numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
+    assert len(numbers) == bench.world.steps - missing
+    for path in (before, after):
+        assert live(Recording(path)).tally.same
+    assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
+
+
+def test_a_disk_that_takes_nothing_is_said_tried_again_and_costs_only_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = tmp_path / "record"
+    where.write_bytes(b"no directory")
+    bench = Bench(where, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    assert "record: File exists" in bench.recorder.status.trouble
+    assert bench.recorder.status.missing > 100
+    assert bench.world.state.recording == bench.recorder.status.trouble
+    where.unlink()
+    bench.drive(10.0)
+    assert bench.recorder.status.trouble == ""
+    levels = [event.level for event in bench.said]
+    assert levels == ["warning", "info"]
+    (path,) = bench.end()
+    assert live(Recording(path)).tally.same
+    assert next(steps(Recording(path))).number > 100
+
+
+def happen_stop(world: World) -> None:
+    world.call("stop")
+
+
+def happen_loss(world: World) -> None:
+    world.port.unplug()
+    world.run(0.5)
+    world.port.plug(world.mcu)
+
+
+def happen_silence(world: World) -> None:
+    with world.mcu.mute():
+        world.run(0.5)
+
+
+def happen_fault(world: World) -> None:
+    with world.mcu.stuck_encoder(0):
+        world.hold(0.5, seconds=3.0)
+
+
+@pytest.mark.parametrize("happen", [happen_stop, happen_loss, happen_silence, happen_fault])
+def test_the_minute_before_and_after_what_happened_is_kept(
+    happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minute = 6  # s: the same in a tenth of the time
+    monkeypatch.setattr(module, "LONGEST_NS", minute * 10**9 // 3)
+    monkeypatch.setattr(module, "AROUND_NS", minute * 10**9)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.bus.wanted = set()
+
+    def rest(seconds: float) -> None:
+        for _ in range(round(seconds * 2)):
+            bench.world.run(0.5)
+            bench.write()
+
+    bench.world.drive(0.5, seconds=1.0)
+    rest(14.0)
+    began_s = bench.world.now_ns / 1e9
+    happen(bench.world)
+    ended_s = bench.world.now_ns / 1e9
+    rest(14.0)
+    paths = bench.end()
+    kept = [path.name.endswith(KEPT) for path in paths]
+    began = [Recording(path).about.mono_ns / 1e9 for path in paths]
+    spans = list(zip(began, [*began[1:], bench.world.now_ns / 1e9], strict=True))
+    close = [s < began_s + minute - 0.5 and e > ended_s - minute + 0.5 for s, e in spans]
+    near = [s < ended_s + minute + 2 and e > began_s - minute - 2 for s, e in spans]
+    assert 2 <= sum(close) <= sum(near) <= len(paths) - 2, (close, near)
+    for has, must, may in zip(kept, close, near, strict=True):
+        assert must <= has <= may
+
+
+def test_the_loop_only_appends(bench: Bench) -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=0.5)
+    inputs, outputs, left = tape.taken[-1]
+    held = threading.Lock()
+    with held:  # whatever the thread does meanwhile
+        bench.recorder.step(inputs, outputs, left, world.loop.robot, b"")
+    last = bench.recorder._queue[-1]
+    assert last == (inputs, outputs, left)
+    assert last[0] is inputs
+
+
+def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tls = tmp_path / "tls"
+    tls.mkdir()
+    for name in ("key.pem", "cert.pem", "ca.pem"):
+        (tls / name).write_text("-----BEGIN SECRET-----")
+    monkeypatch.setenv("ACSARD_SECRET", "BEGIN SECRET")
+    bench = Bench(tmp_path / "record", monkeypatch)
+    bench.end()
+    settings = config(tmp_path / "record")
+    settings = replace(settings, bus=replace(settings.bus, tls=str(tls), connect=("tls/r:7449",)))
+    recorder = Recorder(settings, bench.said.append)
+    world = World(settings, recorder=recorder)
+    world.put("cmd/app", b'{"password": "BEGIN SECRET"}')
+    world.drive(0.5, seconds=1.0)
+    recorder.close()
+    recording = Recording(listed(tmp_path / "record")[-1])
+    assert str(tls) in recording.about.config
+    read = [recording.about.config.encode(), *[data for _, _, data in recording.messages()]]
+    assert len(read) > 5
+    assert not any(b"BEGIN" in data for data in read)

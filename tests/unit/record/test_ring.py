@@ -1,0 +1,153 @@
+"""A directory of recordings keeps its bounds, and what must be kept goes last."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from acsard.config.settings import RecordConfig
+from acsard.record.file import About, Recording
+from acsard.record.ring import DIRECTORY_MODE, KEPT, KEPT_FILES, PART, Ring, listed
+
+DAY_NS = 86_400_000_000_000
+NOW_NS = 1_800_000_000_000_000_000
+
+
+def about(wall_ns: int = NOW_NS) -> About:
+    return About("acsar", "0.1.0", "3.11.0", 5, wall_ns, "")
+
+
+def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> Ring:
+    return Ring(RecordConfig(str(where), megabytes, days))
+
+
+def record(one: Ring, size: int = 10, keep: bool = False, days: int = 0) -> Path:
+    writing = one.begin(about(NOW_NS - days * DAY_NS))
+    writing.add("steps", NOW_NS, os.urandom(size))
+    return one.end(writing, keep)
+
+
+def sizes(where: Path) -> int:
+    return sum(path.stat().st_size for path in listed(where))
+
+
+def test_files_are_numbered_on_whatever_the_clock_says(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    for wall_ns in (NOW_NS, 0, NOW_NS - DAY_NS):
+        one.end(one.begin(about(wall_ns)), keep=False)
+    one.close()
+    names = [path.name for path in listed(tmp_path)]
+    assert [name[:6] for name in names] == ["000001", "000002", "000003"]
+    assert names[1] == "000002-19700101T000000Z.mcap"
+    again = ring(tmp_path)
+    assert record(again).name.startswith("000004")
+
+
+@pytest.mark.parametrize("umask", [0, 0o077])
+def test_the_directory_is_the_services_and_its_groups(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        one = ring(tmp_path / "b")
+        path = record(one)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "b").stat().st_mode & 0o777 == DIRECTORY_MODE == 0o750
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    kept = record(one, 400_000, keep=True)
+    first = record(one, 400_000)
+    for _ in range(40):
+        record(one, 400_000)
+        one.trim(NOW_NS)
+        assert sizes(tmp_path) <= 10e6
+    assert kept.exists()
+    assert not first.exists()
+    assert len(listed(tmp_path)) > 20
+
+
+def test_only_kept_files_are_bounded_in_bytes_too(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    for _ in range(30):
+        newest = record(one, 400_000, keep=True)
+    one.trim(NOW_NS)
+    assert sizes(tmp_path) <= 10e6
+    assert newest.exists()
+
+
+def test_of_kept_files_the_last_fifty_stay(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    paths = [record(one, keep=True) for _ in range(KEPT_FILES + 3)]
+    one.trim(NOW_NS)
+    assert [path.exists() for path in paths] == [False] * 3 + [True] * KEPT_FILES
+
+
+def test_days_are_bounded_but_not_of_what_is_kept(tmp_path: Path) -> None:
+    one = ring(tmp_path, days=2.0)
+    old, new, kept = record(one, days=3), record(one, days=1), record(one, keep=True, days=3)
+    one.trim(NOW_NS)
+    assert [path.exists() for path in (old, new, kept)] == [False, True, True]
+
+
+def test_what_is_being_written_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+    one = ring(tmp_path, days=0.01)
+    (tmp_path / "notes.mcap").write_bytes(b"mine")
+    (tmp_path / "notes-1.txt").write_bytes(b"mine")
+    writing = one.begin(about(0))
+    one.trim(NOW_NS)
+    assert writing.path.exists()
+    assert (tmp_path / "notes.mcap").exists()
+    assert len(listed(tmp_path)) == 1
+
+
+def test_a_file_becomes_a_kept_one_later(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    path = record(one)
+    one.keep(path)
+    assert [p.name for p in listed(tmp_path)] == [path.name.replace(".mcap", KEPT)]
+    one.keep(path)
+
+
+def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, b"whole")
+    writing.flush()
+    with writing.path.open("ab") as file:
+        file.write(b"\x06torn")
+    empty = one.begin(about())
+    empty.path.write_bytes(b"\x89MC")
+    one.close()
+    again = ring(tmp_path)
+    (path,) = listed(tmp_path)
+    assert path.name.endswith(KEPT)
+    recording = Recording(path)
+    assert [data for _, _, data in recording.messages()] == [b"whole"]
+    assert recording.whole
+    again.close()
+
+
+def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, b"whole")
+    writing.flush()
+    writing.close()
+    one.close()
+    Ring(RecordConfig(str(tmp_path)), crashed=False)
+    assert [path.name for path in listed(tmp_path)] == [writing.path.name.removesuffix(".part")]
+
+
+def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    with pytest.raises(OSError, match="another daemon records there"):
+        ring(tmp_path)
+    assert writing.path.name.endswith(PART)
+    assert writing.path.exists()
+    one.close()
+    ring(tmp_path).close()

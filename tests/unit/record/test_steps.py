@@ -1,0 +1,32 @@
+"""What a recording says of estimates: rounded, and a checksum that is not."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.record.steps import checksum, microposes
+from acsard.values import Estimate, Pose
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def estimates() -> list[Estimate]:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.2, seconds=0.5)
+    return [estimate for taken in tape.taken for estimate in taken.outputs.estimates]
+
+
+def test_poses_are_told_in_millionths() -> None:
+    (first, *_) = estimates()
+    turned = replace(first, pose=Pose(1.0000004, -2.0000006, 3.1415926))
+    assert microposes([turned]) == ((1_000_000, -2_000_001, 3_141_593),)
+
+
+def test_a_checksum_goes_on_and_sees_every_bit() -> None:
+    every = estimates()
+    assert checksum(every[5:], checksum(every[:5], 0)) == checksum(every, 0)
+    last = every[-1]
+    nudged = replace(last, pose=replace(last.pose, x=last.pose.x + 1e-16 + last.pose.x * 2e-16))
+    assert checksum([*every[:-1], nudged], 0) != checksum(every, 0)
+    turned = replace(last, positions=(0.0, *last.positions[1:]))
+    assert checksum([*every[:-1], turned], 0) != checksum(every, 0)

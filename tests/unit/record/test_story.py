@@ -1,0 +1,53 @@
+"""A recording in sentences."""
+
+from __future__ import annotations
+
+from acsard.record.batch import decode, encode
+from acsard.record.story import Story, Told, summary
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def story(tape: Tape, without: range = range(0)) -> list[Told]:
+    teller = Story()
+    steps = [s for s in decode(encode(0, tape.taken)) if s.number not in without]
+    return [one for step in steps for one in teller.step(step)]
+
+
+def driven() -> Tape:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.call("stop")
+    world.run(0.5)
+    world.loop.leaving = True
+    world.run(0.1)
+    return tape
+
+
+def test_it_begins_and_ends_with_the_daemon_and_tells_each_drive() -> None:
+    tape = driven()
+    told = story(tape)
+    assert (told[0].name, told[-1].name) == ("start", "end")
+    (drive,) = [one for one in told if one.name == "drive"]
+    assert drive.by == "app"
+    assert drive.text == "drove 0.85 m in 2.0 s"
+    assert "stop" in [one.name for one in told]
+    assert [one.seconds for one in told] == sorted(one.seconds for one in told)
+
+
+def test_steps_that_are_missing_are_said() -> None:
+    gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
+    assert gaps == ["60 steps are missing before this one"]
+
+
+def test_a_list_says_who_stopped_it_and_how_often_what_happened() -> None:
+    events = [
+        Told(1.0, "stop", "stopped", by="joe"),
+        Told(2.0, "stop", "stopped", by="joe"),
+        Told(2.5, "mode", "driving"),
+        Told(3.0, "fault", "a wheel", "error"),
+        Told(4.0, "command_refused", "old", count=7),
+    ]
+    assert summary(events) == "2 stops, 1 fault, 7 refused commands (stopped by joe)"
+    assert summary([]) == ""
