@@ -21,6 +21,9 @@ MEMORY = 64
 GAIN = 0.05
 """How quickly the usual delay and its spread follow."""
 
+SLOW = 0.0125
+"""How quickly it shows whose that spread is."""
+
 JITTER_NS = 350_000
 """What USB and the scheduler make of a constant delay: its mean deviation."""
 
@@ -35,6 +38,10 @@ MOST_LOST = 0.03
 
 SEVERAL = 0.15
 """Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
+
+THINKS = 0.6
+"""Share of the late reads whose spread is that, from which on it is the MCU's own: an adapter that
+is filled line by line makes it too, for a quarter of a second."""
 
 BATCH_NS = 2_000_000
 """A mean deviation that no MCU makes: an adapter holds the lines back."""
@@ -76,11 +83,13 @@ class Prompts:
         """Of a batched link: the least delay, ns, between two reads, and the share of the lost."""
         self._several = 0.0
         """Share of the reads that have several lines."""
+        self._thinking = 0.0
+        """Share of the reads in which the answers' delay varied as neither makes it."""
 
     @property
     def thinks(self) -> bool:
         """The answers' delay varies as no scheduler makes it, nor an adapter: it is the MCU's."""
-        return THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+        return self._thinking > THINKS and not self._batched
 
     @property
     def lost(self) -> bool:
@@ -105,6 +114,8 @@ class Prompts:
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone = at_ns, alone
         self._several += GAIN * ((not alone) - self._several)
+        varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+        self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
             self._weigh(lines, since)
         elif self._delay is not None:
