@@ -33,6 +33,9 @@ THOUGHT_NS = 800_000
 RISE_NS = 20_000
 """By which a batched link's least delay is forgotten, read by read."""
 
+LOSING = 0.005
+"""How quickly the share of lost answers follows: in 20 reads two lost ones would make it 3 %."""
+
 MOST_LOST = 0.03
 """Share of answers lost on a batched link, from which on nobody can tell whose one is."""
 
@@ -180,7 +183,7 @@ class Prompts:
             if late <= self._batch + 2 * JITTER_NS or at - left[lines] < self._soonest:
                 break
             self._passed, lost = left.popleft(), lost + 1
-        self._losses += GAIN * (lost / (lines + lost) - self._losses)
+        self._losses += LOSING * (lost / (lines + lost) - self._losses)
         # A line that is given up too late makes an answer later, none makes it earlier.
         self._base = min(self._base + RISE_NS, at - left[lines - 1])
         self._delay = self._base
