@@ -28,6 +28,7 @@ from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
+from acsard.mcu.lattice import on
 from acsard.values import (
     REST,
     STILL,
@@ -154,6 +155,7 @@ class Odometry:
                 moved_dt += dt - bridged
             else:
                 counted = feedback.counted
+                self._uncertainty.show_count(_count(feedback))
         else:
             turned = _sum(turned, feedback.turned)
         said = _times(speeds.as_tuple(), moved_dt)
@@ -267,6 +269,15 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
+
+
+def _count(line: Feedback) -> float:
+    """rad of the coarsest encoder's count, of a line that shows whole ones; 0 if none does."""
+    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
+    return max([
+        step * turned / speed for turned, speed, step in rows
+        if speed and 0.0 < step < math.inf and on(speed, step)
+    ], default=0.0)  # fmt: skip
 
 
 def _sum(a: Motors, b: Motors) -> Motors:
