@@ -32,6 +32,7 @@ from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
+from acsard.mcu.lattice import on
 from acsard.values import (
     REST,
     STILL,
@@ -94,6 +95,8 @@ class Odometry:
         self._rolling = Rolling()
         self._held = NOWHERE
         """rad of counts at rest, whose way is not clear yet."""
+        self._steps_seen = NOWHERE
+        """Those of the lines of which the counts are known."""
         self._path = Path()
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
@@ -169,6 +172,8 @@ class Odometry:
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
         rolled = self._rolling.take(feedback, self.speeds)
+        if feedback.counted is not None and feedback.steps is not self._steps_seen:
+            self._see(feedback)
         turn, by_wheels = None, 0.0
         if gyro is not None:
             by_wheels = self._wheels_turn(rolled)
@@ -202,6 +207,12 @@ class Odometry:
             feedback.asked_ns,
             feedback.heard_ns,
         )
+
+    def _see(self, line: Feedback) -> None:
+        """The counts that a line shows are the covariance's; all four, once every wheel turns."""
+        if all(line.speeds.as_tuple()):
+            self._steps_seen = line.steps
+        self._uncertainty.show_count(_count(line))
 
     def _wheels_turn(self, rolled: Rolled) -> float:
         """rad by which the wheels say the robot turned since the last line that was believed."""
@@ -316,3 +327,12 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
+
+
+def _count(line: Feedback) -> float:
+    """rad of the coarsest encoder's count, of a line that shows whole ones; 0 if none does."""
+    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
+    return max([
+        step * turned / speed for turned, speed, step in rows
+        if speed and 0.0 < step < math.inf and on(speed, step)
+    ], default=0.0)  # fmt: skip

@@ -42,6 +42,9 @@ MAX_VARIANCE = 1e9
 COARSE_COUNTS = 400
 """Per wheel turn, where the configuration does not tell: hardly an encoder has fewer."""
 
+SAME_COUNT = 0.02
+"""Share by which the angle of a count seems another one for the rounding of two decimals."""
+
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
@@ -59,11 +62,10 @@ class PoseUncertainty:
         self._half = kinematics.track / 2
         self.use(odometry)
         self._parameters = columns(odometry, kinematics)
-        # A side is the mean of two wheels, each of which may stand anywhere within a count.
-        count = kinematics.radius * math.tau / (counts or COARSE_COUNTS)
-        self._play = count / kinematics.track
-        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / kinematics.track**2, 0.0)
-        self._counted = counts > 0
+        self._radius, self._track = kinematics.radius, kinematics.track
+        self._configured = self._counted = counts > 0
+        self._count = 0.0
+        self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
         """m in odom, and of the wheels' way, since the last look at what is of second order."""
         self.set(0.0)
@@ -73,6 +75,12 @@ class PoseUncertainty:
         how certain they are stay."""
         self._start = odometry.pose_covariance_diagonal
         self._noise = Noise(odometry, self._kinematics)
+
+    def _stand_within(self, angle: float) -> None:
+        """A side is the mean of two wheels, each of which may stand anywhere within that, rad."""
+        self._count, count = angle, self._radius * angle
+        self._play = count / self._track
+        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / self._track**2, 0.0)
 
     def set(self, yaw: float) -> None:
         """The pose is as certain as at the start, with its heading at `yaw`."""
@@ -92,6 +100,21 @@ class PoseUncertainty:
         self.covariance = self._p
         """As published: of x, y and yaw in odom."""
         self._publish()
+
+    def show_count(self, angle: float) -> None:
+        """The lines show by themselves what a count of the encoders is, rad; what is configured
+        counts before that.
+
+        So the pose is one of whole counts: from where in one the robot started is not known either.
+        """
+        if self._configured or angle <= 0.0:
+            return
+        if self._counted and abs(angle - self._count) < SAME_COUNT * self._count:
+            return
+        self._stand_within(angle)
+        if not self._counted:
+            self._counted = True
+            self._p = added(self._p, *self._phase, self._cos, self._sin)
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,

@@ -13,6 +13,7 @@ import math
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.residual import MEMORY_S, Residual
+from acsard.drive.stuck import Stuck
 from acsard.drive.suspect import WORDS, Known, Lie, Suspect, has_lied
 from acsard.mcu.frames import Motors
 from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
@@ -36,6 +37,8 @@ SLIP_TOLD_S = 0.1
 BACK_S = 0.5
 """s for which a wheel that was left out must agree, rolling, to be believed again."""
 
+NONE = [False] * 4
+
 LEFT, RIGHT = (1, 2), (0, 3)
 """The front and the rear wheel of each side, in `WHEELS` order."""
 
@@ -48,6 +51,7 @@ class _Side:
         self.residual = Residual()
         self.suspected = False
         self._suspects = (Suspect(), Suspect())
+        self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
         """0 the front, 1 the rear one."""
         self._lie: Lie = "dead"
@@ -84,6 +88,21 @@ class _Side:
             self.event = Event("wheels_doubted", again, kind="again")
             self.out, self.residual.learns = None, True
 
+    def stands_still(
+        self, turned: Motors, same: list[bool], dt: float, count: float, slow: float, wish: float
+    ) -> bool:
+        """Whether a wheel is left out from now on: its speed stays while all else changes."""
+        if self.out is not None:
+            return False
+        front, rear = self.wheels
+        for i, (own, other) in enumerate(((front, rear), (rear, front))):
+            alike = turned[own] * self.residual.stand_in(front=i == 1)
+            apart = turned[other] - alike
+            if self._stuck[i].says(same[own], apart, dt, count, slow, wish):
+                self._leave_out(i, "stuck")
+                return True
+        return False
+
     def contradict(
         self, turned: Motors, same: tuple[bool, bool], dt: float, count: float, known: Known
     ) -> bool:
@@ -98,7 +117,7 @@ class _Side:
             if suspect.looks(own, other, same[i], dt, count):
                 suspect.compare(own, other, dt, known)
                 if suspect.lies(count):
-                    self._leave_out(i)
+                    self._leave_out(i, suspect.lie or "dead")
                     return True
         if not self.residual.slips:
             self._pass(dt)
@@ -122,8 +141,8 @@ class _Side:
         if not self.slip_s:
             self._odd_s = 0.0
 
-    def _leave_out(self, i: int) -> None:
-        self._lie, self.residual.learns = self._suspects[i].lie or "dead", False
+    def _leave_out(self, i: int, lie: Lie) -> None:
+        self._lie, self.residual.learns = lie, False
         self.out, self.slip_s, self._odd_s, self.suspected = i, 0.0, 0.0, False
         for suspect in self._suspects:
             suspect.forget()
@@ -142,7 +161,7 @@ class Witness:
         self._slow_left = self._slow_right = 0.0
         """rad/s of wheels that follow their command slowly."""
         self._last = STILL
-        self._busy = self._leaves_out = False
+        self._busy = self._leaves_out = self._stands = False
         self.slips = False
         """Front and rear of a side contradict each other, or did half a second ago."""
         self._found: _Side | None = None
@@ -201,13 +220,18 @@ class Witness:
         left = self._left.residual.add(front_left, rear_left, keep, dt, count)
         right = self._right.residual.add(front_right, rear_right, keep, dt, count)
         last, self._last = self._last, speeds
-        if left and right and not self._busy:
-            return False
         same = [a == b for a, b in zip(speeds.as_tuple(), last.as_tuple(), strict=True)]
+        stood, self._stands = self._stands, True in same
         self._found = None
+        if stood or self._stands:
+            self._found = self._standing(turned, same if stood else NONE, dt, told)
+        if self._found is None and left and right and not self._busy:
+            return False
         for i, side in enumerate(self._sides):
             front, rear = side.wheels
             agree, other_agrees = (right, left) if i else (left, right)
+            if side is self._found:
+                continue
             if agree:
                 side.agree(dt)
                 continue
@@ -216,6 +240,21 @@ class Witness:
                 self._found = side
         self._sum_up()
         return self._found is not None
+
+    def _standing(
+        self, turned: Motors, same: list[bool], dt: float, told: WheelSpeeds | None
+    ) -> _Side | None:
+        """The side of which a wheel is stuck, of wheels that turn."""
+        if told is None:
+            return None
+        found = None
+        turns = [one and angle != 0.0 for one, angle in zip(same, turned, strict=True)]
+        slow = self._slow_left, self._slow_right
+        wish = told.front_left, told.front_right
+        for side, slowly, command in zip(self._sides, slow, wish, strict=True):
+            if side.stands_still(turned, turns, dt, self._count, slowly, command):
+                found = side
+        return found
 
     def lied(self, before: WheelSpeeds) -> bool:
         """Of the wheel that the last line has shown to lie: it may have lied in that line too."""

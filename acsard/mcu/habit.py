@@ -2,7 +2,8 @@
 
 While we send a line every period, both look alike. When we send more or fewer (the host stood
 still, a command's line went at once) the lines that come are as many as periods have passed or as
-lines have left: whichever it is, it is told by the sums over the reads in which they differ.
+lines have left: whichever it is, it is told by the sums over the reads in which they differ, and
+the few after them, which bring what an adapter still held.
 """
 
 from __future__ import annotations
@@ -16,6 +17,12 @@ TELLING = 2.5
 LATEST = 100.0
 """Periods since the last read; after more, nothing is expected of anybody."""
 
+CLEAR = 0.5
+"""By which share of what the sums are apart one must be nearer to what came than the other."""
+
+AFTER = 3
+"""Reads after one in which they differ that belong to it."""
+
 NEAR = 0.35
 """How far from what came the better one may be, as a share of it: lines are lost too."""
 
@@ -28,7 +35,7 @@ class Habit:
         self.speaks: bool | None = speaks or None
         """It reports by its own clock, it answers; None while nobody can tell."""
         self._known = speaks
-        self._left = 0
+        self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
 
     def left(self) -> None:
@@ -38,7 +45,13 @@ class Habit:
     def read(self, lines: int, periods: float) -> None:
         """So many lines came, so many of its periods after the last read."""
         left, self._left = self._left, 0
-        if self._known or abs(periods - left) < APART or periods > LATEST:
+        if self._known or periods > LATEST:
+            return
+        if abs(periods - left) >= APART:
+            self._after = AFTER
+        elif self._after:
+            self._after -= 1
+        else:
             return
         self._came += lines
         self._periods += periods
@@ -48,8 +61,10 @@ class Habit:
             abs(self._came - self._periods),
             abs(self._came - self._asked),
         )
-        if abs(self._periods - self._asked) < TELLING:
+        apart = abs(self._periods - self._asked)
+        if apart < TELLING or abs(own - asked) < CLEAR * apart:
             return
         if min(own, asked) <= max(1.5, NEAR * came):
             self.speaks = own < asked
         self._came = self._periods = self._asked = 0.0
+        self._after = 0

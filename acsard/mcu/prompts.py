@@ -21,6 +21,9 @@ MEMORY = 64
 GAIN = 0.05
 """How quickly the usual delay and its spread follow."""
 
+SLOW = 0.0125
+"""How quickly it shows whose that spread is."""
+
 JITTER_NS = 350_000
 """What USB and the scheduler make of a constant delay: its mean deviation."""
 
@@ -30,11 +33,18 @@ THOUGHT_NS = 800_000
 RISE_NS = 20_000
 """By which a batched link's least delay is forgotten, read by read."""
 
+LOSING = 0.005
+"""How quickly the share of lost answers follows: in 20 reads two lost ones would make it 3 %."""
+
 MOST_LOST = 0.03
 """Share of answers lost on a batched link, from which on nobody can tell whose one is."""
 
 SEVERAL = 0.15
 """Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
+
+THINKS = 0.6
+"""Share of the late reads whose spread is that, from which on it is the MCU's own: an adapter that
+is filled line by line makes it too, for a quarter of a second."""
 
 BATCH_NS = 2_000_000
 """A mean deviation that no MCU makes: an adapter holds the lines back."""
@@ -76,11 +86,13 @@ class Prompts:
         """Of a batched link: the least delay, ns, between two reads, and the share of the lost."""
         self._several = 0.0
         """Share of the reads that have several lines."""
+        self._thinking = 0.0
+        """Share of the reads in which the answers' delay varied as neither makes it."""
 
     @property
     def thinks(self) -> bool:
         """The answers' delay varies as no scheduler makes it, nor an adapter: it is the MCU's."""
-        return THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+        return self._thinking > THINKS and not self._batched
 
     @property
     def lost(self) -> bool:
@@ -105,6 +117,8 @@ class Prompts:
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone = at_ns, alone
         self._several += GAIN * ((not alone) - self._several)
+        varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
+        self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
             self._weigh(lines, since)
         elif self._delay is not None:
@@ -169,7 +183,7 @@ class Prompts:
             if late <= self._batch + 2 * JITTER_NS or at - left[lines] < self._soonest:
                 break
             self._passed, lost = left.popleft(), lost + 1
-        self._losses += GAIN * (lost / (lines + lost) - self._losses)
+        self._losses += LOSING * (lost / (lines + lost) - self._losses)
         # A line that is given up too late makes an answer later, none makes it earlier.
         self._base = min(self._base + RISE_NS, at - left[lines - 1])
         self._delay = self._base

@@ -21,6 +21,7 @@ Lines that keep no period are refused, and a clock that they contradict is given
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 from statistics import fmean, median
 
@@ -40,6 +41,9 @@ DRIFT = 0.01
 
 EXACT = 0.001
 """As DRIFT, for periods that nobody has configured: a quartz, and what the fit is off."""
+
+LONE = 0.7
+"""Share of the reads that have one line, from which on they are read one by one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """How late in slots any line may be of those a clock is found from: read one by one, or not."""
@@ -143,13 +147,13 @@ class Slots:
             return 0
         alone, self._alone = self._alone, lines == 1
         if self._batched:
-            batch = self._batch
-            prompt = since < 1.1 * batch and lines - 1 < since
+            prompt = since < 1.1 * self._batch and lines - 1 < since
+            held = self._batch + 1.0  # an adapter goes on holding the last line of a backlog
         else:
-            batch, prompt = 0.0, lines == 1
+            held, prompt = 0.0, lines == 1
             if prompt and alone and since < JUMP:
                 return -1 if ahead > 1 else 0  # it only grew later, line by line
-        seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - batch
+        seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - held
         return max(0, math.floor(seen))
 
     # finding the clock, and following it
@@ -161,10 +165,7 @@ class Slots:
             return
         self._reads = reads[-1:]
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
-        slots, most = _slots(reads, gaps)
-        # Of jittery lines a configured period says more than half a second of them.
-        guesses = [known * NS_PER_S for known in self._known]
-        for guess in (*guesses, _slope(reads, slots)):
+        for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
             if max(late) <= most:
                 break
@@ -176,6 +177,25 @@ class Slots:
         self.period = self._nominal()
         self._given, self._share, self._alone = 0, 0.0, False
         self._begin(at_ns)
+
+    def _clocks(
+        self, reads: list[Read], gaps: list[int]
+    ) -> Iterator[tuple[list[int], float, float]]:
+        """What may be the clock, the likelier ones first: the slot of each read's last line, how
+        late in slots one may be, and the period in ns.
+
+        Of jittery lines a configured period says more than half a second of them. An adapter hands
+        lines over one by one too, where they fill its packets: so before lines are missing for a
+        period that nobody has configured, none is for one that somebody has.
+        """
+        plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
+        alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
+        own = plain
+        if len(alone) >= LONE * len(gaps):
+            own = _slots(reads, median(alone))
+            yield from ((own, LATE_ALONE, period) for period in known)
+        yield from ((plain, LATE_BATCHED, period) for period in known)
+        yield own, LATE_BATCHED if own is plain else LATE_ALONE, _slope(reads, own)
 
     def _begin(self, at_ns: int) -> None:
         """A new window: its least x, its reads, their slots, and how many of them were lossy."""
@@ -211,15 +231,12 @@ class Slots:
         return whole if abs(seconds / whole - 1) < EXACT else seconds
 
 
-def _slots(reads: list[Read], gaps: list[int]) -> tuple[list[int], float]:
-    """The slot of each read's last line, and how late in slots one may be."""
-    alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
-    guess = median(alone) if len(alone) >= 0.7 * len(gaps) else 0.0
+def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
+    """The slot of each read's last line, with those that are missing if it were this period, ns."""
     slots = [0]
-    for gap, (_, lines) in zip(gaps, reads[1:], strict=True):
-        missing = round(gap / guess) - lines if guess else 0
-        slots.append(slots[-1] + lines + max(0, missing))
-    return slots, LATE_ALONE if guess else LATE_BATCHED
+    for (before, _), (at, lines) in pairwise(reads):
+        slots.append(slots[-1] + max(lines, round((at - before) / period)))
+    return slots
 
 
 def _slope(reads: list[Read], slots: list[int]) -> float:

@@ -9,6 +9,9 @@ from contextlib import ExitStack, nullcontext
 import pytest
 
 from acsard.config.settings import Config, McuConfig, SimConfig
+from acsard.drive.path import Path
+from acsard.messages.schema import JointState, RobotState
+from acsard.values import Pose
 from tests.scenarios.world import World
 
 FINE = SimConfig(encoder_counts=20_000)
@@ -20,8 +23,10 @@ COUNTS = 3200
 class Drive:
     """8 s of driving at random; after each of eight legs something happens to lines or host."""
 
-    def __init__(self, made: World, reports: bool) -> None:
+    def __init__(self, made: World, reports: bool, batched: bool = False) -> None:
         self.world, self.faults = made, ExitStack()
+        if batched:
+            self.faults.enter_context(made.mcu.ftdi())
         if reports:
             self.faults.enter_context(made.mcu.unprompted(0.01))
         made.run(1.5)
@@ -39,11 +44,26 @@ class Drive:
                 made.stall(stall)
                 made.hold(linear, angular, 0.5)
             made.hold(0.0, 0.0, 1.0)
-        told, true = made.state, made.mcu.vehicle.pose
-        error = math.dist((told.x, told.y), (true.x, true.y))
-        print(f"{1000 * error:.1f} mm off after {made.loop.robot.travelled:.1f} m")
         assert made.loop.robot.travelled > 1.5
-        return error
+        told = made.state
+        print(f"{1000 * self.off(told):.1f} mm off after {made.loop.robot.travelled:.1f} m")
+        return self.off(told)
+
+    @property
+    def floor(self) -> float:
+        """m by which every line with its true time is off, of those reported each 10 ms."""
+        path = Path()
+        for line in self.world.bus.published["wheel_states"]:
+            assert isinstance(line, JointState)
+            front_right, front_left, rear_left, rear_right = line.velocity
+            right, left = (front_right + rear_right) / 2 * 0.01, (front_left + rear_left) / 2 * 0.01
+            path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
+        return self.off(path.pose)
+
+    def off(self, told: RobotState | Pose) -> float:
+        """m from where the robot truly is."""
+        true = self.world.mcu.vehicle.pose
+        return math.dist((told.x, told.y), (true.x, true.y))
 
 
 REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "reporting"])
@@ -55,12 +75,20 @@ def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> Non
     assert Drive(World(Config(sim=FINE)), reports).error(stall) < 0.005
 
 
-@REPORTS
-def test_an_adapter_that_batches_and_stalls_costs_no_distance(reports: bool) -> None:
-    drive = Drive(World(Config(sim=FINE)), reports)
-    drive.faults.enter_context(drive.world.mcu.ftdi())
-    drive.faults.enter_context(drive.world.mcu.stalls(2.0, 0.09))
-    assert drive.error() < 0.02
+@pytest.mark.parametrize(("every", "stall"), [(0.7, 0.05), (2.0, 0.09), (0.7, 0.15)])
+def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
+    every: float, stall: float
+) -> None:
+    drive = Drive(World(Config(sim=FINE)), reports=True, batched=True)
+    drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
+    assert drive.error() <= 1.05 * drive.floor + 0.0005
+
+
+@pytest.mark.parametrize("every", [1.0, 2.0])
+def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(every: float) -> None:
+    drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)
+    drive.faults.enter_context(drive.world.mcu.stalls(every, 0.09))
+    assert drive.error() < 0.005
 
 
 def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import DriveConfig, OdometryConfig
+from acsard.config.settings import DriveConfig, McuConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.odometry import Odometry
 from acsard.drive.uncertainty import PoseUncertainty
 from acsard.mcu.feedback import Feedback
-from acsard.values import WheelSpeeds
+from acsard.mcu.session import McuSession
+from acsard.values import Instant, Received, WheelSpeeds
 from tests.unit.drive.nees import (
     AT,
     DEFAULT,
@@ -37,6 +39,8 @@ from tests.unit.drive.nees import (
     study,
     true_ends,
 )
+from tests.unit.mcu.counted import RADIUS, TRACK, angles
+from tests.unit.mcu.counted import lines as counted_lines
 
 CALIBRATED = {"radius_std": 0.002, "track_std": 0.01}
 MODELS = {
@@ -244,3 +248,48 @@ def test_trembling_within_a_count_is_no_turning() -> None:
         one.advance(0.0, -0.001, 0.0, 0.0, 0.0)
     # 2 x 1000 m of wheels are counted as such: 1.5e-5 a radian
     assert one.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
+
+
+@pytest.mark.parametrize("counts", [16, 96, 400, 4000])
+def test_counts_that_the_lines_show_are_as_uncertain_as_configured_ones(counts: int) -> None:
+    config, kinematics = OdometryConfig(), Kinematics(DriveConfig())
+    told, shown = (PoseUncertainty(config, kinematics, known) for known in (counts, 0))
+    shown.show_count(math.tau / counts)
+    for one in (told, shown):
+        for _ in range(100):
+            one.advance(0.01, 0.02 / counts, 0.01, 0.0, 0.0)
+    ours, theirs = shown.covariance, told.covariance
+    assert (ours.xx, ours.yy, ours.yawyaw) == pytest.approx(
+        (theirs.xx, theirs.yy, theirs.yawyaw), rel=1e-4
+    )
+
+
+def test_what_is_configured_counts_before_what_the_lines_show() -> None:
+    told, plain_one = (
+        PoseUncertainty(OdometryConfig(), Kinematics(DriveConfig()), 400) for _ in range(2)
+    )
+    told.show_count(math.tau / 16)
+    for one in (told, plain_one):
+        one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
+    assert told.covariance == plain_one.covariance
+
+
+@pytest.mark.parametrize("counts", [16, 96, 400])
+def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_they_make_it(
+    counts: int,
+) -> None:
+    """From its bytes, with nothing configured."""
+    session, odometry = (
+        McuSession(McuConfig(), 100.0),
+        Odometry(OdometryConfig(), Kinematics(DriveConfig())),
+    )
+    variances = []
+    for n, line in enumerate(counted_lines(angles(np.random.default_rng(1), 20.0), counts)):
+        now = Instant(10**9 + n * 10**7, n * 10**7)
+        for feedback in session.update(now, True, 1, (Received(now, line),)):
+            variances.append(odometry.fold(feedback).covariance.yawyaw)
+    before, after = variances[:-1], variances[1:]
+    count = RADIUS * math.tau / counts
+    leap = max(b - a for a, b in zip(before, after, strict=True))
+    assert session.snapping.counts == (counts,) * 4
+    assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"

@@ -35,6 +35,14 @@ def test_short_stalls_tell_together() -> None:
     assert habit.speaks is True
 
 
+def test_lines_that_an_adapter_still_holds_belong_to_the_stall_they_were_made_in() -> None:
+    habit = Habit(speaks=False)
+    stall(habit, 13, 15.2, 11)
+    assert habit.speaks is None, "neither is clearly nearer"
+    stall(habit, 2, 0.3, 0)
+    assert habit.speaks is True
+
+
 def test_a_silence_that_fits_neither_tells_nothing() -> None:
     habit = Habit(speaks=False)
     stall(habit, 1, 40.0, 13)

@@ -169,6 +169,15 @@ def test_an_answer_lost_on_a_batched_link_is_noticed_soon(seed: int) -> None:
     assert batched(bench, seed, 300, lost=(150,)) == pytest.approx(1990.0, abs=0.1)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_two_lost_answers_that_happen_to_be_near_each_other_leave_the_lines_their_clock(
+    seed: int,
+) -> None:
+    bench = Bench()
+    batched(bench, seed, 170, lost=(150, 153, 156))
+    assert not bench.prompts.lost
+
+
 def test_where_a_fifth_of_a_batched_link_is_lost_nobody_can_tell_whose_an_answer_is() -> None:
     bench = Bench()
     batched(bench, 1, 300, lost=tuple(range(100, 300, 5)))

@@ -134,6 +134,39 @@ def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int)
     assert counted == 0
 
 
+def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
+    """Time, ns, and lines of each read through an adapter that hands on 62 bytes as soon as it has
+    them and fewer each 16 ms, of lines of so many bytes each 10 ms at 115200."""
+    fed = [(round((k * 10 + phase) * MS + (i + 1) * MS / 11.52), i == size - 1)
+           for k in range(1, lines + 1) for i in range(size)]  # fmt: skip
+    reads: list[tuple[int, int]] = []
+    waiting, whole, due = 0, 0, 0
+    for at, ends in fed:
+        if waiting and at >= due:
+            reads.append((due, whole))
+            waiting = whole = 0
+        due = due if waiting else -(-at // (16 * MS)) * 16 * MS
+        waiting, whole = waiting + 1, whole + ends
+        if waiting == 62:
+            reads.append((at, whole))
+            waiting = whole = 0
+    return [(10**12 + at, whole) for at, whole in reads if whole]
+
+
+@pytest.mark.parametrize("size", [30, 33, 34, 36])
+@given(phase=st.floats(0.0, 16.0))
+def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(
+    size: int, phase: float
+) -> None:
+    slots, counted = Slots((PERIOD,)), 0
+    for at, lines in packets(size, 1000, phase):
+        had = slots.period is not None
+        counted += had * slots.read(at, lines, True)
+        if not had and slots.period is not None:
+            assert slots.period == PERIOD
+    assert (slots.period, counted) == (PERIOD, 0)
+
+
 @pytest.mark.parametrize("lost", [1, 2, 7, 50])
 def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
     bench = Bench().found()
