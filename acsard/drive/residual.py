@@ -10,6 +10,11 @@ stays the same, so it is learned. So sums that forget are compared, angles and n
 
 with off the sum of front - rear, way that of the side's turning and r what is learned. Lags make a
 slip of it only beyond the last term; a wheel is suspected before.
+
+Two wheels of which nobody knows where in a count they stand differ by up to two counts without any
+slip, so one of s at w rad/s cannot be told for certain before 2 count / (s w): a tenth at 10 rad/s
+takes 0.13 s with 96 counts a turn, and 0.26 s where SHARE is left to tyres. With COUNTS, and sums
+that forget, it is told within 0.2 s above 22 rad/s, and below 11.5 rad/s not at all.
 """
 
 from __future__ import annotations

@@ -16,12 +16,15 @@ FLICKER = 0.0105
 BLOCK = 64
 """Steps that are looked at together: with a filter behind few counts, three counts' worth."""
 
+FIRST = 24
+"""Steps of a first block after which it says something: its own largest, which may still grow."""
+
 RECUR = 3
 """The largest step counts that so many of a block reach: one damaged line makes two."""
 
 
 class Steps:
-    """Those of one wheel; `size` of them in rad/s, `math.inf` until a block of them was seen."""
+    """Those of one wheel; `size` of them in rad/s, `math.inf` until enough of them were seen."""
 
     def __init__(self) -> None:
         self.size = math.inf
@@ -43,6 +46,8 @@ class Steps:
             if largest[0] > self.size:
                 self.size = largest[0]
         self._count += 1
+        if self._count == FIRST and self.size == math.inf:
+            self.size = largest[0]
         if self._count == BLOCK:
             # A block's own and the one before it: at its start it has seen too little.
             self._before, self._count = largest[0], 0

@@ -12,7 +12,17 @@ import pytest
 from msgspec import Struct
 
 from acsard.config.settings import FeedbackConfig
-from tests.unit.mcu.counted import PERIOD, Array, Host, angles, counted, end, lines, text
+from tests.unit.mcu.counted import (
+    PERIOD,
+    Array,
+    Host,
+    angles,
+    counted,
+    end,
+    lines,
+    speeds,
+    text,
+)
 
 COUNTS = (16, 20, 40, 96, 400)
 FINER = (1000, 2000, 4000)
@@ -104,3 +114,25 @@ def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float
     host = heard(np.round(np.array(rows), 2))
     assert (host.dropped, host.why) == (0, "")
     assert host.session.snapping.counts == (0,) * 4
+
+
+def wild(wheels: int, seed: int) -> Host:
+    """A drive that is joined on its way, of which so many wheels say anything, until its fault."""
+    host, dice = Host(), np.random.default_rng(seed)
+    for right, left in speeds(np.random.default_rng(seed), 9.0)[150:]:
+        row = np.array([right, left, left, right])
+        row[:wheels] = dice.uniform(-60.0, 60.0, wheels)
+        host.hear(text(np.round(row, 2)))
+        if host.sanity.doubtful:
+            break
+    return host
+
+
+def test_a_wheel_that_jumps_at_random_is_found_out_by_the_steps_of_the_others() -> None:
+    found = sorted(wild(1, seed).lines for seed in range(7))
+    assert found[3] <= 60
+
+
+def test_two_wheels_that_jump_at_random_are_believed_as_the_reference_says() -> None:
+    """They may as well be two coarse encoders among fine ones."""
+    assert not wild(2, 1).sanity.doubtful

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from acsard.mcu.steps import BLOCK, Steps
+from acsard.mcu.steps import BLOCK, FIRST, Steps
 
 
 def after(speeds: list[float], steps: Steps | None = None) -> Steps:
@@ -22,8 +22,8 @@ def fine(count: int = 2 * BLOCK) -> list[float]:
     return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
 
 
-def test_nothing_is_known_until_a_block_of_steps_was_seen() -> None:
-    speeds = [0.1 * (i % 2) for i in range(BLOCK)]
+def test_nothing_is_known_until_enough_steps_were_seen() -> None:
+    speeds = [0.1 * (i % 2) for i in range(FIRST)]
     steps = after(speeds)
     assert steps.size == math.inf
     steps.add(0.2)
