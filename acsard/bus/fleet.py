@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import zenoh
 
 from acsard.bus.address import require_id
@@ -55,6 +56,13 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
     if not found and ALL in ids:
         raise NoAnswerError(nobody(endpoint))
     return sorted(found)
+
+
+def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
+    """Tell these robots to stop, or all: at once, whoever else is there and slow to answer."""
+    by = msgspec.msgpack.encode({"sender": sender})
+    for one in ids:
+        session.put(full_key(one, "stop"), b"", attachment=by, express=True)
 
 
 def nobody(endpoint: str) -> str:

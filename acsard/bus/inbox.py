@@ -17,7 +17,7 @@ from acsard.incoming.bus import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import BUSY, Query, most_bytes, refused
 from acsard.messages.encodings import encoding_name
-from acsard.messages.topics import IMU, JSON_TREE, VERBS, service_key, source_keys
+from acsard.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
 ARRIVALS = 16
@@ -42,7 +42,8 @@ ATTACHMENT_BYTES = 256
 """An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
 
 CDR = encoding_name("cdr")
-STOP = service_key("stop")
+STOP, SET = service_key("stop"), service_key("set")
+STOP_ALL = full_key("*", "stop")
 
 T = TypeVar("T")
 
@@ -64,7 +65,7 @@ class Inbox:
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
         self._slow: deque[Query] = deque()
-        """Those of ROS, for parameters: one takes as long to answer as all others of a step."""
+        """Those of ROS for parameters, and settings: one takes as long as all others of a step."""
         self._overrun = 0
         self._any = False
         """Something has come in; set behind it, so that none is overlooked."""
@@ -91,7 +92,9 @@ class Inbox:
 
     def on_sample(self, sample: zenoh.Sample) -> None:
         """A sample on a native key."""
-        key = str(sample.key_expr).removeprefix(self._prefix)
+        key = str(sample.key_expr)
+        # A stop to all robots comes by the key it was sent on.
+        key = "stop" if key == STOP_ALL else key.removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
@@ -153,6 +156,8 @@ class Inbox:
             self._asked(query, native, native, endpoint.key, endpoint.transport)
 
     def _line_for(self, topic: str, via: Via) -> deque[Query]:
+        if topic == SET:
+            return self._slow
         if topic in VERBS:
             return self._services
         return self._questions if via == "native" else self._slow

@@ -45,6 +45,8 @@ from acsard.cli import set as setting
 from acsard.cli.exits import code_of
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
+from acsard.messages.text import lines
+from acsard.values import AcsardError
 
 VERBS = (
     run,
@@ -111,9 +113,9 @@ def main(argv: list[str] | None = None) -> int:
         try:
             args = parser().parse_args(words)
             return int(args.main(args))
-        except MendableError as error:
-            print(f"acsard: {error}", file=sys.stderr)
-            return int(code_of(error))
+        except AcsardError as error:
+            print(f"acsard: {lines(str(error))}", file=sys.stderr)
+            return int(code_of(error) if isinstance(error, MendableError) else Exit.FAILURE)
         finally:
             sys.stdout.flush()
     except OSError as error:

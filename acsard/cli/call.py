@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
 from acsard.host.exits import Exit
+from acsard.messages.text import json_line, lines, printable
 from acsard.messages.topics import SERVICES
 
 if TYPE_CHECKING:
     from acsard.client import Client
 CALLED = tuple(service for service in SERVICES if service != "set")
 """`acsard set` calls that one, and knows what can be set."""
+
+
+MOST_AT_ONCE = 32
+"""Robots that are waited for at the same time."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -49,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
             return _stop_all(robot, many, endpoint, as_json=args.json)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
-    print(encode(reply, "json").decode() if args.json else reply.message)
+    print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message))
     return 0 if reply.success else 1
 
 
@@ -57,28 +62,30 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     """Stop them all at once, by their exact keys; say who answered what, and who did not."""
     from concurrent.futures import ThreadPoolExecutor
 
+    from acsard.bus import fleet
     from acsard.bus.fleet import ALL, present
     from acsard.cli.echo import of_robot
-    from acsard.host.errors import MendableError
     from acsard.messages.encodings import encode
     from acsard.messages.schema import ServiceReply
+    from acsard.values import AcsardError
 
     # Who is named is told to stop, there or not: nobody waits to find that out first.
+    fleet.stop(robot.session, ids, robot.name)
     wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
 
     def stop(one: str) -> ServiceReply | None:
         try:
             return robot.like(one).call("stop")
-        except MendableError:
+        except AcsardError:  # or it has answered what nobody understands
             return None
 
-    with ThreadPoolExecutor(len(wanted)) as calls:
+    with ThreadPoolExecutor(min(len(wanted), MOST_AT_ONCE)) as calls:
         replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
     for one, reply in replies.items():
         if reply is None:
             reply = ServiceReply(False, "NO ANSWER: go and look, or use its switch")
         line = encode(reply, "json").decode()
-        print(of_robot(one, line) if as_json else f"{one}: {reply.message}")
+        print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
     if None in replies.values():
         return int(Exit.UNREACHABLE)
     return int(Exit.OK if all(r.success for r in replies.values() if r) else Exit.FAILURE)

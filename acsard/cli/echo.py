@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, count, require_followed, robots_address
 from acsard.host.exits import Exit, ExitError
+from acsard.messages import text
 
 if TYPE_CHECKING:
     from acsard.client import Client
@@ -64,7 +65,8 @@ def main(args: argparse.Namespace) -> int:
         try:
             for sample in samples:
                 line, whose = json_line(*encoded(sample)), robot_of(str(sample.key_expr))
-                print(of_robot(whose, line) if many else line, flush=True)
+                shown = of_robot(whose, line) if many else text.json_line(line)
+                print(shown, flush=True)
                 left = None if left is None else left - 1
                 if left == 0:
                     return 0
@@ -125,7 +127,8 @@ def of_robot(whose: str, line: str) -> str:
     """A line of JSON with whose it is."""
     import msgspec
 
-    return msgspec.json.encode({"robot": whose, "message": msgspec.Raw(line.encode())}).decode()
+    told = {"robot": whose, "message": msgspec.Raw(line.encode())}
+    return text.json_line(msgspec.json.encode(told).decode())
 
 
 def _hint(topic: str) -> None:

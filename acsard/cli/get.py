@@ -6,6 +6,10 @@ import argparse
 import sys
 
 from acsard.cli.common import MANY, add_bus, require_asked, robots_address
+from acsard.host.exits import Exit
+from acsard.messages import text
+from acsard.messages.text import printable
+from acsard.values import AcsardError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -24,7 +28,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Ask and print."""
-    import msgspec
 
     from acsard.bus.fleet import present
     from acsard.cli.echo import json_line, of_robot
@@ -34,12 +37,21 @@ def main(args: argparse.Namespace) -> int:
     (endpoint, robot_id, tls), many = robots_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         if not many:
-            found = [json_line(*robot.reply(args.key))]
-        else:
-            ids = present(robot.session, many, endpoint)
-            answers = ((one, robot.like(one).reply(args.key)) for one in ids)
-            found = [of_robot(one, json_line(*answer)) for one, answer in answers]
-    for line in found:
-        shown = msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line
-        print(shown)
-    return 0
+            _show(json_line(*robot.reply(args.key)))
+            return 0
+        silent = 0
+        for one in present(robot.session, many, endpoint):
+            try:
+                line = json_line(*robot.like(one).reply(args.key))
+            except AcsardError as error:
+                silent += 1
+                print(printable(f"{one}: NO ANSWER: {error}"), file=sys.stderr)
+                continue
+            _show(of_robot(one, line))
+    return int(Exit.UNREACHABLE if silent else Exit.OK)
+
+
+def _show(line: str) -> None:
+    import msgspec
+
+    print(text.json_line(msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line))

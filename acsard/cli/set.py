@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from acsard.cli.common import add_bus, find, robot_address
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
+from acsard.messages.text import json_line, lines
 
 if TYPE_CHECKING:
     from acsard.values import Plain
@@ -66,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
         change(file, settings)
         written = f"; written to {file}"
     until = written or ("; until the next start" if reply.success else "")
-    print(encode(reply, "json").decode() if args.json else reply.message + until)
+    print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message + until))
     return int(Exit.OK if reply.success else Exit.FAILURE)
 
 
@@ -128,4 +129,5 @@ def _tell(config: object, as_json: bool) -> None:
         return
     for key, value in now.items():
         said = described(key, 1)
-        print(f"{key} = {show(value)}\n    {said.description}\n    {said.additional_constraints}")
+        told = f"{key} = {show(value)}\n    {said.description}\n    {said.additional_constraints}"
+        print(lines(told))

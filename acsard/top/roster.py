@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from acsard.messages.schema import RobotState
-from acsard.top.teleop import printable, reason
+from acsard.messages.text import printable
+from acsard.top.teleop import reason
 
 SILENT_S = 2.0
 

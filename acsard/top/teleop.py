@@ -13,6 +13,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.messages.schema import RobotState
+from acsard.messages.text import printable
 
 NARROWEST = 40
 
@@ -118,11 +119,6 @@ def flow(parts: Sequence[str], width: int) -> list[str]:
         else:
             found.append(part[:width])
     return found
-
-
-def printable(text: str) -> str:
-    """The text without what a terminal would obey."""
-    return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def _wrapped(look: Look, text: str, width: int) -> list[tuple[Look, str]]:

@@ -8,7 +8,7 @@ import zenoh
 
 from acsard.bus.inbox import Inbox
 from acsard.bus.replies import TICKETS, Replies
-from tests.system.harness import Bus, client_config, free_endpoint
+from tests.system.harness import Bus, client_config, free_endpoint, until
 
 
 class Deaf:
@@ -34,4 +34,24 @@ def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answ
         assert inbox.take(0).arrivals == ()
         assert list(bus.session.get(f"{prefix}srv/stop", timeout=60.0)) == []
         assert [one.key for one in inbox.take(0).arrivals] == ["stop"]
+        del held, asked
+
+
+def test_of_settings_a_step_takes_one_however_many_are_asked_for() -> None:
+    prefix, endpoint = "acsard/acsar/", free_endpoint()
+    inbox = Inbox(prefix, Replies(prefix), (), Deaf())
+    with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
+        topics = ("srv/set", "srv/clear")
+        held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
+        asked = [bus.session.get(prefix + t, payload=b"{}", timeout=60.0) for t in topics * 5]
+        found: list[str] = []
+
+        def all_here() -> bool:
+            taken = [query.topic for query in inbox.take(8).queries]
+            assert taken.count("srv/set") <= 1
+            found.extend(taken)
+            return len(found) == 10
+
+        until(all_here, 5.0, "all of them")
+        assert found.count("srv/set") == 5
         del held, asked

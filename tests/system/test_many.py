@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from acsard.bus.fleet import ALL, stop
 from tests.system.fleet_router import ROBOT_FILE, certified, router
 from tests.system.harness import (
     Bus,
@@ -69,11 +70,6 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
         yield Robots(where, endpoint, daemons)
 
 
-def heard(program: Program) -> list[Any]:
-    """What it has printed so far."""
-    return [json.loads(line) for line in program.out]
-
-
 def messages(program: Program) -> list[Any]:
     """What it has printed so far."""
     return [json.loads(line) for line in program.out]
@@ -92,6 +88,64 @@ def test_get_of_named_robots_says_whose_each_answer_is(robots: Robots) -> None:
     found = [json.loads(line) for line in ended.out.splitlines()]
     assert [one["robot"] for one in found] == [ONE, TWO]
     assert [one["message"]["id"] for one in found] == [ONE, TWO]
+
+
+HOSTILE = "[2J\x1b]0;x\x07"
+"""What a terminal would obey."""
+
+
+@contextmanager
+def fake(robots: Robots, answer: bytes | None) -> Iterator[None]:
+    """Somebody behind the same router who says he is a robot, and gives that answer or none."""
+    who = "acsard/fake"
+
+    def reply(query: zenoh.Query) -> None:
+        if answer is None:
+            kept.append(query)
+        else:
+            query.reply(query.key_expr, answer, encoding="application/json")
+
+    kept: list[zenoh.Query] = []
+    with zenoh.open(client_config(robots.endpoint)) as session:
+        token = session.liveliness().declare_token(f"{who}/alive")
+        asked = session.declare_queryable(f"{who}/**", reply)
+        yield
+        asked.undeclare()
+        token.undeclare()
+        kept.clear()
+
+
+@pytest.mark.parametrize("answer", [b'["x"]', json.dumps({"success": False, "message": HOSTILE})])
+def test_an_answer_of_a_stranger_hides_no_other_and_does_nothing_to_the_terminal(
+    robots: Robots, answer: str | bytes
+) -> None:
+    with fake(robots, answer if isinstance(answer, bytes) else answer.encode()):
+        ended = robots.tool("call", "stop")
+    assert ended.code in (1, 69)
+    told = dict(line.split(": ", 1) for line in ended.out.splitlines())
+    assert told.keys() == {ONE, TWO, "fake"}
+    assert told[ONE].startswith("stopped and latched")
+    assert all(line.isprintable() for line in ended.out.splitlines())
+    robots.tool("call", "clear", who=ONE)
+    robots.tool("call", "clear", who=TWO)
+
+
+def test_who_gives_no_answer_hides_no_other(robots: Robots) -> None:
+    with fake(robots, None):
+        ended = robots.tool("get", "info")
+    assert ended.code == 69
+    assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
+    assert ended.err.startswith("fake: NO ANSWER")
+
+
+def test_a_stop_to_all_reaches_each_without_anybody_having_been_found(robots: Robots) -> None:
+    with zenoh.open(client_config(robots.endpoint)) as session:
+        stop(session, [ALL], "me")
+        for name in (ONE, TWO):
+            with Bus(robots.endpoint, robot_id=name) as bus:
+                until(lambda: bus.state()["mode"] == "stopped", 5.0, "stopped")
+    for name in (ONE, TWO):
+        robots.tool("call", "clear", who=name)
 
 
 def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots) -> None:
