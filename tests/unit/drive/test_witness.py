@@ -227,7 +227,10 @@ class Fall:
         true = said(rolled(told, Robot(counts, tyres=0.005), rng), counts)
         wheel = int(rng.integers(4))
         begun = int(rng.integers(300, 700))
-        while abs(told[begun, wheel]) < 2.0:
+        fast = 300 + np.flatnonzero(abs(told[300:700, wheel]) >= 2.0)
+        if not fast.size:  # it stands all the while
+            begun, wheel = (int(i) for i in np.unravel_index(np.argmax(abs(told[:700])), (700, 4)))
+        while fast.size and abs(told[begun, wheel]) < 2.0:
             begun = int(rng.integers(300, 700))
         lying = LIES[kind](true, wheel, begun)
         healthy, plain, robot = Plain(), Plain(), odometry()
