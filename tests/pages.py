@@ -188,9 +188,8 @@ COMMANDS: dict[str, How] = {
     ),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
-    ".venv/bin/pytest -m '(slow or network or systemd or firmware or languages) and not soak'": (
-        PYTEST
-    ),
+    ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
+    ".venv/bin/pytest -m 'languages and not soak'": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),

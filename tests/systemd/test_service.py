@@ -128,6 +128,6 @@ def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> N
     assert status.code == 0, status.err
     viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", "/etc/acsard/tls/clients/viewer")
     assert bare.run(ACSARD, "call", "stop", *viewer).code == 0
-    assert bare.run(ACSARD, "call", "clear", *viewer).code == 69
+    assert bare.run(ACSARD, "call", "clear", *viewer).code == 77
     assert bare.run(ACSARD, "service", "uninstall").code == 0
     assert not bare.path("/etc/systemd/system/acsard-door.service.d").exists()
