@@ -364,8 +364,9 @@ class Visitor:
         subscribers = [self._subscribed(row, on_sample) for row in rows]
         self._behind()
         # What was before is said again every 5 s, for those who cannot ask for it.
-        late = any(row.how == "late" and self._name in row.who for row in rows)
-        done = self._fleet.comes(came.is_set, 700 if late else 5)
+        mine = [row for row in rows if self._name in row.who]
+        late = any(row.how == "late" for row in mine)
+        done = self._fleet.comes(came.is_set, 700 if late else 50 if mine else 5)
         for subscriber in subscribers:
             subscriber.undeclare()
         return done
