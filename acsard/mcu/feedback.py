@@ -181,6 +181,10 @@ class Timeline:
             plain = (speaks is False or prompts.thinks) and not prompts.lost
             ours = asked_ns is not None or plain
             if ours and answered is not None:
+                if answered.due_ns - came_ns > self._usual_ns / 2:
+                    # The usual delay is that of a first answer read late, in a stall that the
+                    # line before has counted: this one is no further from it than it came.
+                    return Told("prompts", came_ns)
                 return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
         if slots.period is None:
             return self._told_by_reads()

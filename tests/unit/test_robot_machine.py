@@ -729,6 +729,14 @@ def test_a_second_of_impossible_feedback_is_not_made_up_for_at_the_next_speed() 
     machine.impossible_lines_come_for_a_while(count=100)
 
 
+def test_a_stall_before_the_first_answer_of_a_new_port_is_made_up_for_once() -> None:
+    machine = RobotMachine()
+    machine.start(config=CONFIGS[0], rolling=True)
+    machine.the_port_is_lost_and_found_between_two_steps()
+    machine.the_loop_stalls(ms=120.0, reply=True)
+    machine.time_passes(count=1, reply=True)
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_nothing_that_can_happen_a_hundred_times_over_makes_it_break_its_word() -> None:
