@@ -295,6 +295,7 @@ def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> Non
 def test_set_pose_with_a_bad_payload_changes_nothing_and_says_what_to_send(
     bus: Bus, payload: bytes
 ) -> None:
+    bus.at_rest()
     before = bus.state()
     answers = []
     for reply in bus.session.get("acsard/acsar/srv/set_pose", payload=payload, timeout=5.0):

@@ -42,7 +42,8 @@ def recording(where: Path, name: str = "daemon", **how: Any) -> Iterator[tuple[D
 
 
 def files(where: Path) -> list[Path]:
-    return sorted(where.glob("record/*.mcap*"))
+    """Those that are there under their names; what is being written has a dot before it."""
+    return sorted(path for path in where.glob("record/*.mcap*") if path.name[0] != ".")
 
 
 def replayed(where: Path, path: Path) -> int:
