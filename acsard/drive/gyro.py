@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Protocol
 
 from msgspec import Struct
 
@@ -80,6 +81,16 @@ class Turn(Struct, frozen=True):
     """rad the wheels would tell for this turn, skidding as they do."""
     slips: bool = False
     """The wheels do: they told another turn of late."""
+
+
+class Heading(Protocol):
+    """Who tells by how much the robot turned, beside its wheels: a `Gyro`."""
+
+    owes: bool
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
+
+    def taken_back(self, turn: float) -> float: ...
 
 
 class Gyro:

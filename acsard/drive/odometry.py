@@ -17,22 +17,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from itertools import takewhile
-from typing import Protocol
-
-from msgspec import Struct
 
 from acsard.config.settings import FeedbackConfig, OdometryConfig
 from acsard.drive.gaps import Gaps
-from acsard.drive.gyro import Turn
+from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.path import Path
-from acsard.drive.rolled import NOWHERE, Rolled, Rolling, plus
+from acsard.drive.rolled import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.mcu.lattice import on
 from acsard.values import (
     REST,
     STILL,
@@ -50,33 +46,6 @@ REST_S = 0.2
 
 TAKEN_BACK = 128
 """Lines at most that are taken back of a lie that was believed."""
-
-
-class Heading(Protocol):
-    """Who tells by how much the robot turned, beside its wheels: `gyro.Gyro`."""
-
-    owes: bool
-
-    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
-
-    def taken_back(self, turn: float) -> float: ...
-
-
-class Step(Struct, frozen=True, gc=False):
-    """A line's part of the way."""
-
-    pose: Pose
-    """Where it was before."""
-    pieces: tuple[Motors, ...]
-    """How its wheels turned from there, rad,"""
-    gyro: Turn | None
-    """by a gyro too,"""
-    speeds: WheelSpeeds
-    """and the speeds they said."""
-    turn: float
-    """rad that the heading turned,"""
-    on_trial: bool
-    """which a gyro on trial will put right once it is proved."""
 
 
 class Odometry:
@@ -212,7 +181,7 @@ class Odometry:
         """The counts that a line shows are the covariance's; all four, once every wheel turns."""
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
-        self._uncertainty.show_count(_count(line))
+        self._uncertainty.show_count(count_of(line))
 
     def _wheels_turn(self, rolled: Rolled) -> float:
         """rad by which the wheels say the robot turned since the last line that was believed."""
@@ -327,12 +296,3 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
-
-
-def _count(line: Feedback) -> float:
-    """rad of the coarsest encoder's count, of a line that shows whole ones; 0 if none does."""
-    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
-    return max([
-        step * turned / speed for turned, speed, step in rows
-        if speed and 0.0 < step < math.inf and on(speed, step)
-    ], default=0.0)  # fmt: skip

@@ -7,11 +7,15 @@ told that cannot be true is left to the next one that can.
 
 from __future__ import annotations
 
+import math
+
 from msgspec import Struct
 
+from acsard.drive.gyro import Turn
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
-from acsard.values import WheelSpeeds
+from acsard.mcu.lattice import on
+from acsard.values import Pose, WheelSpeeds
 
 MAX_LOST_S = 0.05
 """s of lines that could not be true, up to which the robot is held to have gone on as it did."""
@@ -91,3 +95,29 @@ def plus(a: Motors, b: Motors) -> Motors:
 def times(a: Motors, factor: float) -> Motors:
     """Wheel by wheel."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
+
+
+class Step(Struct, frozen=True, gc=False):
+    """A line's part of the way."""
+
+    pose: Pose
+    """Where it was before."""
+    pieces: tuple[Motors, ...]
+    """How its wheels turned from there, rad,"""
+    gyro: Turn | None
+    """by a gyro too,"""
+    speeds: WheelSpeeds
+    """and the speeds they said."""
+    turn: float
+    """rad that the heading turned,"""
+    on_trial: bool
+    """which a gyro on trial will put right once it is proved."""
+
+
+def count_of(line: Feedback) -> float:
+    """rad of the coarsest encoder's count, of a line that shows whole ones; 0 if none does."""
+    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
+    return max([
+        step * turned / speed for turned, speed, step in rows
+        if speed and 0.0 < step < math.inf and on(speed, step)
+    ], default=0.0)  # fmt: skip
