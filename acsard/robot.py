@@ -149,8 +149,8 @@ class Robot:
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
-        changed, self._status = status != self._status, status
-        if changed or news:  # else neither the mode nor the commander is another
+        another, self._status = status != self._status, status
+        if another or news:  # else neither the mode nor the commander is another
             events += self._told.changes(self._life.mode, self._choice, status[1])
         return Outputs(
             now=inputs.now,
@@ -165,7 +165,7 @@ class Robot:
             link=status[2],
             source=status[3],
             command_ns=self._choice.arrived_ns,
-            status_changed=changed,
+            status_changed=another,
             events=self._tally.lines(events, inputs.now.mono_ns),
             answers=answers,
             news=news,
@@ -305,7 +305,9 @@ class Robot:
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         """Change settings in the middle of whatever the robot does."""
-        before, at_rest = self.config, self._speeds == STILL and self._limiter.twist == REST
+        # What was made may not have gone: the wheels do what the last line that went said.
+        said, made = self._said[0].twist, self._limiter.twist
+        before, at_rest = self.config, self._speeds == STILL and said == made == REST
         try:
             self.config, news = changed(before, settings, at_rest)
         except ConfigError as error:

@@ -50,23 +50,29 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Set, or list."""
     from acsard.client import connect
+    from acsard.host.errors import MendableError
+    from acsard.host.files import change, require_changeable
     from acsard.messages.encodings import encode
 
     settings = pairs(args.settings)
     file = _file(args.config, settings) if args.write else None
+    if file is not None:
+        require_changeable(file, settings)
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         if not settings:
             _tell(robot.get("config"), args.json)
             return int(Exit.OK)
         reply = robot.set(settings)
-    written = ""
+    until = "; until the next start" if reply.success else ""
     if reply.success and file is not None:
-        from acsard.host.files import change
-
-        change(file, settings)
-        written = f"; written to {file}"
-    until = written or ("; until the next start" if reply.success else "")
+        try:
+            change(file, settings)
+        except MendableError as error:
+            raise ExitError(
+                Exit.FAILURE, f"{reply.message}, until the next start; not written: {error}"
+            ) from None
+        until = f"; written to {file}"
     print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message + until))
     return int(Exit.OK if reply.success else Exit.FAILURE)
 

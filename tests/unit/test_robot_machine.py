@@ -490,7 +490,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     def note_limits(self, settings: dict[str, Plain]) -> None:
         """These hold from this step on; what would brake softer, or jump, only from rest."""
-        before, at_rest = self.limits, self.before is None or self.before.applied == REST
+        before, at_rest = self.limits, self.broken or self.sent_twist == REST
         for key, value in settings.items():
             assert isinstance(value, float)
             name = key.removeprefix("limits.")
@@ -727,6 +727,24 @@ def test_a_second_of_impossible_feedback_is_not_made_up_for_at_the_next_speed() 
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=True)
     machine.impossible_lines_come_for_a_while(count=100)
+
+
+def test_settings_for_a_robot_at_rest_wait_until_the_lines_that_say_so_have_gone() -> None:
+    machine = RobotMachine()
+    machine.start(config=CONFIGS[0], rolling=True)
+    machine.cruise("app", Twist(0.5, 0.0), 60, 1)
+    machine.the_output_blocks(blocked=True)
+    machine.ask("stop")
+    for _ in range(19):
+        machine.step(reply=True)
+    assert machine.before is not None
+    assert machine.before.applied == REST
+    machine.blocked = False
+    softer = {"limits.linear_deceleration": 0.3, "limits.linear_stop_deceleration": 0.5}
+    machine.requests.append(Request("set", 3, settings={**softer}))
+    machine.step(reply=True)
+    (answer,) = machine.before.answers
+    assert not answer.success
 
 
 def test_a_stall_before_the_first_answer_of_a_new_port_is_made_up_for_once() -> None:
