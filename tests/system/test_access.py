@@ -94,7 +94,9 @@ def _commands() -> Iterator[Try]:
     yield from (Try(f"{ME}/wheel_cmd/{key}", NOBODY, WHEELS_JSON) for key in ("ghost", "*", "**"))
     wild = ("*", "**", "*/app", "sto$*", "stop/**")
     yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in wild)
-    wilder = ("acsard/*/cmd/app", "acsard/*/stop", "acsard/**", "**/stop", "**")
+    # Who is at the machine may stop all robots at once; over TLS only exact keys pass.
+    yield Try("acsard/*/stop", HERE)
+    wilder = ("acsard/*/cmd/app", "acsard/**", "**/stop", "**")
     yield from (Try(key, NOBODY, TWIST_JSON) for key in wilder)
     others = (f"{OTHER}/cmd/app", f"{OTHER}/stop", f"{OTHER}/**")
     yield from (Try(key, NOBODY, TWIST_JSON) for key in others)
