@@ -175,7 +175,8 @@ WATCHED = """\
 import os, sys
 from acsard.cli import main
 def hook(event, arguments):
-    if event in ("os.chmod", "os.rename", "os.link"):
+    compiled = ".pyc" in str(arguments[:1])  # what Python keeps for itself
+    if event in ("os.chmod", "os.rename", "os.link") and not compiled:
         print(event, arguments[0], file=sys.stderr)
 sys.addaudithook(hook)
 os.umask(0)
