@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 
 from msgspec.structs import replace
@@ -17,9 +18,9 @@ acsard {version}, robot {robot}
   bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
   config  {where}
   try, in a second terminal:
-    acsard drive              drive it by keyboard
-    acsard echo odom -n 1     where is it?
-    acsard call stop          stop it, and keep it stopped until `acsard call clear`
+    acsard drive{reach}              drive it by keyboard
+    acsard echo odom -n 1{reach}     where is it?
+    acsard call stop{reach}          stop it, and keep it stopped until `acsard call clear`
 """
 
 
@@ -95,7 +96,7 @@ def main(args: argparse.Namespace) -> int:
         simulated = config.mcu.simulated
         if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
             # Not print: a full pipe that nobody reads would hold up the robot.
-            screen.write(banner(config, where, device, trouble) + "\n")
+            screen.write(banner(config, where, device, trouble, reach(args)) + "\n")
         log.info(
             "started",
             version=__version__,
@@ -129,8 +130,17 @@ def _bus(config: Config) -> str:
     return ", ".join(bus.listen)
 
 
-def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
-    """What a person sees first."""
+def reach(args: argparse.Namespace) -> str:
+    """The options by which the tools find this daemon, where they must be told."""
+    from acsard.bus.session import reachable
+
+    listens = args.listen and reachable(args.listen)
+    given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
+    return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
+
+
+def banner(config: Config, where: str, device: str, trouble: str = "", reach: str = "") -> str:
+    """What a person sees first; `reach` is how the tools find it."""
     from acsard import __version__
     from acsard.values import ROOT
 
@@ -146,4 +156,5 @@ def banner(config: Config, where: str, device: str, trouble: str = "") -> str:
         listen=_bus(config),
         root=ROOT,
         where=where,
+        reach=reach,
     )

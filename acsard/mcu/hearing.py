@@ -20,9 +20,10 @@ PATIENCE_NS = 3 * NS_PER_S
 SHOWN = 64
 """Characters of them that people are shown: a whole line, and noise on it."""
 
-Look = Literal["nothing", "cut", "foreign", "garbage", "few"]
+Look = Literal["nothing", "cut", "foreign", "garbage", "few", "sparse"]
 """No byte at all; pieces of right lines, or lines without an end; right lines with other bytes on
-them; nothing that looks like a line; good lines among others."""
+them; nothing that looks like a line; good lines among others; good lines only, but too
+seldom."""
 
 MENDS: dict[Look, str] = {
     "nothing": "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed?",
@@ -30,6 +31,7 @@ MENDS: dict[Look, str] = {
     "foreign": "what disturbs the cable, or prints on it too?",
     "garbage": "is mcu.baud_rate the board's own?",
     "few": "look at cable, ground and baud rate",
+    "sparse": "if its lines are further apart than ours, say so by mcu.reply_period",
 }
 
 _RIGHT = re.compile(TOKENS)
@@ -65,7 +67,7 @@ class Heard(Struct):
         if not self.size:
             return "nothing"
         if self.good:
-            return "few"
+            return "few" if self.good < self.lines else "sparse"
         if self.lines and _RIGHT.search(self.last):
             return "foreign"
         return "cut" if _PIECE.fullmatch(self.last) else "garbage"
@@ -81,6 +83,8 @@ class Heard(Struct):
         good, which = "none good", "last"
         if self.good:
             good, which = f"only {self.good} good", "last other"
+            if self.good == self.lines:
+                good = "all good, but too few"
         last = f", the {which} `{printable(self.last)}`" if self.good < self.lines else ""
         return f"{self.lines} lines heard, {good}{last}"
 

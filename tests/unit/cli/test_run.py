@@ -55,6 +55,18 @@ def test_the_banner_tells_a_simulator_from_a_robot() -> None:
     assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))
 
 
+def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
+    parser = argparse.ArgumentParser()
+    run.add(parser.add_subparsers())
+    bare = parser.parse_args(["run"])
+    assert run.reach(bare) == ""
+    words = ["run", "--id", "two", "--listen", "tcp/0.0.0.0:7458", "--config", "my robot.toml"]
+    options = run.reach(parser.parse_args(words))
+    assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
+    told = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
+    assert f"acsard call stop{options} " in told
+
+
 def test_it_records_where_the_option_the_file_or_the_service_says_in_this_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

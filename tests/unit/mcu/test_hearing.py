@@ -21,7 +21,7 @@ HEARD: dict[str, tuple[bytes, Look, str]] = {
     "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines heard, none good"),
     "no end": (b"\xf8\x00\xe6" * 3, "garbage", r"the last `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"),
     "some good": (GOOD + b"ap?\r\n", "few", "2 lines heard, only 1 good, the last other `ap?`"),
-    "all good": (GOOD * 2, "few", "2 lines heard, only 2 good"),
+    "all good": (GOOD * 2, "sparse", "2 lines heard, all good, but too few"),
 }  # fmt: skip
 
 
