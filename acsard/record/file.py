@@ -8,6 +8,7 @@ whole of it is read all the same, and `rewrite` makes a finished file of it.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import struct
@@ -134,6 +135,8 @@ class Writing:
         """What was added is a whole chunk, and on the disk."""
         self._writer.flush()
         os.fsync(self._file.fileno())
+        if not os.fstat(self._file.fileno()).st_nlink:  # the disk takes it, and nobody will find it
+            raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def finish(self) -> None:
         """Write the end of the file and close it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -174,6 +175,21 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     assert 2 <= sum(close) <= sum(near) <= len(paths) - 2, (close, near)
     for has, must, may in zip(kept, close, near, strict=True):
         assert must <= has <= may
+
+
+def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    shutil.rmtree(bench.where)
+    bench.drive(1.0)
+    assert "has been removed" in bench.recorder.status.trouble
+    bench.drive(module.RETRY_ROUNDS + 3.0)
+    status = bench.recorder.status
+    assert status.trouble == ""
+    assert status.missing > 0
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.trouble) == (True, "")
 
 
 def test_the_loop_only_appends(bench: Bench) -> None:
