@@ -9,11 +9,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
-from acsard.values import Estimate, Event, Inputs, Outputs
+from acsard.robot import Robot
+from acsard.values import Estimate, Event, Inputs, Outputs, Recording
 
 MICRO = 1e6
 
@@ -33,6 +34,19 @@ class Taken(NamedTuple):
     outputs: Outputs
     left: bytes | None
     """What was handed to the port, None when nothing went."""
+
+
+class BlackBox(Protocol):
+    """What records every step, and never waits."""
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+
+    @property
+    def status(self) -> Recording:
+        """How it does."""
 
 
 class Said(Struct, frozen=True):

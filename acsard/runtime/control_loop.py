@@ -6,7 +6,6 @@ Synchronous on purpose: the daemon calls `step` from one task, the tests call it
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from msgspec.structs import replace
 
@@ -20,13 +19,14 @@ from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
-from acsard.incoming.queries import Queries, refused
+from acsard.incoming.queries import Queries, Query, refused
 from acsard.incoming.routers import RoutersTold
 from acsard.mcu.port import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message
 from acsard.messages.topics import IMU
+from acsard.record.steps import BlackBox
 from acsard.robot import Robot
 from acsard.runtime.at_once import Pace
 from acsard.runtime.period import NO_PERIOD, Period
@@ -51,21 +51,7 @@ FEEDBACK = ("odom", "tf", "wheel_states")
 QUERIES_PER_STEP = 8
 """Replies built in one step; a crowd of questions waits its turn instead of costing a period."""
 
-
 BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
-
-
-class BlackBox(Protocol):
-    """What records every step, and never waits."""
-
-    def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
-    ) -> None:
-        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
-
-    @property
-    def status(self) -> Recording:
-        """How it does."""
 
 
 class ControlLoop:
@@ -201,7 +187,9 @@ class ControlLoop:
         got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
-        commands, refusals, requests = [], [], []
+        commands: list[Command] = []
+        refusals: list[Refusal] = []
+        requests: list[Request] = []
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
@@ -241,19 +229,25 @@ class ControlLoop:
                     )
                 )
         for query in got.queries:
-            try:
-                served = self._queries.serve(query, self._current, self.outputs)
-            except DecodeError as error:
-                refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
-                reply = refused(query, str(error), now.wall_ns)
-                served = [] if reply is None else [reply]
-            if isinstance(served, Request):
+            served = self._served(query, now, refusals)
+            if served is not None:
                 requests.append(served)
-                continue
-            for reply in served:
-                self._bus.reply(reply)
-            self._bus.retire(query.ticket)
         return tuple(commands), tuple(refusals), tuple(requests)
+
+    def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
+        """Answer a query, or have the robot decide: then what it is asked for."""
+        try:
+            served = self._queries.serve(query, self._current, self.outputs)
+        except DecodeError as error:
+            refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
+            reply = refused(query, str(error), now.wall_ns)
+            served = [] if reply is None else [reply]
+        if isinstance(served, Request):
+            return served
+        for reply in served:
+            self._bus.reply(reply)
+        self._bus.retire(query.ticket)
+        return None
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bool:
         """Offer the line; whether it went. What became of it the robot hears with the next step."""

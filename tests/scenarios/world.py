@@ -22,7 +22,8 @@ from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.signature import Signature
 from acsard.messages.topics import PUBLISHED
-from acsard.runtime.control_loop import BlackBox, ControlLoop
+from acsard.record.steps import BlackBox
+from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.told import turn_rate
