@@ -21,8 +21,7 @@ FAIL baud rate: other | {rate}, not {configured} baud
     -> write mcu.baud_rate = {rate}; the check goes on with it
 FAIL baud rate: nothing | nothing heard
     {heard} at {configured} baud, and no good line at any other
-    -> is it the right port (`acsard ports`), is the board powered, does the firmware answer lines,
-    are TX and RX crossed?
+    -> is it the right port (`acsard ports`), is it powered, does it answer, are TX and RX crossed?
 FAIL baud rate: cut | pieces of lines
     at {configured} baud {heard}; no good line at any other
     -> the firmware cuts its replies short or leaves out the line end: all four values and

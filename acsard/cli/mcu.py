@@ -107,8 +107,7 @@ def main(args: argparse.Namespace) -> int:
         trouble = error  # programs get their object all the same
     finally:
         person.clear()
-    changes = advice.changes(findings, configured, args.port if args.write else "")
-    written = ""
+    changes, written = advice.changes(findings, configured, args.port if args.write else ""), ""
     if args.write and changes and not trouble:
         try:
             change(Path(where), changes)
