@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.system.harness import Bus, Daemon, acsard, finish, until
+from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
 OFTEN = {"rates": {"state": 100.0, "diagnostics": 100.0}}
 """What has a rate is said when the mode changes, and from then on at that rate: whoever listens by
@@ -22,6 +23,8 @@ ROS = ("odom", "tf", "joint_states", "cmd_vel_out", "diagnostics")
 
 MEASURED = {"acsard: control loop", "acsard: recording"}
 """Rows of what the daemon measures of itself, which is in no recording."""
+
+RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
 
 MISSED = 0.2
 """The share of messages that a listener on a busy machine may not have got: the bus drops them."""
@@ -49,6 +52,10 @@ def bag(path: Path) -> Told:
     return Told(data, times, lambda topic, raw: store.deserialize_cdr(raw, types[topic]))
 
 
+def _take(got: list[bytes], sample: Any) -> None:
+    got.append(sample.payload.to_bytes())
+
+
 @contextmanager
 def heard(bus: Bus) -> Iterator[dict[str, list[bytes]]]:
     """All that comes on the keys of the ROS tree, and `state` and `events` of our own."""
@@ -56,9 +63,7 @@ def heard(bus: Bus) -> Iterator[dict[str, list[bytes]]]:
     with ExitStack() as stack:
         for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
             got = seen.setdefault(key.rpartition("/")[2], [])
-            subscriber = bus.session.declare_subscriber(
-                key, lambda sample, got=got: got.append(sample.payload.to_bytes())
-            )
+            subscriber = bus.session.declare_subscriber(key, partial(_take, got))
             stack.callback(subscriber.undeclare)
         bus.ask("info")  # behind the subscriptions
         yield seen
@@ -202,3 +207,11 @@ def test_times_in_the_file_are_when_it_was_published(both: Any) -> None:
     for raw, time_ns in zip(told.data["/cmd_vel_out"], told.times["/cmd_vel_out"], strict=True):
         stamp = told.decode("/cmd_vel_out", raw).header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == time_ns
+
+
+def test_a_full_disk_is_a_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    words = acsard("log", "export", str(RECORDED), "new.mcap")
+    full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes a file
+    ended = finish(full, tmp_path)
+    assert (ended.code, ended.err) == (1, "acsard: cannot write new.mcap: File too large")
+    assert not [*tmp_path.iterdir()]
