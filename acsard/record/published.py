@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from acsard.messages.report import Report
+from acsard.messages.report import Look, Report
 from acsard.messages.schema import (
     DiagnosticArray,
     Header,
@@ -51,6 +51,7 @@ class Publisher:
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._listened()
         self._static: TFMessage | None = None
+        self._latches = True
 
     def _listened(self) -> frozenset[str]:
         names = {channel.native for channel in said(left_out(self._config))}
@@ -62,22 +63,24 @@ class Publisher:
             self._config = self._robot.config
             self._report.use(self._config)
             self._wanted = self._listened()
+            self._latches = True
         now = step.inputs.now
         for command in step.inputs.commands:
             yield self._heard(command, now)
         yield from self._latched(now)
-        for key, message in self._report.due(outputs, self._wanted, self._robot_now(now)):
+        for key, message in self._report.due(outputs, self._wanted, self._look(now)):
             yield Published(BY_KEY[key], "", now.wall_ns, _recorded(message))
         for event in step.said.events:
             line = log(event, Time.from_ns(now.wall_ns))
             yield Published(LOG, "", now.wall_ns, line)
 
-    def _robot_now(self, now: Instant) -> Any:
+    def _look(self, now: Instant) -> Look:
         return lambda: self._robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
-        """Once, and again when it is another one."""
-        if "tf_static" in self._wanted:
+        """Once, and again when a setting has made it another one."""
+        if self._latches and "tf_static" in self._wanted:
+            self._latches = False
             static = self._report.tf_static()
             if static != self._static:
                 self._static = static
