@@ -9,6 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from errno import EEXIST
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple, Protocol
 
@@ -238,13 +239,23 @@ def _beside(new: Path, force: bool) -> Iterator[Path]:
 
 
 def _require_free(new: Path, force: bool) -> None:
-    """Only what an export was may go, and only by `force`."""
+    """Only what may have been an export may go, and only by `force`."""
     if not (new.exists() or new.is_symlink()):
         return
     if not force:
-        raise FileExistsError(17, "it exists; --force writes it anew")
+        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
     if new.is_dir() and not (new / "metadata.yaml").is_file():
-        raise FileExistsError(17, "it is a directory, and no bag")
+        raise FileExistsError(EEXIST, "it is a directory, and no bag")
+    if new.is_file() and _is_recording(new):
+        raise FileExistsError(EEXIST, "it is a recording; name another file")
+
+
+def _is_recording(path: Path) -> bool:
+    try:
+        Recording(path)
+    except RecordingError:
+        return False
+    return True
 
 
 def _remove(part: Path) -> None:

@@ -56,7 +56,13 @@ def exported(tape: Tape, config: Config, path: Path) -> Said:
     return said
 
 
-@pytest.fixture(scope="module", params=[Config(), CHECKED], ids=["plain", "checked"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(Config(), id="plain"),
+        pytest.param(CHECKED, id="checked", marks=pytest.mark.slow),
+    ],
+)
 def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What was published, and what the export says."""
     world, tape = driven(request.param)
