@@ -7,9 +7,7 @@ An hour of driving at 100 Hz in virtual time, the daemon's own program over the 
 
 from __future__ import annotations
 
-import os
-import subprocess
-import time
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +23,7 @@ from acsard.record.steps import Taken
 from acsard.robot import Robot
 from acsard.values import Inputs, Instant, Outputs, Recording
 from tests.scenarios.world import START, World
-from tests.system.harness import acsard, environment
+from tests.system.harness import ROOT, finish
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(1800)]
 
@@ -79,15 +77,23 @@ class Cost(NamedTuple):
     """Resident at most."""
 
 
+MEASURED = """\
+import sys, time
+from pathlib import Path
+from acsard.cli import main
+assert main(sys.argv[1:]) == 0
+status = Path("/proc/self/status").read_text()
+print(time.process_time(), int(status.partition("VmHWM:")[2].split()[0]) / 1024)
+"""
+"""Of a process the system tells the most it had since it became this program."""
+
+
 def cost(*words: str) -> Cost:
     """Of one run of the program."""
-    began = time.perf_counter()
-    process = subprocess.Popen(acsard(*words), env=environment(), stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0, words
-    took = time.perf_counter() - began
-    return Cost(took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+    ended = finish([sys.executable, "-c", MEASURED, *words], ROOT, within=1500.0)
+    assert ended.code == 0, ended
+    processor, megabytes = map(float, ended.out.splitlines()[-1].split())
+    return Cost(ended.seconds, processor, megabytes)
 
 
 @pytest.fixture(scope="module")
