@@ -39,7 +39,6 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.access import least_role
 from acsard.bus.address import require_id
 from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
@@ -136,7 +135,7 @@ class Client:
             with closing(drive(self, linear, angular, seconds)) as steps:
                 for pause in steps:
                     time.sleep(pause)
-        except UnheardError as error:
+        except (UnheardError, NoAnswerError) as error:
             raise self._unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
@@ -260,16 +259,25 @@ class Client:
         return found
 
     def _require(self, name: str) -> None:
-        """Raises `NotPermittedError` when our certificate is why nobody answers."""
-        key = name.partition("?")[0]
-        if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
+        """Raises `NotPermittedError` or `NoAnswerError` when our certificate may be why nobody
+        answers."""
+        if not self._tls:
+            return
+        us = self.whoami()
+        if us.unlisted:
+            raise NoAnswerError(f"no answer on {self.key(name)}: {us.unlisted}")
+        if why := us.lacks(name.partition("?")[0]):
             raise NotPermittedError(why)
 
-    def _unheard(self, error: UnheardError) -> MendableError:
+    def _unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """The same with what our certificate has to do with it."""
         if not self._tls:
             return error
         us = self.whoami()
+        if us.unlisted:
+            return NoAnswerError(f"{error}; {us.unlisted}")
+        if isinstance(error, NoAnswerError):
+            return error
         if us.role == "viewer":
             return NotPermittedError(us.words())
         return NotDrivenError(f"{error}; {us.words()}")
@@ -291,7 +299,7 @@ class AsyncClient:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
                     await asyncio.sleep(pause)
-        except UnheardError as error:
+        except (UnheardError, NoAnswerError) as error:
             found = await in_thread(partial(self._client._unheard, error), 2 * REPLY_TIMEOUT_S)
             raise found from None
 
