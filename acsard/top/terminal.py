@@ -132,7 +132,7 @@ def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
             for line in told[1:]:
                 if "GONE" in line.plain or "SILENT" in line.plain:
                     line.stylize("bold red")
-            below = "q leaves" if rows else fleet.hint()
+            below = (fleet.more or "q leaves") if rows else fleet.hint()
             shown.update(Group(*told, Text(), Text(below, "dim")), refresh=True)
             typed = read(PERIOD_S)
             if typed is None or "q" in typed.lower():
