@@ -8,7 +8,7 @@ from threading import Lock
 
 import zenoh
 
-from acsard.bus.fleet import ALL, follow, nobody, robot_of
+from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
 from acsard.messages.encodings import DecodeError, Decoder
@@ -67,6 +67,13 @@ class Fleet:
             age = max(0.0, now - heard)
             rows.append(Row(name, one.here, state, age, one.version, SILENT_S + ASK_S))
         return rows
+
+    @property
+    def seen(self) -> str:
+        """How many robots are all there are, and where; "" where they were named."""
+        with self._lock:
+            here = sum(one.here for one in self._known.values())
+        return seen(self._endpoint, here) if ALL in self._ids else ""
 
     @property
     def more(self) -> str:
