@@ -69,6 +69,10 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
     late, board = found({}, {"link_lost": 5, "link_lost_late": 3})
     assert "lost 2 times" in board.text
     assert "mcu check" in board.mend
+    states = replace(STATE, counters={"link_lost": 2})
+    (sim,) = link(Running(INFO, Config(), STATE, states, 0))
+    assert "this computer" in sim.text
+    assert "mcu check" not in sim.mend
     why = "this computer did not run for 0.80 s, and heard nothing"
     (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
     assert why in finding.text
