@@ -39,7 +39,6 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.access import least_role
 from acsard.bus.address import require_id
 from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
@@ -136,7 +135,7 @@ class Client:
             with closing(drive(self, linear, angular, seconds)) as steps:
                 for pause in steps:
                     time.sleep(pause)
-        except UnheardError as error:
+        except (UnheardError, NoAnswerError) as error:
             raise self._unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
@@ -149,8 +148,7 @@ class Client:
 
     def _call(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         payload = msgspec.json.encode(fields) if fields else None
-        replies = self._ask(service_key(service), payload)
-        return Decoder(schema.ServiceReply).decode(*replies[0])
+        return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
     def get(self, name: str) -> Any:
         """The last value of a published key as its typed message, or of `info`, `config`, …"""
@@ -158,7 +156,7 @@ class Client:
 
     def reply(self, name: str) -> tuple[str, bytes]:
         """The same as it came: encoding and payload."""
-        return self._ask(name)[0]
+        return self._ask(name)
 
     def whoami(self) -> Identity:
         """Who we are to the daemon; the role is "" when it answers none of them."""
@@ -230,8 +228,8 @@ class Client:
             timestamp=self.session.new_timestamp(),
         )
 
-    def _ask(self, name: str, payload: bytes | None = None) -> list[tuple[str, bytes]]:
-        found = []
+    def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
+        """The first answer: a stranger may give any number of others."""
         try:
             replies = self.session.get(
                 self.key(name),
@@ -243,33 +241,40 @@ class Client:
             raise _no_key(name) from None
         for reply in replies:
             if reply.ok is not None:
-                found.append(encoded(reply.ok))
-            elif reply.err is not None and reply.err.payload.to_string() == TIMED_OUT:
+                return encoded(reply.ok)
+            if reply.err is not None and reply.err.payload.to_string() == TIMED_OUT:
                 raise NoAnswerError(
                     f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
                     "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
                 )
-            elif reply.err is not None:
+            if reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
-        if not found:
-            self._require(name)
-            raise NoAnswerError(
-                f"no answer on {self.key(name)}; is the daemon running with robot.id "
-                f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
-            )
-        return found
+        self._require(name)
+        raise NoAnswerError(
+            f"no answer on {self.key(name)}; is the daemon running with robot.id "
+            f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
+        )
 
     def _require(self, name: str) -> None:
-        """Raises `NotPermittedError` when our certificate is why nobody answers."""
-        key = name.partition("?")[0]
-        if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
+        """Raises `NotPermittedError` or `NoAnswerError` when our certificate may be why nobody
+        answers."""
+        if not self._tls:
+            return
+        us = self.whoami()
+        if us.unlisted:
+            raise NoAnswerError(f"no answer on {self.key(name)}: {us.unlisted}")
+        if why := us.lacks(name.partition("?")[0]):
             raise NotPermittedError(why)
 
-    def _unheard(self, error: UnheardError) -> MendableError:
+    def _unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """The same with what our certificate has to do with it."""
         if not self._tls:
             return error
         us = self.whoami()
+        if us.unlisted:
+            return NoAnswerError(f"{error}; {us.unlisted}")
+        if isinstance(error, NoAnswerError):
+            return error
         if us.role == "viewer":
             return NotPermittedError(us.words())
         return NotDrivenError(f"{error}; {us.words()}")
@@ -291,7 +296,7 @@ class AsyncClient:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
                     await asyncio.sleep(pause)
-        except UnheardError as error:
+        except (UnheardError, NoAnswerError) as error:
             found = await in_thread(partial(self._client._unheard, error), 2 * REPLY_TIMEOUT_S)
             raise found from None
 

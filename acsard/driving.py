@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Generator, Iterator
 from typing import Any, Protocol
 
@@ -132,6 +133,8 @@ class _Watch:
         self._robot = robot
         self._decoder = Decoder(RobotState)
         self._states = robot.subscribe("state")
+        self._answers: deque[zenoh.Sample] = deque()
+        """What was asked for comes on a thread of Zenoh's, which only leaves it here."""
         self.state: RobotState | None = None
         self.heard = self._asked = time.monotonic()
         self.objection: str | None = None
@@ -151,13 +154,15 @@ class _Watch:
         """Take what has come; raises `NoAnswerError` after a long silence."""
         now = time.monotonic()
         try:
+            while self._answers:  # first: what comes by itself is later
+                self._take(self._answers.popleft())
             while (sample := self._states.try_recv()) is not None:
                 self._take(sample)
         except zenoh.ZError:
             raise NoAnswerError("the connection was closed while the robot drove") from None
         if now - max(self.heard, self._asked) > ASK_S:
             self._asked = now
-            self._robot.ask("state", self._take)
+            self._robot.ask("state", self._answers.append)
         if now - self.heard > DEAD_S:
             raise NoAnswerError(
                 f"no word from the daemon for {DEAD_S:g} s: does it run, with this robot.id?"

@@ -91,8 +91,9 @@ class Robot:
         does not go never was."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
-        """Totals since start: `commands`, and `command_<reason>` for each kind refused. The shell
-        adds what it alone sees (lines that were superseded, the bus)."""
+        """Totals since start: `commands`, `commands_first_contact` of senders that were new here
+        and had to show their delays first, `command_<reason>` for each kind refused. The shell adds
+        what it alone sees (lines that were superseded, the bus)."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -200,6 +201,8 @@ class Robot:
             events.append(told)
         if before == "up" != link:
             self.counters["link_lost"] += 1
+            if session.lateness.late_s:
+                self.counters["link_lost_late"] += 1
         if link != "up":
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
@@ -344,11 +347,12 @@ class Robot:
                 self.counters["commands"] += 1
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
-        self.counters[f"command_{refusal.reason}"] += 1
-        if refusal.reason != "unproven":  # so begins every sender with a clock of its own
-            self._refused_ns = now_ns
-        self._refused = refusal.text[:MAX_TEXT]
         events.append(refused(refusal))
+        if refusal.reason == "unproven":  # so begins every sender with a clock of its own
+            self.counters["commands_first_contact"] += 1
+            return
+        self.counters[f"command_{refusal.reason}"] += 1
+        self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]
 
     # limit, invert
 

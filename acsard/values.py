@@ -168,12 +168,12 @@ EventName = Literal[
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_dropped", "lines_lost", "wheels_turned", "wheels_doubted",
     "gyro", "imu_refused",
-    "bus_stuck", "router_missing", "router_found",
+    "bus_stuck", "router_missing", "router_found", "no_router",
     "missed_periods", "recording",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
-    "mode", "commander", "kept_waiting", "command_refused", "fault",
+    "mode", "commander", "kept_waiting", "first_contact", "command_refused", "fault",
 ]  # fmt: skip
 """All that the log can be asked for; `deploy/systemd/README.md` says what each means."""
 
@@ -259,6 +259,8 @@ class RoutersStatus(Struct, frozen=True):
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    peers: tuple[str, ...] = ()
+    """Those of the connected that are no routers, and hand on nothing."""
 
 
 class GyroSample(Struct, frozen=True):

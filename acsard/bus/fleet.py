@@ -65,6 +65,11 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
         session.put(full_key(one, "stop"), b"", attachment=by, express=True)
 
 
+def seen(endpoint: str, robots: int) -> str:
+    """How many there are by a wildcard, and where that was asked: another place may see others."""
+    return f"all seen at {endpoint}: {robots} robot{'' if robots == 1 else 's'}"
+
+
 def nobody(endpoint: str) -> str:
     """Why no robot is seen by a wildcard, in words."""
     if endpoint.startswith(TLS):

@@ -40,9 +40,22 @@ class Identity(Struct, frozen=True):
     def lacks(self, key: str) -> str:
         """Why one may not use a key below the robot's id, "" when that is not known."""
         least = least_role(key)
-        if not self.role or ROLES.index(self.role) >= ROLES.index(least):
+        if not self.role:
+            return self.unlisted
+        if ROLES.index(self.role) >= ROLES.index(least):
             return ""
         return f"{self.words()}; {key} is for a certificate that is {least}"
+
+    @property
+    def unlisted(self) -> str:
+        """That our certificate has no role, as far as can be told from here; "" without one."""
+        if self.role or not self.certificate:
+            return ""
+        return (
+            f"your certificate {self.certificate} is in no role's list: add that name to viewers, "
+            "operators or maintainers of [access] in the robot's acsard.toml (behind a router: to "
+            "the router's list) and restart both; or no daemon of this robot.id runs there"
+        )
 
     def words(self) -> str:
         """Role and certificate in a sentence."""
@@ -50,10 +63,7 @@ class Identity(Struct, frozen=True):
             whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
             whose += "" if self.certificate else " a certificate here, by this link"
             return f"{whose} is {self.role}: {MAY[self.role]}"
-        return (
-            f"your certificate {self.certificate or '(unknown)'} is in no list of [access], or "
-            "the robot's daemon is not there: it may do nothing"
-        )
+        return self.unlisted or "nobody answers: no daemon of this robot.id runs there"
 
 
 def identity(ask: Ask, tls: str, sender: str) -> Identity:

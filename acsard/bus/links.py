@@ -59,11 +59,16 @@ class Links:
     def _look(self) -> RoutersStatus:
         endpoints = self._bus.connect
         try:
-            ends = {str(link.dst) for link in self._session.info.links()}
+            info = self._session.info
+            far = {str(link.dst): str(link.zid) for link in info.links()}
+            kinds = {str(one.zid): one.whatami for one in info.transports()}
         except zenoh.ZError:  # it is being closed
             return self._status or RoutersStatus()
-        missing = unreached(self._bus.mode, endpoints, ends)
-        return RoutersStatus(tuple(one for one in endpoints if one not in missing), missing)
+        missing = unreached(self._bus.mode, endpoints, set(far))
+        connected = tuple(one for one in endpoints if one not in missing)
+        ends = {end for end, zid in far.items() if kinds.get(zid) == zenoh.WhatAmI.PEER}
+        peers = tuple(one for one in connected if _leads_there(one, ends))
+        return RoutersStatus(connected, missing, peers)
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 Every step of the check is an experiment: lines go out for some time, all that comes back is one
 recording, `replies`, and the step judges what it holds. Speeds are the motors', not the wheels':
 which wheel a motor turns is what the check has to find out. A motor that runs away, or an MCU that
-falls silent while one turns, ends any experiment at once: zeros, then silence.
+falls silent while one turns, ends any experiment at once, as one that starts anew: zeros, silence.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
+from acsard.checkup.restarts import Restarts
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
@@ -69,12 +70,13 @@ class Board:
         """For how long `drive` has had no reply; what this host paused does not count."""
         self._sequence = 0
         self._lines = LineReader()
+        self.restarts = Restarts()
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
         """Open the line at this rate; what was half received is forgotten."""
         self.wire.open(baud_rate)
-        self.baud_rate, self.heard = baud_rate, Heard()
+        self.baud_rate, self.heard, self.restarts = baud_rate, Heard(), Restarts()
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
 
@@ -97,7 +99,7 @@ class Board:
         Where zeros make a motor run away (its encoder is reversed, and the firmware regulates it
         to zero), each further one would feed the watchdog that can cut it.
         """
-        self.armed = False
+        self.armed, self.restarts.watched = False, False
         try:
             for _ in range(FAREWELL):
                 if self._fled:
@@ -140,6 +142,7 @@ class Board:
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
         self.sent_s = self.now_s
+        self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
         """Zeros that any firmware takes: on a line of their own, with the comma and without."""
@@ -202,6 +205,8 @@ class Board:
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
                 self.heard.line(line, reply is not None)
+                if sign := self.restarts.look(line, at_s, reply):
+                    raise StoppedError(self.restarts.finding(self.mcu, sign))
                 if reply is not None:
                     got.append(reply)
         self.replies += got
@@ -221,6 +226,11 @@ class Board:
         except FrameError:
             self.others.append(line)
             return None
+
+    @property
+    def silent_s(self) -> float:
+        """Since the last reply, 0 where none has come or may be asked for."""
+        return self.now_s - self.replies[-1].at_s if self.replies and not self._fled else 0.0
 
     def _guard(self) -> None:
         fastest = motion.fastest(self.replies, limits.RUNAWAY)

@@ -11,14 +11,11 @@ from typing import get_args
 from acsard.checkup import manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
-from acsard.checkup.limits import GLANCE_S
+from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.motion import ZERO, Reply
 from acsard.config.settings import Baud
 from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
-
-BOOT_S = 3.0
-"""Opening the port resets many boards, and their bootloader waits about two seconds."""
 
 OTHER_S = 0.6
 """How long each other baud rate is tried."""
@@ -36,7 +33,7 @@ TRIES = 5
 def baud(board: Board) -> Finding:
     """At which rate it answers; ends the check when at none."""
     configured = board.baud_rate
-    if _knock(board, BOOT_S):
+    if _knock(board, BOOT_S):  # opening the port resets many boards
         return manual.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
@@ -67,6 +64,7 @@ def identity(board: Board) -> Finding:
     """Who it says it is; ends the check when it only says what we say."""
     board.others.clear()
     for _ in range(ASKED):
+        board.restarts.asked(board.now_s)
         board.wire.send(b"\r\n?\r\n")
         board.listen(1.5 * GLANCE_S)
         if any(line.startswith(IDENTITY) or line == b"?" for line in board.others):

@@ -21,5 +21,6 @@ PERIOD_S = 0.02  # between two lines, where the wire carries that
 GLANCE_S = 0.2  # a few replies, and some counts of a coarse encoder
 MOTOR_S = 2.0  # a lifted wheel has its speed or has lost it by then, unless it is on its way:
 PATIENCE_S = 3 * MOTOR_S  # the longest wait for one that is, heavy or a hub motor that coasts
+BOOT_S = 3.0  # a board that starts anew answers by then: many a bootloader waits two
 CUT_S = WATCHDOG_MOST_S + GLANCE_S  # after such a silence any right watchdog has cut the motors
 STOOD_S = WATCHDOG_MOST_S + MOTOR_S  # they stand by then, or the MCU has no watchdog

@@ -241,10 +241,8 @@ WARN damaged lines: lenient | {took} of {kinds} kinds moved
 FAIL damaged lines: taken | {took} of {kinds} kinds moved
     motors turned on lines that are none: {which}; on a noisy cable that drives the robot
     -> the firmware must take a line whole or not at all; deploy/firmware does
-
 FAIL wheels: not lifted
     not confirmed to be lifted
-
 FAIL runaway: along | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
     the encoder of {motor} says more than {most:g} rad/s
     -> counts per turn in the firmware too low, or its control loop unstable
@@ -252,15 +250,17 @@ FAIL runaway: against | {letter}: told {told:.1f}, seen {seen:.1f} rad/s
     the encoder of {motor} says more than {most:g} rad/s, against the command: the firmware's
     control loop drives it away
     -> swap this motor's two leads, or A and B of its encoder
-
 FAIL stop: turns | turns {seconds:g} s after zeros
     {motors} turns on, by its encoder, whatever zeros are sent
     -> does a hand or a slope turn it? else cut the motors' power: firmware must stop at `p00.00`
-
+FAIL restarts: seen | started anew
+    while {when} the board started anew: {sign}
+    -> a weak supply (brown-out when motors start, a USB hub): one for the board alone, thicker
+    leads, one ground; a second program that opens the port (DTR resets many boards); else its own
+    watchdog, or a crash of its firmware
 FAIL link: silent | silent for {seconds:.1f} s
     the microcontroller fell silent while {motors} was to turn
     -> does its supply dip when a motor starts, and it restarts? a loose cable?
-
 FAIL serial line: lost | lost
     {error}
     -> a loose plug? `dmesg | tail`

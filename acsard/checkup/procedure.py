@@ -17,6 +17,7 @@ from acsard.checkup import (
 )
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, WireLostError
+from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.outside import Operator, Wire
 from acsard.checkup.wheels import encoder_finding, wheel_map
 from acsard.config.settings import Config
@@ -73,7 +74,11 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(manual.find("wheels: not lifted"))
-            _steps(board, operator, once)
+            try:
+                _steps(board, operator, once)
+            except StoppedError:
+                _await_return(board, GLANCE_S)  # which says it if it has started anew
+                raise
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -87,7 +92,20 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
         tell(Finding(REST, "SKIPPED", f"{len(rest)} steps", f"{why}; not tried: {', '.join(rest)}"))
 
 
-def _steps(board: Board, operator: Operator, tell: Callable[[Finding | None], None]) -> None:
+def _await_return(board: Board, silent_s: float) -> None:
+    """Zeros until a board that has been silent for so long answers, or has had time to start."""
+    end_s = board.now_s + BOOT_S
+    while board.silent_s > max(silent_s, 4 * board.gap_s) and board.now_s < end_s:
+        board.zeros()
+        board.listen(board.period_s)
+
+
+def _steps(board: Board, operator: Operator, once: Callable[[Finding | None], None]) -> None:
+    def tell(finding: Finding | None) -> None:
+        if finding is not None and finding.verdict in ("WARN", "FAIL"):
+            _await_return(board, 2 * GLANCE_S)  # no cable is to blame for a board that starts anew
+        once(finding)
+
     for doing, step in SILENT:
         operator.say(doing)
         tell(step(board))

@@ -107,7 +107,8 @@ class Robot:
         """Drive it; raises `GuideError` when it ends before its end."""
         recorder = Recorder(self._joints)
         self._drain()
-        riding = Riding(leg, SOURCE, self._geometry, time.monotonic())
+        sender = self._client.sender
+        riding = Riding(leg, SOURCE, self._geometry, time.monotonic(), sender)
         try:
             self._drive(riding, recorder)
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
@@ -63,7 +64,7 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     from concurrent.futures import ThreadPoolExecutor
 
     from acsard.bus import fleet
-    from acsard.bus.fleet import ALL, present
+    from acsard.bus.fleet import ALL, present, seen
     from acsard.cli.echo import of_robot
     from acsard.messages.encodings import encode
     from acsard.messages.schema import ServiceReply
@@ -86,6 +87,8 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
             reply = ServiceReply(False, "NO ANSWER: go and look, or use its switch")
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
+    if ALL in ids:
+        print(f"acsard: {seen(endpoint, len(replies))}", file=sys.stderr)
     if None in replies.values():
         return int(Exit.UNREACHABLE)
     return int(Exit.OK if all(r.success for r in replies.values() if r) else Exit.FAILURE)

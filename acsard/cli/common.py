@@ -123,7 +123,10 @@ def require_followed(key: str) -> None:
 
 
 def require_asked(key: str) -> None:
-    """Raises `UsageError` for a key that answers no question, or does something when asked."""
+    """Raises `UsageError` for a key that answers no question, does something when asked, or is
+    many: `get` prints one answer."""
+    if set(key.partition("?")[0]) & set("*$"):
+        raise UsageError(f"{key} is many keys: get asks one; `acsard topics` lists them")
     row = row_of(key)
     if row is None:
         return

@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 import time
+from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -108,14 +109,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C."""
     from acsard.client import connect
-    from acsard.host.errors import NotPermittedError, UsageError
+    from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 
     if not sys.stdin.isatty():
         raise UsageError("drive reads keys and needs a terminal; use acsard.client")
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
-        if tls and (us := robot.whoami()).role == "viewer":
-            raise NotPermittedError(us.words())
+        if tls and (us := robot.whoami()).role in ("", "viewer"):
+            raise (NotPermittedError if us.role else NoAnswerError)(us.words())
         ride = _Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
         try:
             _show(ride)
@@ -190,6 +191,8 @@ class _Ride:
         self._robot, self._teleop = robot, teleop
         self._names = robot_id, endpoint
         self._decoder, self._states = Decoder(RobotState), robot.subscribe("state")
+        self._answers: deque[zenoh.Sample] = deque()
+        """Left here by a thread of Zenoh's."""
         self._state: RobotState | None = None
         self._heard = self._fine = self._asked = time.monotonic()
 
@@ -203,11 +206,13 @@ class _Ride:
             self._robot.send(wish.linear, wish.angular)
         if wish in (None, REST):
             self._fine = now
+        while self._answers:  # first: what comes by itself is later
+            self._take(self._answers.popleft())
         while (sample := self._states.try_recv()) is not None:
             self._take(sample)
         if now - max(self._heard, self._asked) > ASK_S:
             self._asked = now
-            self._robot.ask("state", self._take)
+            self._robot.ask("state", self._answers.append)
 
     def _take(self, sample: zenoh.Sample) -> None:
         from acsard.bus.subscription import encoded

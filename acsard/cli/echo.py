@@ -62,6 +62,8 @@ def main(args: argparse.Namespace) -> int:
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
             _say_who(robot, many, endpoint)
+        elif tls and (why := robot.whoami().unlisted):
+            print(f"acsard: {why}. Waiting.", file=sys.stderr)
         try:
             for sample in samples:
                 line, whose = json_line(*encoded(sample)), robot_of(str(sample.key_expr))

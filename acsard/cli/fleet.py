@@ -71,4 +71,6 @@ def _once(fleet: Fleet) -> int:
         raise ExitError(Exit.UNREACHABLE, fleet.hint())
     width = shutil.get_terminal_size((160, 24)).columns
     print("\n".join(table(rows, width)))
+    for told in filter(None, (fleet.seen, fleet.more)):
+        print(f"acsard: {told}", file=sys.stderr)
     return int(Exit.OK)

@@ -11,6 +11,7 @@ from acsard.bus.certificates import CA, CERTIFICATE, KEY
 from acsard.cli.common import add_config, load
 from acsard.config.settings import Config
 from acsard.config.validation import write
+from acsard.host.errors import UsageError
 from acsard.host.service import TLS
 from acsard.lan import identities
 from acsard.values import ROLES
@@ -51,6 +52,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--role",
         choices=ROLES,
         help="what it may do; leave it out for a robot or a router",
+    )
+    more.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="also add the name to its role's list in this acsard.toml",
     )
     add_config(more)
     more.set_defaults(main=main_add)
@@ -100,22 +107,41 @@ def main_init(args: argparse.Namespace) -> int:
     _admit_service(directory)
     host = socket.gethostname()
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
+    lines = "" if args.write else _LINES.format(directory=directory, port=identities.PORT)
     print(_certified(names))
-    print(_NEXT.format(directory=directory, port=identities.PORT, host=host, **files))
+    print(_NEXT.format(directory=directory, port=identities.PORT, host=host, lines=lines, **files))
     return 0
 
 
 def main_add(args: argparse.Namespace) -> int:
     """Make one more client certificate."""
+    from acsard.host.files import change, require_changeable, require_tomlkit
+
+    listed = f"{args.role}s"
+
+    def keys(config: Config) -> dict[str, object]:
+        there = getattr(config.access, listed)
+        return {f"access.{listed}": list(dict.fromkeys([*there, args.name]))}
+
     where, config = load(args.config)  # before anything is made
+    if args.write:
+        if not args.role:
+            raise UsageError("--write puts the name into a role's list: say which, --role operator")
+        require_tomlkit()
+        require_changeable(args.write, keys, new=True)
     place = identities.add(args.directory, args.name, args.address, args.days)
     if not args.role:
         print(f"{place} is for {args.name}")
         return 0
-    there = getattr(config.access, f"{args.role}s")
-    names = list(dict.fromkeys([*there, args.name]))
-    print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do (whom {where}")
-    print(f"has as {args.role}s stays):\n\n[access]\n{args.role}s = {write(names)}")
+    if args.write:
+        names = write(change(args.write, keys, new=True)[f"access.{listed}"])
+        print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
+    else:
+        names = write(keys(config)[f"access.{listed}"])
+        print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do (whom")
+        print(f"{where} has as {listed} stays; --write FILE does it):\n")
+        print(f"[access]\n{listed} = {names}\n")
+    print("It counts when the daemon starts: systemctl restart acsard, or `acsard run` anew")
     return 0
 
 
@@ -172,17 +198,22 @@ def _days(text: str) -> int:
     return int(text)
 
 
+_LINES = """\
+On the robot, in acsard.toml (--write FILE does it):
+
+[bus]
+listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:{port}"]
+tls = "{directory}"
+
+"""
+
 _NEXT = """\
 Wrote {directory}:
   {ca}, {certificate}, {key}   the robot's
   ca-key.pem                       the authority: whoever has it can let anyone in; keep it safe
   clients/<role>/                  one directory each for viewer, operator, maintainer
 
-On the robot, in acsard.toml:
-
-[bus]
-listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:{port}"]
-tls = "{directory}"
+{lines}The daemon opens it when it starts: systemctl restart acsard, or `acsard run` anew.
 
 Copy clients/<role>/ to who may do that, and there:
 

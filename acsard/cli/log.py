@@ -188,6 +188,12 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     where = Path(args.directory or load(None)[1].record.directory or SERVICE)
     try:
         return where, listed(where)
+    except FileNotFoundError:
+        raise ExitError(
+            Exit.FAILURE,
+            f"nothing is recorded in {where}: it is not there. The service records by itself, "
+            "`acsard run --record DIRECTORY` where you say; --directory reads another",
+        ) from None
     except OSError as error:
         raise ExitError(
             Exit.NO_PERMISSION if isinstance(error, PermissionError) else Exit.FAILURE,

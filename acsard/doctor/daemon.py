@@ -11,6 +11,7 @@ from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.link import check, link
 from acsard.doctor.running import Running, answers, asked
 from acsard.drive.gyro import WORDS
+from acsard.messages.diagnostics import NO_ROUTER
 from acsard.messages.schema import DiagnosticStatus
 from acsard.values import NS_PER_S, AcsardError
 
@@ -33,6 +34,12 @@ SIGN = "commands signed as the README says need no common clock"
 
 
 START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
+
+
+PUT_ROUTER = (
+    "robots that are joined directly hand on nothing: `acsard fleet` and `acsard call stop --id "
+    "'*'` miss the others; a router that all connect to mends that (deploy/zenoh/README.md)"
+)
 
 
 def routers(config: Config) -> Iterator[Finding]:
@@ -114,6 +121,8 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     row = rows.get(ROUTER)
     if row is not None:
         mend = START_ROUTER if row.level else ""
+        if any(one.value == NO_ROUTER for one in row.values):
+            mend = PUT_ROUTER
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 

@@ -12,6 +12,7 @@ from msgspec import Struct
 from acsard.bus.address import address_of
 from acsard.bus.session import reachable
 from acsard.client import Client, connect
+from acsard.config.live import flat, live
 from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding
@@ -24,6 +25,21 @@ WATCHED_S = 1.0
 
 SHOWN = 6
 """Keys that are named one by one; more are another file."""
+
+
+WAYS = (
+    (
+        False,
+        "(by its options or environment, or the file has changed since)",
+        "what follows is of the daemon; to have the file's, start it anew without those options",
+    ),
+    (
+        True,
+        "(set while it ran, or the file has changed since)",
+        "its next start has the file's; `acsard set KEY VALUE --write` puts one into the file",
+    ),
+)
+"""How a value can be another than the file's, by whether it can be set, and what to do."""
 
 
 class Running(Struct, frozen=True):
@@ -59,14 +75,14 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
         return msgspec.structs.replace(file, mcu=mcu)
 
 
-def differences(runs: Config, file: Config) -> list[str]:
-    """Each key that the daemon has otherwise than the file."""
-    ours = _flat(effective(file))
-    return [
-        f"{key} = {_text(value)}, not {_text(ours.get(key))}"
-        for key, value in _flat(effective(runs)).items()
-        if value != ours.get(key)
-    ]
+def differences(runs: Config, file: Config) -> dict[str, str]:
+    """Each key that the daemon has otherwise than the file, with both values in words."""
+    its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
+    return {
+        key: f"{key} = {_text(its.get(key))}, not {_text(ours.get(key))}"
+        for key in its | ours
+        if its.get(key) != ours.get(key)
+    }
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
@@ -76,10 +92,13 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     if not others:
         yield Finding("configuration", "ok", f"the daemon that runs ({who}) has it")
         return
-    more = f"; and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-    text = f"the daemon that runs ({who}) has other values: {'; '.join(others[:SHOWN])}{more}"
-    mend = "what follows is of the daemon; to have the file's, start it anew without those options"
-    yield Finding("configuration", "warning", text, mend)
+    for settable, how, mend in WAYS:
+        told = [words for key, words in others.items() if (live(key) is not None) == settable]
+        if told:
+            more = f"; and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
+            text = f"the daemon that runs ({who}) has other values {how}: "
+            text += f"{'; '.join(told[:SHOWN])}{more}"
+            yield Finding("configuration", "warning", text, mend)
 
 
 def answers(endpoint: str) -> bool:
@@ -90,13 +109,6 @@ def answers(endpoint: str) -> bool:
     except OSError:
         return False
     return True
-
-
-def _flat(table: dict[str, object], above: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for key, value in table.items():
-        flat |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {above + key: value}
-    return flat
 
 
 def _text(value: object) -> str:

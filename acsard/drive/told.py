@@ -18,8 +18,10 @@ def missed(periods: int) -> Event:
 
 
 def refused(refusal: Refusal) -> Event:
-    """A command does not count."""
+    """A command does not count, or not yet."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
+    if kind == "unproven":
+        return Event("first_contact", refusal.text, by=by, news=False)
     return Event("command_refused", refusal.text, "warning", by, kind, news=False)
 
 

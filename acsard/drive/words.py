@@ -9,7 +9,7 @@ REFUSED = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
     "crowded": f"{MAX_SENDERS} other senders of this source are live",
-    "unproven": "of a sender whose clock is not known yet: counts once its delays are steady",
+    "unproven": "of a sender that is new here: no error, it counts once its delays are steady",
     "stale": "held up on the way for longer than the source's timeout, or the sender's clock was "
     "set: counts once its delays are steady",
 }

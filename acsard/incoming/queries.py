@@ -231,7 +231,7 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     if query.topic in VERBS:
         payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
     else:
-        payload, name = failure(query.topic.removeprefix(PARAMETERS), why), ""
+        payload, name = failure(query.topic.removeprefix(PARAMETERS), why, query.payload), ""
     encoding = encoding_name("cdr", name)
     return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
 

@@ -6,6 +6,12 @@ from collections.abc import MutableMapping
 
 from acsard.values import Event, RoutersStatus
 
+PEER = (
+    "is no router but another peer, a robot's daemon perhaps: neither hands on what the other "
+    "says, so who connects to one sees that one only, and `acsard call stop --id '*'` stops no "
+    "other; put a router between them (deploy/zenoh/README.md)"
+)
+
 
 class RoutersTold:
     """Follows the routers that this daemon is to be connected to."""
@@ -25,6 +31,9 @@ class RoutersTold:
             events.append(Event("router_missing", _words("not connected to", gone), "warning"))
         if come:
             events.append(Event("router_found", _words("connected to", come)))
+        peers = [one for one in status.peers if one not in before.peers]
+        if peers:
+            events.append(Event("no_router", f"{', '.join(peers)} {PEER}", "warning"))
 
 
 def _words(what: str, endpoints: list[str]) -> str:

@@ -25,8 +25,9 @@ class Port(Protocol):
     def sent_ns(self) -> int:
         """When the last line had been handed over, monotonic."""
 
-    def take(self) -> tuple[Received, ...]:
-        """What was received since the last call."""
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
+        """What was received since the last call; with the time of a step that comes late also what
+        lies there and nobody had the time to read."""
 
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Send the line made at `now`, or say that it did not go; it is never kept."""

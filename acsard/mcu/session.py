@@ -14,8 +14,9 @@ from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.hearing import Hearing
+from acsard.mcu.lateness import Lateness
 from acsard.mcu.lines import LineReader
-from acsard.mcu.link import WORDS, Link
+from acsard.mcu.link import Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
 from acsard.mcu.snapping import Snapping
@@ -50,6 +51,7 @@ class McuSession:
         """Silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
+        self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self.snapping = Snapping()
         self._hearing = Hearing()
@@ -101,6 +103,7 @@ class McuSession:
             if more > 0:
                 self._reject("too_long", more)
                 self._bad()
+            self.lateness.look(now.mono_ns, good=bool(feedback))
             self._judge(now.mono_ns)
         self._announce()
         return feedback
@@ -149,7 +152,7 @@ class McuSession:
                 )
             if heard is not None:
                 return heard.words
-        return WORDS[self.link]
+        return self.lateness.words(self.link)
 
     @property
     def note(self) -> str:
@@ -215,7 +218,7 @@ class McuSession:
         link, check = self.link, self.negotiation
         before, self._announced = self._announced, (link, check.in_force, bool(check.trouble))
         if link != before[0]:
-            text = self.words() if self._damaged else WORDS[link]
+            text = self.words() if self._damaged else self.lateness.words(link)
             good = link in ("up", "booting")
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:

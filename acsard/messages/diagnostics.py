@@ -37,6 +37,9 @@ MISSED_SHARE = 0.01
 """Of the last minute's periods; more are a warning."""
 
 
+NO_ROUTER = "a peer, no router"
+
+
 class Row(Struct, frozen=True):
     """One status, before it has the robot's name."""
 
@@ -147,10 +150,13 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
 
 def _routers(routers: RoutersStatus) -> list[Row]:
     """The row of what `bus.connect` names, none where it names nothing."""
-    missing, connected = routers.missing, routers.connected
-    values = dict.fromkeys(connected, "connected") | dict.fromkeys(missing, "not connected")
+    missing, peers = routers.missing, routers.peers
+    values = dict.fromkeys(routers.connected, "connected") | dict.fromkeys(missing, "not connected")
+    values |= dict.fromkeys(peers, NO_ROUTER)
     words = f"not connected to {', '.join(missing)}" if missing else "connected"
-    return [Row("router", WARN if missing else OK, words, values)] if values else []
+    if peers:
+        words += f"; {', '.join(peers)} is no router: who connects here sees this robot only"
+    return [Row("router", WARN if missing or peers else OK, words, values)] if values else []
 
 
 def _recording(recording: Recording) -> list[Row]:

@@ -9,6 +9,7 @@ The rcl_interfaces structs live here, since nothing else speaks them; names are 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Annotated, TypeVar
 
 from msgspec import Meta, Struct
@@ -130,12 +131,15 @@ SETTING = ("set_parameters", "set_parameters_atomically")
 """The services that are asked of the robot."""
 
 
-def failure(service: str, why: str) -> bytes:
+def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """The reply to a request that is not served: as rclcpp, nothing where there is no room for why.
 
-    A client without any reply would wait for ever.
+    A client without any reply would wait for ever; one that sets expects a result for each.
     """
     refused = SetParametersResult(False, why)
+    if service in SETTING:
+        with suppress(CdrError):
+            return outcome(service, request, successful=False, reason=why)
     replies: dict[str, Struct] = {
         "list_parameters": ListReply([], []),
         "get_parameters": Values([]),
@@ -191,7 +195,12 @@ class Parameters:
 def wished(payload: bytes) -> dict[str, Plain]:
     """What a request to set asks for, by name; raises `CdrError`."""
     asked = Cdr(SetRequest).decode(payload)
-    return {one.name: _plain(one) for one in asked.parameters}
+    wishes: dict[str, Plain] = {}
+    for one in asked.parameters:
+        if one.name in wishes:
+            raise CdrError(f"{one.name} is in it twice: set it once; nothing was set")
+        wishes[one.name] = _plain(one)
+    return wishes
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:

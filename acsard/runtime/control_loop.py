@@ -142,7 +142,7 @@ class ControlLoop:
             port_open=port.is_open,
             opened=port.opened,
             port_trouble=port.trouble,
-            received=port.take(),
+            received=port.take(now if missed else None),
             commands=commands,
             requests=requests,
             refusals=refusals,

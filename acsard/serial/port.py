@@ -12,6 +12,7 @@ import errno
 import itertools
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 
 import serial
@@ -35,6 +36,10 @@ PERMISSION_PATIENCE_S = 2.0
 
 FAREWELL_S = 0.15
 """Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
+
+
+AT_ONCE = 4096
+"""Bytes read at a time: all that a driver holds."""
 
 
 class SerialPort:
@@ -69,8 +74,13 @@ class SerialPort:
         """When the last line had been handed to the kernel, monotonic."""
         return self._gate.sent_ns
 
-    def take(self) -> tuple[Received, ...]:
-        """What was received since the last call."""
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
+        """What was received since the last call; with the time of a step that comes late also what
+        lies there: the reader's turn may come behind the step's, which would read it as silence."""
+        if late is not None and self._transport is not None:
+            with suppress(serial.SerialException):  # lost: the reader finds out, and says so
+                data = self._transport.serial.read(AT_ONCE)
+                self._received += [Received(late, data)] if data else []
         if not self._received:
             return ()
         got = tuple(self._received)

@@ -8,7 +8,7 @@ from threading import Lock
 
 import zenoh
 
-from acsard.bus.fleet import ALL, follow, nobody, robot_of
+from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
 from acsard.messages.encodings import DecodeError, Decoder
@@ -29,8 +29,9 @@ class _Known:
 
     def __init__(self) -> None:
         self.here = False
-        self.state: RobotState | None = None
-        self.heard = self.asked = 0.0
+        self.said: tuple[RobotState | None, float] = None, 0.0
+        """Its state and when that came: one value, since another thread reads it."""
+        self.asked = 0.0
         self.version = ""
 
 
@@ -40,6 +41,7 @@ class Fleet:
     def __init__(self, robot: Client, ids: Sequence[str], endpoint: str) -> None:
         self._robot, self._ids, self._endpoint = robot, ids, endpoint
         self._lock = Lock()
+        self._left_out = False
         self._known = {one: _Known() for one in ids if one != ALL}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._samples = follow(robot.session, ids, "state")
@@ -57,13 +59,28 @@ class Fleet:
         now = time.monotonic()
         with self._lock:
             known = list(self._known.items())
+        rows = []
         for name, one in known:
-            if now - max(one.heard, one.asked) > ASK_S or (one.here and not one.version):
+            state, heard = one.said
+            if now - max(heard, one.asked) > ASK_S or (one.here and not one.version):
                 self._ask(name, one, now)
-        return [
-            Row(name, one.here, one.state, max(0.0, now - one.heard), one.version, SILENT_S + ASK_S)
-            for name, one in known
-        ]
+            age = max(0.0, now - heard)
+            rows.append(Row(name, one.here, state, age, one.version, SILENT_S + ASK_S))
+        return rows
+
+    @property
+    def seen(self) -> str:
+        """How many robots are all there are, and where; "" where they were named."""
+        with self._lock:
+            here = sum(one.here for one in self._known.values())
+        return seen(self._endpoint, here) if ALL in self._ids else ""
+
+    @property
+    def more(self) -> str:
+        """That not all who are there are shown, "" when they are."""
+        if not self._left_out:
+            return ""
+        return f"more than {MOST} robots: the others are left out; name yours, --id robot1,robot2"
 
     def hint(self) -> str:
         """Why there may be nobody to show."""
@@ -80,8 +97,11 @@ class Fleet:
     def _of(self, sample: zenoh.Sample) -> _Known | None:
         name = robot_of(str(sample.key_expr))
         with self._lock:
-            if name not in self._known and name and len(self._known) < MOST:
-                self._known[name] = _Known()
+            if name not in self._known and name:
+                if len(self._known) < MOST:
+                    self._known[name] = _Known()
+                else:
+                    self._left_out = True
             return self._known.get(name)
 
     def _token(self, sample: zenoh.Sample) -> None:
@@ -98,7 +118,7 @@ class Fleet:
             return  # of another version: shown as silent
         one = self._of(sample)
         if one is not None:
-            one.state, one.heard = state, time.monotonic()
+            one.said = state, time.monotonic()
 
     def _info(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)

@@ -126,6 +126,7 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
 
     counters = state.counters
     superseded, overrun = counters.get("lines_superseded", 0), counters.get("bus_overrun", 0)
+    met = counters.get("commands_first_contact", 0)
     lines = [
         rule(width, titles),
         row("lines", f"in {counted('lines')} out {counted('lines_sent')}").append(
@@ -133,6 +134,8 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
         ),
         row("commands", f"   {counted('commands')} ").append_text(_missed(state, before)),
     ]
+    if met:
+        lines[-1].append(f"  first contact {count(met)}", "dim")
     if overrun:
         lines[-1].append(f"  bus overrun {count(overrun)}", "yellow")
     if state.gyro != "off":

@@ -132,8 +132,9 @@ def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
             for line in told[1:]:
                 if "GONE" in line.plain or "SILENT" in line.plain:
                     line.stylize("bold red")
-            below = "q leaves" if rows else fleet.hint()
-            shown.update(Group(*told, Text(), Text(below, "dim")), refresh=True)
+            below = f"q leaves   {fleet.more or fleet.seen}" if rows else fleet.hint()
+            last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
+            shown.update(Group(*told, Text(), last), refresh=True)
             typed = read(PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False

@@ -211,7 +211,12 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     client.hold(0.0, 0.2)
     assert world.state.reason.startswith("app may be late: its delays must be steady")
     assert "app may be late" in {s.name: s.waits_for for s in world.state.sources}["app"]
-    assert world.state.counters["command_unproven"] == 4
+    assert world.state.counters["commands_first_contact"] == 4
+    # Which is how every sender begins: nothing is refused, and nothing warned of.
+    assert not [name for name in world.state.counters if name.startswith("command_")]
+    assert world.state.refused == ""
+    (told,) = [event for event in world.events if event.name == "first_contact"][:1]
+    assert told.level == "info"
     client.hold(0.4, 0.3)
     assert world.state.mode == "driving"
 

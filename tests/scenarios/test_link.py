@@ -290,6 +290,24 @@ def test_a_stall_of_the_loop_bunches_nothing_and_loses_no_distance(world: World)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
 
 
+def test_a_loop_that_did_not_run_is_told_so_and_a_board_that_is_silent_as_that(
+    world: World,
+) -> None:
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.05)
+        world.stall(0.2)
+        world.run(0.02)
+        assert world.state.link == "stale"
+        assert world.state.reason.startswith("this computer did not run for 0.2")
+    assert world.state.counters["link_lost_late"] == world.state.counters["link_lost"] == 1
+    world.hold(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.2)
+    assert world.state.counters["link_lost"] == 2
+    assert world.state.counters["link_lost_late"] == 1
+
+
 def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:
     world.drive(0.5, seconds=5.0)
     assert world.mcu.watchdog_trips == 0

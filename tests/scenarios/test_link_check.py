@@ -21,7 +21,7 @@ from acsard.mcu.lines import LineReader
 from acsard.messages.schema import DiagnosticArray
 from acsard.sim import protocol
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Outputs, Received
+from acsard.values import NS_PER_S, Instant, Outputs, Received
 from tests.scenarios.world import VirtualPort, World
 from tests.unit.mcu.test_damage import drive as replies_of_a_drive
 
@@ -377,7 +377,7 @@ class LatePort(VirtualPort):
     def feed(self, received: Received) -> None:
         self.held.append(received.data)
 
-    def take(self) -> tuple[Received, ...]:
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         now = self.world.instant
         if now.mono_ns < self.ready_ns or not self.held:
             return ()

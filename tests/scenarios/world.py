@@ -70,7 +70,7 @@ class VirtualPort:
     def feed(self, received: Received) -> None:
         self._received.append(received)
 
-    def take(self) -> tuple[Received, ...]:
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         got = tuple(self._received)
         self._received.clear()
         return got

@@ -725,7 +725,7 @@ class Bus:
                 nonlocal said
                 # Whoever is stamped on the way, as by a router, shows its delays first; and what
                 # comes within a millisecond of another is left out.
-                if self.count("command_unproven") or time.monotonic() > said + 0.5:
+                if self.count("commands_first_contact") or time.monotonic() > said + 0.5:
                     self.put(commander.key, ZERO)
                     said = time.monotonic()
                 return self.count("commands") > before

@@ -403,7 +403,7 @@ class Visitor:
 def _heard(state: Any) -> int:
     """Commands that came as far as the arbiter: a new sender's do not count at once."""
     counters = state["counters"]
-    return sum(counters.get(name, 0) for name in ("commands", "command_unproven"))
+    return sum(counters.get(name, 0) for name in ("commands", "commands_first_contact"))
 
 
 def _subscribed(session: zenoh.Session, row: Try, on_sample: Callable[[zenoh.Sample], None]) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.system.harness import Bus, Daemon, Program, free_endpoint, until
+from tests.system.harness import Bus, Daemon, Program, Tables, acsard, finish, free_endpoint, until
 from tests.system.strangers import ROUTER, words
 from tests.system.test_doctor import examined
 
@@ -71,6 +71,29 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
             told(daemon, "router_found", 2)
             with Bus(meeting) as bus:
                 until(lambda: row(bus)["message"] == "connected", 2.0, "diagnostics say it")
+
+
+@pytest.mark.slow
+def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_saw(
+    tmp_path: Path,
+) -> None:
+    """Neither hands on what the other says: who stops all at one of them has to know."""
+    one = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
+    config: Tables = {"robot": {"id": "two"}, "bus": {"connect": [one.endpoint]}}
+    with one, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
+        assert one.endpoint in told(two, "no_router", 1)
+        with Bus(two.endpoint, robot_id="two") as bus:
+            until(lambda: "is no router" in row(bus)["message"], 2.0, "diagnostics say it")
+        toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
+        _, found = examined(tmp_path, toml + f'connect = ["{one.endpoint}"]\n')
+        (mend,) = (each["mend"] for each in found["router"] if "no router" in each["text"])
+        assert "a router that all connect to" in mend
+        stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
+        assert stopped.out.startswith("one: stopped")
+        assert f"all seen at {one.endpoint}: 1 robot" in stopped.err
+        assert one.events("no_router") == []  # it named nobody
+        with Bus(two.endpoint, robot_id="two") as bus:
+            assert bus.state()["mode"] != "stopped"
 
 
 def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path) -> None:

@@ -312,7 +312,7 @@ class Visitor:
 
         def commands() -> list[int]:
             # A first command of a new clock is let through, and not believed yet.
-            heard = ("commands", "command_unproven")
+            heard = ("commands", "commands_first_contact")
             return [sum(map(robot.count, heard)) for robot in fleet.robots]
 
         def obeyed() -> bool:

@@ -15,7 +15,7 @@ import pytest
 from acsard.host import clock
 from acsard.mcu.check import seal
 from acsard.serial.port import SerialPort
-from acsard.values import Instant
+from acsard.values import Instant, Received
 
 PERIOD_NS = 10_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -47,6 +47,35 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
         path = os.ttyname(slave)
         assert asyncio.run(offered()) == ["sent", "superseded", "sent", "sent"]
         assert os.read(master, 4096).count(GO) == 1
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence() -> None:
+    """After a stall both the clock and the reader are due, in whatever order."""
+
+    async def taken() -> tuple[list[bytes], Sequence[Received], list[bytes]]:
+        async with SerialPort(
+            path, 115200, STOP, PERIOD_NS, lambda: None, lambda event: None
+        ) as port:
+            os.write(master, GO)
+            in_time, now = port.take(), clock.now()
+            end_ns = clock.mono_ns() + 5 * 10**9
+            late = port.take(now)  # no reader has run: the loop has not had its turn
+            while not late and clock.mono_ns() < end_ns:
+                late = port.take(now)
+            await asyncio.sleep(0.01)
+            again = [one.data for one in port.take()]
+            return [one.data for one in in_time], late, again
+
+    master, slave = os.openpty()
+    try:
+        tty.setraw(master)
+        path = os.ttyname(slave)
+        in_time, late, again = asyncio.run(taken())
+        assert in_time == again == []
+        assert [one.data for one in late] == [GO]
     finally:
         os.close(master)
         os.close(slave)

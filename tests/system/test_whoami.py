@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect, connect_async
-from acsard.host.errors import NotPermittedError
+from acsard.host.errors import NoAnswerError, NotPermittedError
 from acsard.values import ROLES
 from tests.system.harness import (
     Bus,
@@ -84,7 +84,31 @@ def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
 def test_a_certificate_of_no_list_is_told_so_with_77(robot: Robot) -> None:
     ended = robot.tool("unlisted", "whoami")
     assert ended.code == 77
-    assert "your certificate unlisted is in no list of [access]" in ended.out
+    assert "your certificate unlisted is in no role's list" in ended.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("get", "state"),  # `call` and `top` ask in the same way
+        ("echo", "state", "--timeout", "0.1"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[str, ...]) -> None:
+    ended = robot.tool("unlisted", *words)
+    assert ended.code != 0
+    assert "your certificate unlisted is in no role's list" in ended.err
+
+
+@pytest.mark.slow
+def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
+    with (
+        connect(robot.tls, tls=robot.own("unlisted")) as client,
+        pytest.raises(NoAnswerError, match="unlisted is in no role's list"),
+    ):
+        client.drive(0.3, seconds=1.0)
 
 
 @pytest.mark.slow
@@ -109,8 +133,22 @@ def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
         asyncio.run(_drive(robot))
 
 
-def test_the_keyboard_of_a_viewer_is_told_before_a_key_is_pressed(robot: Robot) -> None:
-    link = ["--connect", robot.tls, "--tls", robot.own("viewer")]
+@pytest.mark.parametrize(
+    ("who", "code", "told"),
+    [
+        ("viewer", 77, "your certificate viewer is viewer: it may follow and stop, not drive"),
+        pytest.param(
+            "unlisted",
+            69,
+            "your certificate unlisted is in no role's list",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_the_keyboard_of_who_may_not_drive_is_told_before_a_key_is_pressed(
+    robot: Robot, who: Identity, code: int, told: str
+) -> None:
+    link = ["--connect", robot.tls, "--tls", robot.own(who)]
     with Terminal() as terminal:
         words = [sys.executable, "-c", ON_TERMINAL, "drive", *link]
         where = robot.daemon.config.parent
@@ -122,8 +160,8 @@ def test_the_keyboard_of_a_viewer_is_told_before_a_key_is_pressed(robot: Robot) 
             stderr=subprocess.PIPE,
             start_new_session=True,
         ) as program:
-            assert program.ended(10.0) == 77
-    assert "your certificate viewer is viewer: it may follow and stop, not drive" in program.stderr
+            assert program.ended(10.0) == code
+    assert told in program.stderr
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
+from threading import Thread, get_ident
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,6 +126,35 @@ def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.Monke
     assert world.drive(monkeypatch) < 2.6
     assert world.sent.count(0.5) in (20, 21)
     assert world.asked < 12
+
+
+def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else what was heard, when, and whether it objects could be of two states."""
+    world, readers = World(followed), set()
+    world.published = False
+    made = world._sample
+
+    def sample() -> Any:
+        one = made()
+        payload: bytes = one.payload.to_bytes()
+
+        def read() -> bytes:
+            readers.add(get_ident())
+            return payload
+
+        one.payload = SimpleNamespace(to_bytes=read)
+        return one
+
+    def ask(name: str, take: Any) -> None:
+        thread = Thread(target=take, args=(sample(),))
+        thread.start()
+        thread.join()
+
+    monkeypatch.setattr(world, "ask", ask)
+    world.drive(monkeypatch)
+    assert readers == {get_ident()}
 
 
 def test_a_robot_that_something_else_moves_is_not_waited_for(

@@ -54,8 +54,11 @@ class Phase(StrEnum):
 class Riding:
     """A leg while it is driven; times are s of one clock."""
 
-    def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float) -> None:
-        self._leg, self._source, self._drive = leg, source, drive
+    def __init__(
+        self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str = ""
+    ) -> None:
+        """`sender` is our name on each command, for a daemon that tells whose it follows."""
+        self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
         self.phase = Phase.OPENING
         self.halted = ""
         """Why it ended before its end."""
@@ -63,6 +66,8 @@ class Riding:
         self._number, self._ends = -1, now
         self._command = REST
         self._waits: str | None = "a daemon that hears us"
+        self._another = ""
+        """Who drives by our source in our place, in words."""
         self._still_since: float | None = None
         self._doubted: float | None = None
 
@@ -96,8 +101,10 @@ class Riding:
             self._halt(f"the robot is {state.mode}: {state.reason}")
         elif state.source not in ("", self._source):
             self._halt(f"{state.source} commands the robot now")
+        elif self._driven_by_another(state) and self.phase is not Phase.OPENING:
+            self._halt(self._another)
         elif self.phase is Phase.OPENING:
-            self._waits = _waits(state, self._source)
+            self._waits = self._another or self._missing(state)
         elif self.phase is Phase.MOVING:
             self._doubt(self._objection(state, now), now)
 
@@ -129,7 +136,8 @@ class Riding:
         if passed >= OPENING_S and not self._waits:
             self.phase, self._ends = Phase.MOVING, now
         elif passed >= OPENED_S:
-            self._halt(f"the daemon does not take our commands: it waits for {self._waits}")
+            waits = f"the daemon does not take our commands: it waits for {self._waits}"
+            self._halt(self._another or waits)
 
     def _next(self, now: float) -> None:
         self._number += 1
@@ -166,7 +174,7 @@ class Riding:
     def _objection(self, state: RobotState, now: float) -> str:
         """What speaks against its doing as it is told, by its wheels: a gyro sees what skidding
         leaves of a turn, which is no disobedience."""
-        if waits := _waits(state, self._source):
+        if waits := self._missing(state):
             return f"the daemon does not follow us, it waits for {waits}"
         if now - self._changed < OBEYED_S:
             return ""
@@ -185,15 +193,28 @@ class Riding:
                 )
         return ""
 
+    def _driven_by_another(self, state: RobotState) -> bool:
+        """Another program drives by our source, a second calibration say: it came first."""
+        other = bool(self._sender) and state.sender not in ("", self._sender)
+        self._another = (
+            f"another program drives the robot as {self._source}, {state.sender}: a calibration or "
+            "a client; end it, or wait until it is done"
+            if other and state.source == self._source
+            else ""
+        )
+        return bool(self._another)
+
+    def _missing(self, state: RobotState) -> str:
+        """What our commands wait for before they count; "" when they do."""
+        for one in state.sources:
+            if one.name == self._source:
+                heard = one.age is not None and one.age < OPENING_S
+                # Of several senders it names the others as waiting, and we are the one it follows.
+                followed = state.mode == "driving" and state.sender == self._sender != ""
+                waits_for = "" if followed else one.waits_for
+                return waits_for if heard else waits_for or "a command"
+        return f"a source {self._source} in commands.sources"
+
     def _halt(self, why: str) -> None:
         if not self.over:
             self.phase, self._command, self.halted = Phase.HALTED, REST, why
-
-
-def _waits(state: RobotState, source: str) -> str:
-    """What our commands wait for before they count; "" when they do."""
-    for one in state.sources:
-        if one.name == source:
-            heard = one.age is not None and one.age < OPENING_S
-            return one.waits_for if heard else one.waits_for or "a command"
-    return f"a source {source} in commands.sources"

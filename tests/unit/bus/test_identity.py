@@ -49,3 +49,12 @@ def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> 
     assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
     assert Identity("maintainer", "", "x").lacks("config") == ""
     assert Identity("", "", "x").lacks("config") == ""
+
+
+def test_a_certificate_without_a_role_is_named_with_what_to_do_whatever_the_key() -> None:
+    nobody = Identity("", "anna", "joe/1/aa")
+    for told in (nobody.words(), nobody.unlisted, nobody.lacks("state"), nobody.lacks("srv/set")):
+        assert "your certificate anna is in no role's list" in told
+        assert "viewers, operators or maintainers of [access]" in told
+        assert "no daemon" in told  # which looks the same from here
+    assert Identity("viewer", "anna", "x").unlisted == Identity("", "", "x").unlisted == ""

@@ -196,7 +196,13 @@ def test_what_is_never_published_says_what_to_type_instead(key: str, instead: st
 
 @pytest.mark.parametrize(
     ("key", "instead"),
-    [("srv/clear", "call clear"), ("cmd/app", "echo cmd/app"), ("alive", "acsard fleet")],
+    [
+        ("srv/clear", "call clear"),
+        ("cmd/app", "echo cmd/app"),
+        ("alive", "acsard fleet"),
+        ("**", "get asks one"),
+        ("schema/*", "get asks one"),
+    ],
 )
 def test_what_answers_nothing_or_acts_is_not_asked(key: str, instead: str) -> None:
     with pytest.raises(UsageError, match=instead):

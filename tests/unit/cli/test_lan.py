@@ -283,7 +283,10 @@ def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
     own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
 ) -> None:
     assert lan("add", name, "--role", role, "--directory", str(own)) == 0
-    printed = tables(capsys.readouterr().out)
+    told = capsys.readouterr().out
+    assert "systemctl restart acsard" in told
+    assert "--write" in told
+    printed = tables(told)
     assert set(tomllib.loads(printed.decode())) == {"access"}
     access = parse(printed).access
     listed = {"viewer": access.viewers, "operator": access.operators}
@@ -410,7 +413,11 @@ def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
     config = parse(text.encode())
     assert config.bus.listen == ("tcp/127.0.0.1:9", "tls/0.0.0.0:7449")
     assert config.bus.tls == str(directory)
-    assert str(file) in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert str(file) in told
+    assert "systemctl restart acsard" in told
+    assert "listen = [" in told.partition("\n")[0]  # what it has set, and nothing to paste
+    assert "[bus]" not in told
 
 
 def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) -> None:
@@ -519,6 +526,22 @@ def test_add_and_renew_make_no_directory_and_then_fail(tmp_path: Path) -> None:
     for words in (["add", "anna", "--role", "viewer"], ["renew"]):
         assert lan(*words, "--directory", str(tmp_path / "none")) == Exit.FAILURE
     assert not list(tmp_path.iterdir())
+
+
+def test_add_writes_the_name_into_its_role_s_list_and_leaves_nothing_to_paste(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text('# mine\n[access]\noperators = ["bob"]\n')
+    words = ("--directory", str(own), "--write", str(file))
+    assert lan("add", "eve", *words) == Exit.USAGE
+    assert not (own / "clients" / "eve").exists()
+    assert lan("add", "eve", "--role", "operator", *words) == 0
+    told = capsys.readouterr().out
+    assert parse(file.read_bytes()).access.operators == ("bob", "eve")
+    assert file.read_text().startswith("# mine\n")
+    assert "[access]" not in told
+    assert "systemctl restart acsard" in told
 
 
 def encrypt(own: Path, password: bytes) -> None:

@@ -49,6 +49,15 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     assert second.endswith("[no end: cut, or being written]")
 
 
+def test_where_nothing_was_ever_recorded_it_says_what_records(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, tmp_path / "never")
+    assert (code, out) == (1, "")
+    assert "nothing is recorded in" in err
+    assert "acsard run --record DIRECTORY" in err
+
+
 def test_a_story_is_told_in_order_as_sentences_or_json(
     where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,6 +61,24 @@ def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
     assert "12 malformed, 30 wrong check" in text
 
 
+def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
+    (late,) = found({}, {"link_lost": 3, "link_lost_late": 3})
+    assert "lost 3 times" in late.text
+    assert "this computer" in late.text
+    assert "mcu check" not in late.mend
+    late, board = found({}, {"link_lost": 5, "link_lost_late": 3})
+    assert "lost 2 times" in board.text
+    assert "mcu check" in board.mend
+    states = replace(STATE, counters={"link_lost": 2})
+    (sim,) = link(Running(INFO, Config(), STATE, states, 0))
+    assert "this computer" in sim.text
+    assert "mcu check" not in sim.mend
+    why = "this computer did not run for 0.80 s, and heard nothing"
+    (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
+    assert why in finding.text
+    assert "mcu check" not in finding.mend
+
+
 def test_a_wheel_that_is_left_out_is_told() -> None:
     *_, finding = found({}, {}, doubt="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")

@@ -27,14 +27,38 @@ def test_a_daemon_that_runs_with_the_file_has_it() -> None:
 
 def test_each_key_that_is_otherwise_is_told_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert differences(runs, FILE) == [
+    assert [*differences(runs, FILE).values()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
         "mcu.baud_rate = 57600, not 115200",
     ]
     (finding,) = compared(running(runs), FILE)
     assert finding.level == "warning"
     assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
-    assert finding.mend
+    assert "without those options" in finding.mend
+
+
+def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
+    sources = (replace(FILE.commands.sources[0], timeout=0.4), *FILE.commands.sources[1:])
+    runs = replace(
+        FILE,
+        limits=replace(FILE.limits, linear_speed=0.4),
+        commands=replace(FILE.commands, sources=sources),
+    )
+    (finding,) = compared(running(runs), FILE)
+    assert "limits.linear_speed = 0.4, not 1.0" in finding.text
+    assert f"commands.sources.{sources[0].name}.timeout = 0.4, not 0.25" in finding.text
+    assert "set while it ran" in finding.text
+    assert "acsard set KEY VALUE --write" in finding.mend
+    assert "options" not in finding.text + finding.mend
+    both = replace(runs, mcu=McuConfig(port="/dev/pts/3"))
+    by_option, by_set = compared(running(both), FILE)
+    assert "mcu.port" in by_option.text
+    assert "mcu.port" not in by_set.text
+
+
+def test_a_source_that_only_the_file_has_is_told() -> None:
+    runs = replace(FILE, commands=replace(FILE.commands, sources=FILE.commands.sources[1:]))
+    assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in differences(runs, FILE)
 
 
 def test_another_file_is_not_told_key_by_key() -> None:

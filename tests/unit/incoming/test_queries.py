@@ -491,6 +491,27 @@ def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
     assert (reply.ok, reply.attachment) == (True, echo if via == "rmw" else b"")
 
 
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_a_parameter_that_is_set_twice_at_once_is_refused_with_a_result_for_each(
+    service: str,
+) -> None:
+    wishes = [
+        rcl.Parameter("limits.linear_speed", rcl.ParameterValue(rcl.DOUBLE, double_value=value))
+        for value in (0.7, 0.3)
+    ]
+    payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest(wishes))
+    asked = ros_query(f"parameters/{service}", "rmw", payload)
+    with pytest.raises(DecodeError, match=r"limits\.linear_speed is in it twice") as caught:
+        queries().serve(asked, nothing, OUTPUTS)
+    reply = refused(asked, str(caught.value), WALL_NS)
+    assert reply is not None
+    no = rcl.SetParametersResult(False, str(caught.value))
+    if service == "set_parameters":
+        assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no, no])
+    else:
+        assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
+
+
 def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
     names = ["robot.id"] * 256
     payload = Cdr(rcl.Names).encode(rcl.Names(names))

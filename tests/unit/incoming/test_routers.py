@@ -46,6 +46,18 @@ def test_of_two_routers_only_the_one_that_went_is_told() -> None:
     assert A not in event.text
 
 
+def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
+    told, counters = RoutersTold(), Counter[str]()
+    events: list[Event] = []
+    told.hear(RoutersStatus((A,)), counters, events)  # what is there is not known yet
+    told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
+    told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
+    found = [(event.name, event.level) for event in events]
+    assert found == [("router_found", "info"), ("no_router", "warning")]
+    assert events[-1].text.startswith(f"{A} is no router")
+    assert "call stop --id '*'" in events[-1].text
+
+
 def test_one_may_go_as_the_other_comes() -> None:
     daemon = Daemon()
     daemon.hears((A,), (B,))

@@ -730,7 +730,8 @@ def test_a_board_that_only_prints_noise_is_told_with_what_it_said() -> None:
 
 def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
     bench = Bench().up()
-    bench.wait(200)
+    for _ in range(20):
+        bench.wait(10)
     assert bench.session.words() == "the microcontroller has fallen silent"
     for _ in range(302):
         bench.wait(10)

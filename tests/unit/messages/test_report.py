@@ -380,6 +380,12 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
             "not connected to b",
             {"a": "connected", "b": "not connected"},
         ),
+        (
+            RoutersStatus(("a", "b"), peers=("b",)),
+            1,
+            "connected; b is no router: who connects here sees this robot only",
+            {"a": "connected", "b": "a peer, no router"},
+        ),
     ],
 )
 def test_a_router_that_is_missing_is_a_warning(

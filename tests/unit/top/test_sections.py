@@ -23,6 +23,14 @@ from tests.unit.top.screens import (
 )
 
 
+def test_first_contact_is_counted_beside_the_commands_and_is_no_refusal() -> None:
+    counters = {**STATE.counters, "commands_first_contact": 40}
+    shown = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
+    (line,) = [line for line in shown if "first contact 40" in line]
+    assert line.startswith("commands")
+    assert any(line.startswith("rejected") and "nothing" in line for line in shown)
+
+
 def test_pose_and_twist_have_their_units() -> None:
     assert "x   +1.250 m  y   -0.500 m  yaw  +57.3°" in line_with("yaw")
     assert "forward  +0.500 m/s  turn  -0.600 rad/s" in line_with("forward")

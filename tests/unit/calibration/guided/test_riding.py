@@ -111,6 +111,42 @@ def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
     assert set(world.run(3.0).said[stopped:]) == {REST}
 
 
+US, OTHER = "joe/1/aa", "joe/2/bb"
+TWO = [SourceState("app", 50, 0.01, "1 more of its senders: the first until it is silent")]
+
+
+def of_two(leg: Leg, sender: str) -> World:
+    """The daemon hears two calibrations, and follows this one."""
+    world = World(leg)
+    world.riding = Riding(leg, "app", DriveConfig(), world.now, US)
+    world.tells = changed(sources=TWO, sender=sender)
+    return world
+
+
+def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
+    assert of_two(LEG, US).run(5.0).riding.phase is Phase.DONE
+
+
+def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
+    world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
+    assert set(world.said) == {REST}
+    assert world.riding.halted.startswith(f"another program drives the robot as app, {OTHER}")
+    assert "end it, or wait" in world.riding.halted
+
+
+def test_one_whose_robot_another_takes_on_the_way_says_so_at_once() -> None:
+    world = of_two(LEG, US).until_moving()
+    world.tells = changed(sources=TWO, sender=OTHER)
+    world.run(TICK)
+    assert OTHER in world.riding.halted
+
+
+def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
+    world = of_two(LEG, OTHER).run(1.0)
+    world.tells = changed(sender=US)
+    assert world.run(5.0).riding.phase is Phase.DONE
+
+
 def test_a_daemon_that_falls_silent_stops_it() -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False

@@ -1,0 +1,45 @@
+"""Whether a silence is the board's, or of this computer, which did not run and so neither asked nor
+heard it. For the person who has to find out why: the link is judged by the silence alone.
+"""
+
+from __future__ import annotations
+
+from acsard.mcu.link import WORDS
+from acsard.mcu.link import State as LinkState
+from acsard.values import NS_PER_S
+
+SHARE = 0.5
+"""Of the silence that ends a link: steps so far apart are what made it."""
+
+BUSY = "what else runs here? (`top`; as a service it goes first)"
+"""The mend of a computer that is late."""
+
+
+class Lateness:
+    """Looks at the times of the steps."""
+
+    def __init__(self, simulated: bool, quiet_ns: int) -> None:
+        """`simulated`: the board is a part of this process; `quiet_ns` of silence end the link."""
+        self._simulated, self._least_ns = simulated, SHARE * quiet_ns
+        self._looked_ns: int | None = None
+        self.late_s = 0.0
+        """The longest time since the last good line in which there was no step; 0 for none."""
+
+    def look(self, now_ns: int, good: bool) -> None:
+        """A step, and whether a good line came with it."""
+        before_ns, self._looked_ns = self._looked_ns, now_ns
+        if good:
+            self.late_s = 0.0
+        elif before_ns is not None and now_ns - before_ns >= self._least_ns:
+            self.late_s = max(self.late_s, (now_ns - before_ns) / NS_PER_S)
+
+    def words(self, link: LinkState) -> str:
+        """How the link is, for people."""
+        if link == "stale" and self.late_s:
+            return (
+                f"this computer did not run for {self.late_s:.2f} s, and heard nothing of the "
+                f"microcontroller: {BUSY}"
+            )
+        if link == "stale" and self._simulated:
+            return f"the built-in simulator, a part of this program, is late: {BUSY}"
+        return WORDS[link]
