@@ -20,6 +20,8 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "sensor_msgs/msg/Imu":
         "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
+    "rcl_interfaces/msg/Log":
+        "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
     "diagnostic_msgs/msg/DiagnosticArray":
         "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "std_srvs/srv/Trigger":

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from acsard.ros.definitions import DEFINITIONS, OURS
 from acsard.ros.names import TYPE_HASHES, bridge_key, dds_type, full_name, rmw_key
 from tests.vectors import ros_types
 
@@ -110,7 +111,7 @@ def split(text: str) -> list[Field]:
 
 def definitions() -> dict[str, list[Field]]:
     """The fields of every type by name; a service is a type whose fields are its three messages."""
-    known = {}
+    known = {name: [*fields] for name, fields in DEFINITIONS.items() if not name.startswith(OURS)}
     for line in ros_types.MESSAGES.strip().splitlines():
         name, _, fields = line.partition(":")
         known[name] = split(fields)

@@ -1,0 +1,101 @@
+"""The message definitions of ROS 2 (Jazzy and later) that a file or a viewer is told.
+
+One line a type: its name, a colon, its fields as `type name` with commas between; `[]` is a
+sequence, `[n]` an array. What has no message in ROS is in the package `acsard` (`shapes.py`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+OURS = "acsard/msg/"
+"""Begins the types that ROS does not know; a file tells them like any other."""
+
+Field = tuple[str, str]
+"""Type and name."""
+
+_TEXT = """
+builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
+std_msgs/msg/Header: builtin_interfaces/msg/Time stamp, string frame_id
+geometry_msgs/msg/Vector3: float64 x, float64 y, float64 z
+geometry_msgs/msg/Point: float64 x, float64 y, float64 z
+geometry_msgs/msg/Quaternion: float64 x, float64 y, float64 z, float64 w
+geometry_msgs/msg/Twist: geometry_msgs/msg/Vector3 linear, geometry_msgs/msg/Vector3 angular
+geometry_msgs/msg/TwistStamped: std_msgs/msg/Header header, geometry_msgs/msg/Twist twist
+geometry_msgs/msg/TwistWithCovariance: geometry_msgs/msg/Twist twist, float64[36] covariance
+geometry_msgs/msg/Pose: geometry_msgs/msg/Point position, geometry_msgs/msg/Quaternion orientation
+geometry_msgs/msg/PoseWithCovariance: geometry_msgs/msg/Pose pose, float64[36] covariance
+geometry_msgs/msg/Transform: \
+    geometry_msgs/msg/Vector3 translation, geometry_msgs/msg/Quaternion rotation
+geometry_msgs/msg/TransformStamped: \
+    std_msgs/msg/Header header, string child_frame_id, geometry_msgs/msg/Transform transform
+nav_msgs/msg/Odometry: \
+    std_msgs/msg/Header header, string child_frame_id, \
+    geometry_msgs/msg/PoseWithCovariance pose, geometry_msgs/msg/TwistWithCovariance twist
+tf2_msgs/msg/TFMessage: geometry_msgs/msg/TransformStamped[] transforms
+sensor_msgs/msg/JointState: \
+    std_msgs/msg/Header header, string[] name, \
+    float64[] position, float64[] velocity, float64[] effort
+diagnostic_msgs/msg/KeyValue: string key, string value
+diagnostic_msgs/msg/DiagnosticStatus: \
+    byte level, string name, string message, string hardware_id, \
+    diagnostic_msgs/msg/KeyValue[] values
+diagnostic_msgs/msg/DiagnosticArray: \
+    std_msgs/msg/Header header, diagnostic_msgs/msg/DiagnosticStatus[] status
+rcl_interfaces/msg/Log: \
+    builtin_interfaces/msg/Time stamp, uint8 level, string name, string msg, \
+    string file, string function, uint32 line
+acsard/msg/Counter: string name, int64 count
+acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_for
+acsard/msg/RobotState: \
+    std_msgs/msg/Header header, string mode, string reason, \
+    float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
+    string link, string source, string sender, acsard/msg/SourceState[] sources, \
+    string refused, string gyro, string doubt, string recording, string certificate, \
+    acsard/msg/Counter[] counters
+"""
+
+
+def _parsed(text: str) -> dict[str, tuple[Field, ...]]:
+    found = {}
+    for line in text.strip().splitlines():
+        name, _, fields = line.partition(":")
+        pairs = [field.split() for field in fields.split(",")]
+        found[name] = tuple((kind, field) for kind, field in pairs)
+    return found
+
+
+DEFINITIONS = _parsed(_TEXT)
+"""The fields of each type in order."""
+
+RULE = "=" * 80
+
+
+def schema_text(name: str) -> str:
+    """The definition with all that it is made of, as MCAP's `ros2msg` has it: each type once."""
+    parts = [_fields(name)]
+    parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
+    return "".join(parts)
+
+
+def nested(name: str) -> tuple[str, ...]:
+    """The types that a type is made of, however deep, in the order in which they are met."""
+    return tuple(dict.fromkeys(_nested(name)))
+
+
+def _nested(name: str) -> Iterator[str]:
+    for kind, _ in DEFINITIONS[name]:
+        base = kind.partition("[")[0]
+        if "/" in base:
+            yield base
+            yield from _nested(base)
+
+
+def _fields(name: str) -> str:
+    return "".join(f"{_short(kind)} {field}\n" for kind, field in DEFINITIONS[name])
+
+
+def _short(kind: str) -> str:
+    """`pkg/msg/Type` as definitions write it: `pkg/Type`."""
+    return re.sub("/msg/", "/", kind)

@@ -1,0 +1,109 @@
+"""What our structs are not yet in the shape of: the log, and `state` as CDR can tell it.
+
+CDR has no maps and no "none", so counters are a list and an age that there is not is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from acsard.messages.schema import Byte, Header, RobotState, Time
+from acsard.values import Event, Level
+
+Whole = Annotated[int, Meta(extra={"cdr": "q"})]
+Natural = Annotated[int, Meta(extra={"cdr": "I"})]
+
+
+class Log(Struct, frozen=True):
+    """rcl_interfaces/msg/Log: `name` is the event's."""
+
+    stamp: Time
+    level: Byte
+    name: str
+    msg: str
+    file: str = ""
+    function: str = ""
+    line: Natural = 0
+
+
+LEVELS: dict[Level, int] = {"info": 20, "warning": 30, "error": 40}
+"""As ROS numbers them."""
+
+
+def log(event: Event, wall_ns: int) -> Log:
+    """An event at that time, told in one line."""
+    by = f" (by {event.by})" if event.by else ""
+    times = f" ({event.count} times)" if event.count > 1 else ""
+    text = f"{event.text}{by}{times}"
+    return Log(Time.from_ns(wall_ns), LEVELS[event.level], event.name, text)
+
+
+class Counter(Struct, frozen=True):
+    """One of the totals since the start."""
+
+    name: str
+    count: Whole
+
+
+class Source(Struct, frozen=True):
+    """A commander; `age` in s, NaN where it was never heard."""
+
+    name: str
+    priority: Whole
+    age: float
+    waits_for: str
+
+
+class State(Struct, frozen=True):
+    """`RobotState` without what the daemon measures of itself: that is in `diagnostics`."""
+
+    header: Header
+    mode: str
+    reason: str
+    x: float
+    y: float
+    yaw: float
+    linear: float
+    angular: float
+    wheels: list[float]
+    link: str
+    source: str
+    sender: str
+    sources: list[Source]
+    refused: str
+    gyro: str
+    doubt: str
+    recording: str
+    certificate: str
+    counters: list[Counter]
+
+
+def state(message: RobotState) -> State:
+    """The same in the shape of `acsard/msg/RobotState`."""
+    return State(
+        header=Header(message.stamp),
+        mode=message.mode,
+        reason=message.reason,
+        x=message.x,
+        y=message.y,
+        yaw=message.yaw,
+        linear=message.linear,
+        angular=message.angular,
+        wheels=message.wheels,
+        link=message.link,
+        source=message.source,
+        sender=message.sender,
+        sources=[
+            Source(s.name, s.priority, math.nan if s.age is None else s.age, s.waits_for)
+            for s in message.sources
+        ],
+        refused=message.refused,
+        gyro=message.gyro,
+        doubt=message.doubt,
+        recording=message.recording,
+        certificate=message.certificate,
+        counters=[Counter(name, count) for name, count in message.counters.items()],
+    )

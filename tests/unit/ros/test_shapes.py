@@ -1,0 +1,54 @@
+"""The log and `state` as a ROS message."""
+
+from __future__ import annotations
+
+import math
+
+from acsard.messages.schema import RobotState, SourceState, Time
+from acsard.ros.shapes import Counter, Log, Source, log, state
+from acsard.values import Event
+
+STATE = RobotState(
+    stamp=Time(5, 6),
+    mode="driving",
+    reason="driving: app",
+    x=1.0,
+    y=2.0,
+    yaw=0.5,
+    linear=0.3,
+    angular=0.1,
+    wheels=[1.0, 2.0, 3.0, 4.0],
+    link="up",
+    source="app",
+    sources=[SourceState("app", 50, 0.1, ""), SourceState("nav", 10, None, "a command")],
+    refused="",
+    counters={"lines": 7, "commands": 2},
+    sender="joystick",
+)
+
+
+def test_an_event_is_a_log_line_of_ros() -> None:
+    event = Event("command_refused", "too old", "warning", by="a phone", count=3)
+    assert log(event, 1_500_000_000) == Log(
+        Time(1, 500_000_000), 30, "command_refused", "too old (by a phone) (3 times)"
+    )
+
+
+def test_who_did_it_and_how_often_stand_there_only_if_there_is_something_to_say() -> None:
+    assert log(Event("started", "up"), 0) == Log(Time(), 20, "started", "up")
+
+
+def test_a_source_never_heard_has_no_age() -> None:
+    heard, never = state(STATE).sources
+    assert heard == Source("app", 50, 0.1, "")
+    assert math.isnan(never.age)
+
+
+def test_state_is_the_same_field_by_field() -> None:
+    told = state(STATE)
+    assert told.header.stamp == STATE.stamp
+    assert told.counters == [Counter("lines", 7), Counter("commands", 2)]
+    plain = set(told.__struct_fields__) - {"header", "sources", "counters"}
+    assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
+    left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
+    assert left_out == {"stamp", "figures", "encoders"}
