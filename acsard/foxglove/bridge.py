@@ -30,8 +30,8 @@ from acsard.ros.names import full_name
 from acsard.values import NS_PER_S, AcsardError
 
 GATHER_S = 0.015
-"""A screen shows 60 pictures a second: what comes within this goes in one round, which costs a third
-less. Commands do not wait for it."""
+"""A screen shows 60 pictures a second: what comes within this goes in one round, which costs a
+third less. Commands do not wait for it."""
 
 ROUND_S = 0.5
 """A round at least so often."""

@@ -27,8 +27,8 @@ LONGEST_NS = 10 * NS_PER_S
 """No timeout of a source is longer: who was silent for so long drives no more."""
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Speeds that so often come further apart than a silence, and no further than this, are of a panel
-that publishes too seldom."""
+"""Messages that so often come further apart than a silence, and no further than this, are of a
+panel that publishes too seldom."""
 
 
 class Hand:

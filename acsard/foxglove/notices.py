@@ -49,11 +49,11 @@ class Notices:
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
-        """Tell everybody who looks."""
+        """Tell everybody who looks; the same again only if it is to stay."""
         now_ns = clock.mono_ns()
         with self._lock:
             recent = {t: ns for t, ns in self._said.items() if now_ns - ns < AGAIN_NS}
-            if text in recent:
+            if text in recent and not stays:
                 return
             self._said = recent | {text: now_ns}
             self._waiting.append(Notice(level, name, text, stays))

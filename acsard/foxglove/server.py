@@ -17,7 +17,7 @@ from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, W
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.settings import Settings
-from acsard.host.errors import InUseError
+from acsard.host.errors import InUseError, NotPermittedError
 
 BACKLOG = 256
 """Messages held for one slow viewer: the oldest are dropped beyond that."""
@@ -113,7 +113,8 @@ def start(
     services: list[foxglove.Service],
     context: foxglove.Context,
 ) -> WebSocketServer:
-    """Listen; without services for viewers only. Raises `InUseError` when the port is taken."""
+    """Listen; without services for viewers only. Raises `InUseError` when the port is taken,
+    `NotPermittedError` when it is root's."""
     host, port = address
     takes = [Capability.ClientPublish, Capability.Parameters, Capability.Services]
     try:
@@ -129,12 +130,14 @@ def start(
             message_backlog_size=BACKLOG,
         )
     except RuntimeError as error:
-        taken = os.strerror(errno.EADDRINUSE) in str(error)
+        another = f"--address {host}:{max(1024, port % 65535 + 1)}"
+        if os.strerror(errno.EACCES) in str(error):
+            raise NotPermittedError(
+                f"you may not listen on {host}:{port}; take a port above 1023: {another}"
+            ) from None
         raise InUseError(
-            f"cannot listen on {host}:{port}: "
-            + ("somebody else does" if taken else str(error))
-            + "; stop that (another acsard foxglove, or foxglove_bridge?), or give this one "
-            f"another port: --address {host}:{port % 65535 + 1}"
+            f"cannot listen on {host}:{port}: {error}; stop who does (another acsard foxglove, or "
+            f"foxglove_bridge?), or give this one another port: {another}"
         ) from None
 
 
