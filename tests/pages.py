@@ -329,6 +329,10 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/acsard log replay": Elsewhere(
         LOG, "test_a_replay_says_that_all_is_the_same"
     ),
+    "sudo /opt/acsard/venv/bin/acsard log export 12 drive.mcap": Elsewhere(
+        "tests/unit/cli/test_log_export.py",
+        "test_a_number_and_a_name_are_taken_and_what_is_there_stays",
+    ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
         UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"

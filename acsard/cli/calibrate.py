@@ -26,13 +26,13 @@ DESCRIPTION = """\
 Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
 improve. Without --log the robot is driven, guided in words: a person at this terminal stands beside
 it on a free floor of 3 m x 3 m, starts each leg by Enter, stops it by any key, and reads off a tape
-what is asked for; at most 90 s of driving. With --log from a drive that was recorded: a CSV file
-with a header: column t (s) and the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right"; and
-yaw_rate (rad/s, of a gyro), or x and y (m, of any source of positions) with or without yaw (rad),
-or both; run (any name) tells several drives apart. Columns may be in any order, cells empty where a
-sensor has nothing to say. Good logs begin with 3 s of standing, and have straight drives, turns to
-both sides, slow and fast, and curves, for 60 s or more. Exit 0 when something was found, 1 when
-not, with what to do instead.
+what is asked for; at most 90 s of driving. With --log from a drive that was recorded: by the black
+box of a robot with a gyro, as it is, or a CSV file with a header: column t (s) and the wheel speeds
+in rad/s, "fr,fl,rl,rr" or "left,right"; and yaw_rate (rad/s, of a gyro), or x and y (m, of any
+source of positions) with or without yaw (rad), or both; run (any name) tells several drives apart.
+Columns may be in any order, cells empty where a sensor has nothing to say. Good logs begin with 3 s
+of standing, and have straight drives, turns to both sides, slow and fast, and curves, for 60 s or
+more. Exit 0 when something was found, 1 when not, with what to do instead.
 """
 
 DRIVEN = "the drive"
@@ -51,7 +51,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     add_bus(parser)
     add_options(parser)
-    parser.add_argument("--log", type=Path, metavar="FILE", help="a recorded drive, CSV")
+    parser.add_argument(
+        "--log", type=Path, metavar="FILE", help="a recorded drive, CSV or one of `acsard log`"
+    )
     parser.add_argument(
         "--distance",
         type=_distance,
@@ -128,6 +130,8 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
     from acsard.calibration.table import read
+    from acsard.record.export import measured
+    from acsard.record.file import MAGIC, Recording
 
     try:
         if log.stat().st_size > MOST_BYTES:
@@ -137,6 +141,8 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
         raise ExitError(
             Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
         ) from None
+    if data.startswith(MAGIC):
+        data = measured(Recording(log))
     return calibrate(runs(read(data)), drive, tape)
 
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from acsard.cli import log_export
 from acsard.cli.common import load
 from acsard.host.exits import Exit, ExitError
 
@@ -34,9 +35,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
     show = inner.add_parser("show", help="tell what happened, sentence by sentence")
     show.add_argument("file", nargs="?", metavar="FILE")
-    when = "seconds after the beginning, or HH:MM:SS of its day"
-    show.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
-    show.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+    _span(show)
     show.add_argument("--json", action="store_true", help="print one JSON object a line")
     show.set_defaults(main=show_one)
     replay = inner.add_parser(
@@ -54,8 +53,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     recover.add_argument("file", metavar="FILE")
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.set_defaults(main=recover_one)
-    for one in (show, replay, recover):
+    export = log_export.add(inner)
+    _span(export)
+    export.set_defaults(main=export_one)
+    for one in (show, replay, recover, export):
         _directory(one, argparse.SUPPRESS)
+
+
+def _span(parser: argparse.ArgumentParser) -> None:
+    when = "seconds after the beginning, or HH:MM:SS of its day"
+    parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
+    parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
 
 
 def _directory(parser: argparse.ArgumentParser, default: object) -> None:
@@ -160,6 +168,17 @@ def recover_one(args: argparse.Namespace) -> int:
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
     print(f"{count} messages in {new}{_state(recording)}")
+    return int(Exit.OK)
+
+
+def export_one(args: argparse.Namespace) -> int:
+    """Write it for other programs."""
+    recording = _recording(args)
+    began_s = recording.about.wall_ns / 1e9
+    trouble = log_export.export_one(recording, args, lambda text: _seconds(text, began_s))
+    note = trouble or _state(recording).strip()
+    if note:
+        print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
 
 

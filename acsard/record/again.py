@@ -51,25 +51,49 @@ def steps(recording: Recording) -> Iterator[Step]:
             reason = batch[-1].said.status[1] if batch else reason
 
 
+class Course:
+    """The steps of a recording from its beginning on, and the robot they begin with."""
+
+    def __init__(self, recording: Recording, other: Config | None = None) -> None:
+        """With its own configuration, or with another; raises `RecordingError`."""
+        self.config = other or config_of(recording)
+        """What it begins with."""
+        self.trouble = ""
+        """Why it was not gone to the end of the file, "" when it was."""
+        self._recording = recording
+        state = _state(recording)
+        if state is None:
+            self.robot = Robot(self.config)
+            self.last = b""
+        else:
+            self.robot, self.last = state
+            # by newer code, its parts may have what it knows nothing of
+            adopt(self.robot, Robot(config_of(recording)), Robot(self.config))
+        self._whole = state is not None
+
+    def steps(self) -> Iterator[Step]:
+        """One after the other, while none is missing; raises `RecordingError`."""
+        path, number = self._recording.path, None
+        for step in steps(self._recording):
+            if number is None and not self._whole and step.number > 0:
+                raise RecordingError(f"{path}: its first steps are missing or damaged")
+            if number is not None and step.number != number + 1:
+                missing = step.number - number - 1
+                self.trouble = f"{missing} steps are missing after step {number}"
+                return
+            number = step.number
+            yield step
+        if number is None:
+            raise RecordingError(f"{path} has no whole second of steps")
+
+
 def live(recording: Recording, other: Config | None = None) -> Lived:
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
-    config = config_of(recording)
-    state = _state(recording)
-    if state is not None:  # by newer code, its parts may have what it knows nothing of
-        adopt(state.robot, Robot(config), Robot(other or config))
-    replay = Replay(other or config, *(state or ()))
-    number: int | None = None
-    for step in steps(recording):
-        if number is None and state is None and step.number > 0:
-            raise RecordingError(f"{recording.path}: its first steps are missing or damaged")
-        if number is not None and step.number != number + 1:
-            missing = step.number - number - 1
-            return Lived(replay.tally, f"{missing} steps are missing after step {number}")
-        number = step.number
+    course = Course(recording, other)
+    replay = Replay(course.config, course.robot, course.last)
+    for step in course.steps():
         replay.step(step)
-    if number is None:
-        raise RecordingError(f"{recording.path} has no whole second of steps")
-    return Lived(replay.tally, "")
+    return Lived(replay.tally, course.trouble)
 
 
 def _state(recording: Recording) -> State | None:

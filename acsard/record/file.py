@@ -38,6 +38,9 @@ MODE = 0o640
 FORMAT = "1"
 """Of the messages in it; another number is another meaning."""
 
+MAGIC = b"\x89MCAP0\r\n"
+"""Begins every file of this kind, whatever it is called."""
+
 LARGEST_RECORD = 1 << 26
 """bytes; a longer one is damage."""
 
@@ -66,6 +69,8 @@ class About(Struct, frozen=True):
     config: str = ""
     """The `acsard.toml` in force, all keys in it."""
     format: str = FORMAT
+    started_ns: int = 0
+    """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
 
 
 class Closing(Struct, frozen=True):

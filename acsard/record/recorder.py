@@ -64,8 +64,9 @@ class _Start(NamedTuple):
 class Recorder:
     """`step` is for the control loop; everything else happens in the thread."""
 
-    def __init__(self, config: Config, tell: Callable[[Event], None]) -> None:
-        """`tell` takes the recorder's own events, from within `step`."""
+    def __init__(self, config: Config, tell: Callable[[Event], None], started_ns: int = 0) -> None:
+        """`tell` takes the recorder's own events, from within `step`; the daemon's start by the
+        wall clock is the stamp of what it says once and for all."""
         self._queue: deque[Taken | _Start] = deque()
         self._tell = tell
         self._said: deque[Event] = deque()
@@ -76,7 +77,7 @@ class Recorder:
         self._full = False
         self._wants_state = False
         """Set by the thread, cleared by `step`: begin a new file."""
-        self._disk = _Disk(config, self._say, self._ask)
+        self._disk = _Disk(config, self._say, self._ask, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)
         self._thread.start()
@@ -143,8 +144,13 @@ class _Disk:
     """What the thread has: the ring, the file, and how the disk takes it."""
 
     def __init__(
-        self, config: Config, say: Callable[[Event], None], ask: Callable[[], None]
+        self,
+        config: Config,
+        say: Callable[[Event], None],
+        ask: Callable[[], None],
+        started_ns: int,
     ) -> None:
+        self._started_ns = started_ns
         self.where = config.record.directory
         self.trouble = ""
         self.missing = 0
@@ -215,6 +221,7 @@ class _Disk:
             python=platform.python_version(),
             mono_ns=now.mono_ns,
             wall_ns=now.wall_ns,
+            started_ns=self._started_ns,
             config="\n".join(document(effective(start.config))) + "\n",
         )
         self._writing, self._start = ring.begin(about), None

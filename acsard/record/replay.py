@@ -74,6 +74,17 @@ class Tally(Struct):
         return self.first is None
 
 
+def lived(robot: Robot, step: Step) -> Outputs:
+    """What the robot says of it now; what the loop counts beside the robot is counted as then."""
+    outputs = robot.step(step.inputs)
+    said, inputs = step.said, step.inputs
+    if said.left is not None:
+        robot.counters["lines_sent"] += 1
+    elif said.line is not None and inputs.tick and inputs.port_open:
+        robot.counters["lines_superseded"] += 1
+    return outputs
+
+
 class Replay:
     """One robot that lives again, step by step."""
 
@@ -90,7 +101,7 @@ class Replay:
         """Live it; what came out otherwise than then, None when nothing did."""
         if step.begins:
             self._checksum = 0
-        outputs = self._robot.step(step.inputs)
+        outputs = lived(self._robot, step)
         if self._robot.config is not self._config:  # a setting was changed
             self._watched_by(self._robot.config)
         line, trip = self._guard.check(outputs, self._last)

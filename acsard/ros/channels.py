@@ -35,7 +35,7 @@ class Channel(Struct, frozen=True):
     name: str
     """Relative to the namespace; may hold `<source>`."""
     native: str
-    """The key in the native tree that says the same; "" where there is none."""
+    """The key in the native tree that says the same."""
     schema_name: str
     """`pkg/msg/Name`."""
     message: type[Struct]
@@ -68,9 +68,9 @@ def _published() -> dict[str, Channel]:
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 STATE = Channel("state", "state", OURS + "RobotState", State)
-LOG = Channel("log", "", "rcl_interfaces/msg/Log", Log, Qos(1000))
+LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""What each source asks for; the stamp is when it arrived."""
+"""What each source asks for; the stamp is when it arrived. A log line is one event."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 """What the report builds, by its key."""

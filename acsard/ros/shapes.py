@@ -10,8 +10,8 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from acsard.messages.schema import Byte, Header, RobotState, Time
-from acsard.values import Event, Level
+from acsard.messages.schema import Byte, Happening, Header, RobotState, Time
+from acsard.values import Event
 
 Whole = Annotated[int, Meta(extra={"cdr": "q"})]
 Natural = Annotated[int, Meta(extra={"cdr": "I"})]
@@ -29,16 +29,16 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
-LEVELS: dict[Level, int] = {"info": 20, "warning": 30, "error": 40}
+LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """As ROS numbers them."""
 
 
-def log(event: Event, wall_ns: int) -> Log:
-    """An event at that time, told in one line."""
+def log(event: Event | Happening, stamp: Time) -> Log:
+    """An event of a step, or of `events`, told in one line."""
     by = f" (by {event.by})" if event.by else ""
     times = f" ({event.count} times)" if event.count > 1 else ""
     text = f"{event.text}{by}{times}"
-    return Log(Time.from_ns(wall_ns), LEVELS[event.level], event.name, text)
+    return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
 
 
 class Counter(Struct, frozen=True):

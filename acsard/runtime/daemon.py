@@ -86,9 +86,9 @@ async def _run(
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
         events: list[Event] = []
-        recorder = None
+        recorder, start = None, clock.now()
         if config.record.directory:
-            recorder = Recorder(config, events.append)
+            recorder = Recorder(config, events.append, start.wall_ns)
             stack.callback(recorder.close)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
         path = config.mcu.port if simulated is None else simulated.path
@@ -123,7 +123,7 @@ async def _run(
             info,
             port,
             bus,
-            clock.now(),
+            start,
             log.event,
             clock.mono_ns,
             ends_ns,

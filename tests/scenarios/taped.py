@@ -19,7 +19,7 @@ from acsard.robot import Robot
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.faults import FAULTS, Fault
 from acsard.values import Inputs, Outputs, Recording
-from tests.scenarios.world import World
+from tests.scenarios.world import START, World
 
 BATCH = 200
 """Steps; about a second."""
@@ -62,7 +62,15 @@ class Tape:
         """The file that the daemon would have written."""
         now = self.taken[0].inputs.now
         text = "\n".join(document(effective(config))) + "\n"
-        about = About(config.robot.id, "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, text)
+        about = About(
+            config.robot.id,
+            "0.1.0",
+            "3.11.0",
+            now.mono_ns,
+            now.wall_ns,
+            text,
+            started_ns=START.wall_ns,
+        )
         writing = Writing(path, about)
         for at in range(0, len(self.taken), BATCH):
             batch = self.taken[at : at + BATCH]
@@ -108,10 +116,11 @@ def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[st
             had.append(name)
             if world.now_ns > end_ns:
                 return had
-        _happenings(world, dice)
+        happenings(world, dice)
 
 
-def _happenings(world: World, dice: random.Random) -> None:
+def happenings(world: World, dice: random.Random) -> None:
+    """Each once."""
     world.call("stop")
     world.hold(0.5, seconds=0.3)
     world.call("clear")

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import shutil
+import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, RecordConfig
 from acsard.record import recorder as module
 from acsard.record.again import live, steps
+from acsard.record.export import export
 from acsard.record.file import Recording
 from acsard.record.recorder import MOST, Recorder
 from acsard.record.ring import KEPT, listed
 from acsard.values import Event
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
+
+SECRET = "PRIVATE KEY of a robot"
 
 
 def config(where: Path, megabytes: float = 10.0) -> Config:
@@ -225,3 +230,33 @@ def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     read = [recording.about.config.encode(), *[data for _, _, data in recording.messages()]]
     assert len(read) > 5
     assert not any(b"BEGIN" in data for data in read)
+
+
+def test_a_recording_and_what_is_exported_of_it_tell_where_keys_are_and_hold_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certificates, where = tmp_path / "tls", tmp_path / "record"
+    certificates.mkdir()
+    for name in ("ca.pem", "robot.pem", "robot-key.pem"):
+        (certificates / name).write_text(f"-----BEGIN {SECRET} {name}-----")
+    plain = config(where)
+    bus = replace(
+        plain.bus, tls=str(certificates), listen=("tcp/127.0.0.1:7448", "tls/0.0.0.0:7449")
+    )
+    monkeypatch.setattr(module, "CLOSE_S", 20.0)
+    recorder = Recorder(replace(plain, bus=bus), lambda event: None)
+    World(replace(plain, bus=bus), recorder=recorder).drive(0.3, 0.0, 0.5)
+    recorder.close()
+    (path,) = listed(where)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    recording = Recording(path)
+    export(recording, tmp_path / "new.mcap", "mcap")
+    export(recording, tmp_path / "new.csv", "csv")
+    held = [path.read_bytes(), recording.about.config.encode()]
+    held += [data for _, _, data in recording.messages()]
+    held += [(tmp_path / name).read_bytes() for name in ("new.mcap", "new.csv")]
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        held += [message.data for _, _, message in make_reader(stream).iter_messages()]
+    assert len(held) > 200
+    assert not [data for data in held if SECRET.encode() in data]
+    assert str(certificates) in recording.about.config

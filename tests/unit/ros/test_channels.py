@@ -81,5 +81,5 @@ def test_what_a_robot_has_nothing_to_say_on_has_no_channel() -> None:
 
 def test_events_and_commands_have_a_channel_beside_the_keys() -> None:
     twist = TwistStamped(Header(Time(1)), Twist(Vector3(x=0.5), Vector3()))
-    assert LOG.encode(log(Event("started", "up"), 0)).startswith(b"\0\1\0\0")
+    assert LOG.encode(log(Event("started", "up"), Time())).startswith(b"\0\1\0\0")
     assert len(CMD_VEL_IN.encode(twist)) == 68

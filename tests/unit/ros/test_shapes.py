@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.messages.schema import RobotState, SourceState, Time
+from acsard.messages.schema import Happening, RobotState, SourceState, Time
 from acsard.ros.shapes import Counter, Log, Source, log, state
 from acsard.values import Event
 
@@ -29,13 +29,18 @@ STATE = RobotState(
 
 def test_an_event_is_a_log_line_of_ros() -> None:
     event = Event("command_refused", "too old", "warning", by="a phone", count=3)
-    assert log(event, 1_500_000_000) == Log(
+    assert log(event, Time(1, 500_000_000)) == Log(
         Time(1, 500_000_000), 30, "command_refused", "too old (by a phone) (3 times)"
     )
 
 
+def test_what_the_topic_says_of_an_event_is_the_same_line() -> None:
+    seen = Happening(Time(1), "fault", "error", "dead motor", "", 1)
+    assert log(seen, seen.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
+
+
 def test_who_did_it_and_how_often_stand_there_only_if_there_is_something_to_say() -> None:
-    assert log(Event("started", "up"), 0) == Log(Time(), 20, "started", "up")
+    assert log(Event("started", "up"), Time()) == Log(Time(), 20, "started", "up")
 
 
 def test_a_source_never_heard_has_no_age() -> None:

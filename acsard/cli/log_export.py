@@ -1,0 +1,100 @@
+"""`acsard log export`: a recording as files that other programs open."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import load
+from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.record.export import Kind, Progress
+    from acsard.record.file import Recording
+
+DESCRIPTION = """\
+Write what the robot said then as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag play`:
+MCAP, with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each source, diagnostics,
+state and log as ROS 2 messages, and their definitions. With --config it is what the robot would
+have said with other parameters.
+"""
+
+
+def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+    """Declare the verb."""
+    parser = inner.add_parser(
+        "export",
+        help="write it for Foxglove, PlotJuggler, ros2 bag or a table",
+        description=DESCRIPTION,
+    )
+    parser.add_argument("file", nargs="?", metavar="FILE")
+    parser.add_argument("new", nargs="?", metavar="NEW", help="what to write (by default in this "
+                        "directory, called as the recording, with another ending)")  # fmt: skip
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--csv", dest="kind", action="store_const", const="csv", default="mcap",
+                      help="write a table: a line for each feedback; what `acsard calibrate --log` "
+                      "reads comes first")  # fmt: skip
+    form.add_argument("--rosbag2", dest="kind", action="store_const", const="rosbag2",
+                      help="write a directory with metadata.yaml, as `ros2 bag` does")  # fmt: skip
+    parser.add_argument("--config", metavar="FILE", help="another acsard.toml in place of its own")
+    parser.add_argument("--force", action="store_true", help="write over what is there")
+    return parser
+
+
+def export_one(
+    recording: Recording,
+    args: argparse.Namespace,
+    seconds: Callable[[str | None], float | None],
+) -> str:
+    """Write it, tell what was written, and return why it ends early, "" if it does not."""
+    from acsard.record.export import Span, export
+
+    kind: Kind = args.kind
+    new = Path(args.new) if args.new else _name(recording.path, kind)
+    begin, end = (
+        (None if s is None else int(s * 1e9)) for s in map(seconds, (args.begin, args.end))
+    )
+    other = None if args.config is None else load(args.config)[1]
+    try:
+        done = export(
+            recording, new, kind, other, Span(begin, end), _progress(recording), args.force
+        )
+    except OSError as error:
+        denied = isinstance(error, PermissionError)
+        raise ExitError(
+            Exit.NO_PERMISSION if denied else Exit.FAILURE, f"cannot write {new}: {error.strerror}"
+        ) from None
+    finally:
+        _clear()
+    print(f"{done.count} {'rows' if kind == 'csv' else 'messages'} in {new}")
+    return done.trouble
+
+
+def _name(path: Path, kind: Kind) -> Path:
+    """In the directory where we are: that of the recordings is the service's."""
+    from acsard.record.export import SUFFIX
+
+    return Path(path.name.partition(".")[0] + SUFFIX[kind])
+
+
+def _progress(recording: Recording) -> Progress:
+    """Tells on a terminal how far it has come."""
+    from acsard.record.file import closing
+
+    began_ns, last = recording.about.wall_ns, closing(recording.path)
+    whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
+
+    def tell(wall_ns: int) -> None:
+        if sys.stderr.isatty():
+            text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s"
+            print(text, end="", file=sys.stderr, flush=True)
+
+    return tell
+
+
+def _clear() -> None:
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)

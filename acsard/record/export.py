@@ -1,0 +1,265 @@
+"""A recording -> files for other programs: what the robot said then, or a table of what it did.
+
+A file stands there whole or not at all: it is written beside its name and gets it at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from errno import EEXIST
+from pathlib import Path
+from typing import BinaryIO, Literal, NamedTuple, Protocol
+
+from mcap.writer import Writer
+from msgspec import Struct
+
+from acsard import __version__
+from acsard.config.settings import Config
+from acsard.host.errors import RecordingError
+from acsard.record import bag, table
+from acsard.record.again import Course
+from acsard.record.file import About, Recording
+from acsard.record.published import Published, Publisher
+from acsard.record.replay import lived
+from acsard.record.steps import Step
+from acsard.robot import Robot
+from acsard.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
+from acsard.ros.names import TYPE_HASHES
+from acsard.values import Outputs
+
+Kind = Literal["mcap", "csv", "rosbag2"]
+
+SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
+"""What a name is made with where none is given."""
+
+Progress = Callable[[int], None]
+"""Called now and then with the wall-clock time that it has come to, ns."""
+
+EVERY = 1024
+"""Steps from one call of it to the next."""
+
+
+class Span(NamedTuple):
+    """From when to when, wall-clock ns; None is the beginning or the end."""
+
+    begin_ns: int | None = None
+    end_ns: int | None = None
+
+
+WHOLE = Span()
+
+
+class Done(Struct, frozen=True):
+    """What was written."""
+
+    count: int
+    """Messages, or lines of a table."""
+    trouble: str
+    """Why it ends before the recording does, "" when it does not."""
+
+
+class _Sink(Protocol):
+    count: int
+
+    def step(self, step: Step, outputs: Outputs) -> None:
+        """Write what there is of a step that has been lived."""
+
+    def finish(self) -> None:
+        """Write the end."""
+
+
+class _Messages:
+    """Writes MCAP."""
+
+    def __init__(self, stream: BinaryIO, robot: Robot, about: About, name: str) -> None:
+        self._publisher = Publisher(robot, about.started_ns or about.wall_ns)
+        self._namespace = robot.config.ros.namespace
+        self._writer = Writer(stream)
+        self._writer.start("ros2", f"acsard {__version__}")
+        made = {"robot": about.robot, "recording": name, "recorded_by": f"acsard {about.version}"}
+        self._writer.add_metadata("acsard export", made)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._topics: dict[int, tuple[str, Channel]] = {}
+        self._counts: dict[int, int] = {}
+        self.count = 0
+        self.times: tuple[int, int] = (0, 0)
+        """Of the first and the last message."""
+
+    def step(self, step: Step, outputs: Outputs) -> None:
+        for one in self._publisher.step(step, outputs):
+            self._add(one)
+
+    def _add(self, one: Published) -> None:
+        number = self._channels.get((one.channel.name, one.source))
+        if number is None:
+            number = self._open(one.channel, one.source)
+        wall_ns = max(0, one.wall_ns)
+        self._counts[number] += 1
+        data = one.channel.encode(one.message)
+        self._writer.add_message(number, wall_ns, data, wall_ns, self._counts[number])
+        first, last = self.times if self.count else (wall_ns, wall_ns)
+        self.times = (min(first, wall_ns), max(last, wall_ns))
+        self.count += 1
+
+    def _open(self, channel: Channel, source: str) -> int:
+        """The number of a channel that is new, by the file."""
+        kind = channel.schema_name
+        if kind not in self._schemas:
+            text = channel.schema.encode()
+            self._schemas[kind] = self._writer.register_schema(kind, SCHEMA_ENCODING, text)
+        topic = channel.topic(self._namespace, source)
+        about = {"offered_qos_profiles": bag.offered(channel.qos)}
+        if kind in TYPE_HASHES:
+            about["topic_type_hash"] = TYPE_HASHES[kind]
+        number: int = self._writer.register_channel(topic, ENCODING, self._schemas[kind], about)
+        self._channels[channel.name, source] = number
+        self._topics[number], self._counts[number] = (topic, channel), 0
+        return number
+
+    def finish(self) -> None:
+        self._writer.finish()
+
+    @property
+    def topics(self) -> list[bag.Topic]:
+        return [
+            bag.Topic(name, channel.schema_name, channel.qos, self._counts[number])
+            for number, (name, channel) in self._topics.items()
+        ]
+
+
+class _Table:
+    """Writes CSV."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._stream.write(f"{table.HEADER}\n".encode())
+        self.count = 0
+
+    def step(self, step: Step, outputs: Outputs) -> None:
+        for row in table.rows(step, outputs):
+            self._stream.write(f"{row}\n".encode())
+            self.count += 1
+
+    def finish(self) -> None: ...
+
+
+def export(
+    recording: Recording,
+    new: Path,
+    kind: Kind,
+    other: Config | None = None,
+    span: Span = WHOLE,
+    progress: Progress = lambda wall_ns: None,
+    force: bool = False,
+) -> Done:
+    """Write `new`, a file or, of `rosbag2`, a directory.
+
+    `other` is a configuration in place of the recording's own. Raises `RecordingError` where there
+    is nothing to write, `FileExistsError` where it would take the place of something, unless
+    `force`, and any other `OSError`; then nothing is left behind.
+    """
+    course = Course(recording, other)
+
+    def written(sink: _Sink, stream: BinaryIO) -> None:
+        _all(course, sink, span, progress)
+        if not sink.count:
+            raise RecordingError(f"{recording.path} has nothing in that time")
+        sink.finish()
+        _synced(stream)
+
+    def messages(stream: BinaryIO) -> _Messages:
+        return _Messages(stream, course.robot, recording.about, recording.path.name)
+
+    with _beside(new, force) as part:
+        if kind == "rosbag2":
+            part.mkdir()
+            file = part / f"{new.name}_0.mcap"
+            with file.open("wb") as stream:
+                written(sink := messages(stream), stream)
+            with (part / "metadata.yaml").open("wb") as stream:
+                stream.write(bag.metadata(file.name, sink.topics, *sink.times).encode())
+                _synced(stream)
+            return Done(sink.count, course.trouble)
+        with part.open("wb") as stream:
+            one: _Sink = _Table(stream) if kind == "csv" else messages(stream)
+            written(one, stream)
+        return Done(one.count, course.trouble)
+
+
+def _all(course: Course, sink: _Sink, span: Span, progress: Progress) -> None:
+    begin_ns, end_ns = span
+    for number, step in enumerate(course.steps()):
+        wall_ns = step.inputs.now.wall_ns
+        if number % EVERY == 0:
+            progress(wall_ns)
+        outputs = lived(course.robot, step)
+        if (begin_ns is None or wall_ns >= begin_ns) and (end_ns is None or wall_ns <= end_ns):
+            sink.step(step, outputs)
+
+
+def measured(recording: Recording) -> bytes:
+    """The table that `acsard calibrate` reads; raises `RecordingError` if it were no use."""
+    course = Course(recording)
+    lines, turned = [table.MEASURED_HEADER], False
+    for step in course.steps():
+        lines += table.measured(step, lived(course.robot, step))
+        turned = turned or bool(step.inputs.gyro)
+    if not turned:
+        raise RecordingError(
+            f"{recording.path} holds no gyro, so there is nothing to compare the wheels with: "
+            "record a drive with [odometry] gyro = true, or export it with --csv and add the "
+            "columns x and y of what measures positions"
+        )
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _synced(stream: BinaryIO) -> None:
+    stream.flush()
+    os.fsync(stream.fileno())
+
+
+@contextmanager
+def _beside(new: Path, force: bool) -> Iterator[Path]:
+    """Where to write what is to be `new`, which it is at the end, if all went well."""
+    _require_free(new, force)
+    part = new.with_name(f".{new.name}.{os.getpid()}.part")
+    try:
+        yield part
+        _require_free(new, force)
+        if new.is_dir():
+            shutil.rmtree(new)
+        os.replace(part, new)
+    except BaseException:
+        _remove(part)
+        raise
+
+
+def _require_free(new: Path, force: bool) -> None:
+    """Only what may have been an export may go, and only by `force`."""
+    if not (new.exists() or new.is_symlink()):
+        return
+    if not force:
+        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
+    if new.is_dir() and not (new / "metadata.yaml").is_file():
+        raise FileExistsError(EEXIST, "it is a directory, and no bag")
+    if new.is_file() and _is_recording(new):
+        raise FileExistsError(EEXIST, "it is a recording; name another file")
+
+
+def _is_recording(path: Path) -> bool:
+    try:
+        Recording(path)
+    except RecordingError:
+        return False
+    return True
+
+
+def _remove(part: Path) -> None:
+    if part.is_dir():
+        shutil.rmtree(part)
+    else:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,105 @@
+"""What a robot that lives again says meanwhile: every message as it was on the bus then.
+
+Built by the same report, as if somebody had listened to everything all the time. What the daemon
+measured of itself is in no recording: the rows of `diagnostics` that tell it are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from msgspec.structs import replace
+
+from acsard.messages.report import Look, Report
+from acsard.messages.schema import (
+    DiagnosticArray,
+    Header,
+    RobotState,
+    TFMessage,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
+from acsard.record.steps import Step
+from acsard.robot import Robot
+from acsard.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, said
+from acsard.ros.shapes import log
+from acsard.ros.transports import left_out
+from acsard.values import Command, Instant, Outputs
+
+MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
+"""Rows that are made of more than what came into the steps."""
+
+
+class Published(NamedTuple):
+    """A message and when it went; `source` of a commander's channel."""
+
+    channel: Channel
+    source: str
+    wall_ns: int
+    message: Any
+
+
+class Publisher:
+    """Takes step after step, some may be left out."""
+
+    def __init__(self, robot: Robot, started_ns: int) -> None:
+        """The daemon's start by the wall clock is the stamp of what never changes."""
+        self._robot, self._config = robot, robot.config
+        self._report = Report(robot.config, Instant(0, started_ns))
+        self._wanted = self._listened()
+        self._static: TFMessage | None = None
+        self._latches = True
+
+    def _listened(self) -> frozenset[str]:
+        names = {channel.native for channel in said(left_out(self._config))}
+        return frozenset(names & BY_KEY.keys())
+
+    def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
+        """What was said around a step that has just been lived: heard first, log lines last."""
+        if self._robot.config is not self._config:  # a setting was changed
+            self._config = self._robot.config
+            self._report.use(self._config)
+            self._wanted = self._listened()
+            self._latches = True
+        now = step.inputs.now
+        for command in step.inputs.commands:
+            yield self._heard(command, now)
+        yield from self._latched(now)
+        for key, message in self._report.due(outputs, self._wanted, self._look(now)):
+            yield Published(BY_KEY[key], "", now.wall_ns, _recorded(message))
+        for event in step.said.events:
+            line = log(event, Time.from_ns(now.wall_ns))
+            yield Published(LOG, "", now.wall_ns, line)
+
+    def _look(self, now: Instant) -> Look:
+        return lambda: self._robot.snapshot(now.mono_ns)
+
+    def _latched(self, now: Instant) -> Iterator[Published]:
+        """Once, and again when a setting has made it another one."""
+        if self._latches and "tf_static" in self._wanted:
+            self._latches = False
+            static = self._report.tf_static()
+            if static != self._static:
+                self._static = static
+                yield Published(BY_KEY["tf_static"], "", now.wall_ns, static)
+
+    def _heard(self, command: Command, now: Instant) -> Published:
+        arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns
+        header = Header(Time.from_ns(arrived_ns), self._config.odometry.base_frame)
+        linear, angular = Vector3(x=command.twist.linear), Vector3(z=command.twist.angular)
+        message = TwistStamped(header, Twist(linear, angular))
+        return Published(CMD_VEL_IN, command.source, arrived_ns, message)
+
+
+def _recorded(message: Any) -> Any:
+    """The message without what no recording knows."""
+    match message:
+        case RobotState():
+            return replace(message, certificate="", figures={})
+        case DiagnosticArray():
+            rows = [row for row in message.status if row.name not in MEASURED]
+            return DiagnosticArray(message.header, rows)
+    return message

@@ -1,0 +1,116 @@
+"""How long an hour's recording takes to export, and with how much memory.
+
+pytest -s -m bench tests/bench/test_export.py
+
+An hour of driving at 100 Hz in virtual time, the daemon's own program over the file.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.config.writing import document
+from acsard.record.batch import encode
+from acsard.record.file import About, Writing
+from acsard.record.steps import Taken
+from acsard.robot import Robot
+from acsard.values import Inputs, Instant, Outputs, Recording
+from tests.scenarios.world import START, World
+from tests.system.harness import acsard, environment
+
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(1800)]
+
+BATCH = 200
+
+HOUR_S, MINUTE_S = 3600.0, 60.0
+
+
+class Streamed:
+    """A black box that writes as it goes: an hour does not fit into memory."""
+
+    status = Recording("file")
+
+    def __init__(self, path: Path, config: Config, start: Instant) -> None:
+        text = "\n".join(document(effective(config))) + "\n"
+        about = About(config.robot.id, "0.1.0", "3.11.0", start.mono_ns, start.wall_ns, text)
+        self.writing = Writing(path, about)
+        self._taken: list[Taken] = []
+        self._number = 0
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+    ) -> None:
+        self._taken.append(Taken(inputs, outputs, left))
+        if len(self._taken) == BATCH:
+            at_ns = self._taken[0].inputs.now.wall_ns
+            self.writing.add("steps", at_ns, encode(self._number, self._taken))
+            self._number += BATCH
+            self._taken.clear()
+
+
+def recorded(path: Path, seconds: float) -> Path:
+    """Driving at 20 commands a second, another speed every half minute."""
+    config = replace(Config(), record=replace(Config().record, directory=str(path.parent)))
+    box = Streamed(path, config, START)
+    world = World(config, recorder=box)
+    world.bus.wanted = set()
+    world.drive(0.3, 0.2, 1.0)
+    while world.now_ns - START.mono_ns < seconds * 1e9:
+        for linear, angular in ((0.4, 0.3), (-0.2, 0.5), (0.0, -0.8), (0.5, 0.0)):
+            world.hold(linear, angular, seconds=15.0)
+    box.writing.finish()
+    return path
+
+
+class Cost(NamedTuple):
+    seconds: float
+    processor: float
+    """s of it; the rest is what others had."""
+    megabytes: float
+    """Resident at most."""
+
+
+def cost(*words: str) -> Cost:
+    """Of one run of the program."""
+    began = time.perf_counter()
+    process = subprocess.Popen(acsard(*words), env=environment(), stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0, words
+    took = time.perf_counter() - began
+    return Cost(took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A minute and an hour."""
+    where = tmp_path_factory.mktemp("hour")
+    return recorded(where / "minute.mcap", MINUTE_S), recorded(where / "hour.mcap", HOUR_S)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "csv", "rosbag2"])
+def test_an_hour_needs_hardly_more_memory_than_a_minute(
+    kind: str, both: tuple[Path, Path], tmp_path: Path
+) -> None:
+    options = [] if kind == "mcap" else [f"--{kind}"]
+    little, much = (
+        cost("log", "export", str(path), str(tmp_path / path.stem), *options) for path in both
+    )
+    new = tmp_path / "hour"
+    written = sum(p.stat().st_size for p in [new, *new.rglob("*")] if p.is_file()) / 1e6
+    size = both[1].stat().st_size / 1e6
+    print(
+        f"\nan hour of {size:.1f} MB as {kind}: {much.seconds:.0f} s ({much.processor:.0f} s of a "
+        f"processor), {written:.1f} MB written, {much.megabytes:.0f} MB resident at most (a "
+        f"minute: {little.megabytes:.0f} MB)"
+    )
+    assert much.megabytes < little.megabytes + 2 * size + 50

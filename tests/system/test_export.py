@@ -1,0 +1,217 @@
+"""What is exported of a recording is what strangers got over the bus while it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
+
+OFTEN = {"rates": {"state": 100.0, "diagnostics": 100.0}}
+"""What has a rate is said when the mode changes, and from then on at that rate: whoever listens by
+then gets the same ones, whenever he began."""
+
+ROS = ("odom", "tf", "joint_states", "cmd_vel_out", "diagnostics")
+
+MEASURED = {"acsard: control loop", "acsard: recording"}
+"""Rows of what the daemon measures of itself, which is in no recording."""
+
+RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
+
+MISSED = 0.2
+"""The share of messages that a listener on a busy machine may not have got: the bus drops them."""
+
+
+class Told(NamedTuple):
+    """A bag in memory: the bytes of each topic, and what makes messages of them."""
+
+    data: dict[str, list[bytes]]
+    times: dict[str, list[int]]
+    decode: Callable[[str, bytes], Any]
+
+
+def bag(path: Path) -> Told:
+    store: Any = get_typestore(Stores.EMPTY)
+    data: dict[str, list[bytes]] = {}
+    times: dict[str, list[int]] = {}
+    with Reader(path) as reader:
+        types = {one.topic: one.msgtype for one in reader.connections}
+        for one in reader.connections:
+            store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
+        for connection, time_ns, raw in reader.messages():
+            data.setdefault(connection.topic, []).append(raw)
+            times.setdefault(connection.topic, []).append(time_ns)
+    return Told(data, times, lambda topic, raw: store.deserialize_cdr(raw, types[topic]))
+
+
+def _take(got: list[bytes], sample: Any) -> None:
+    got.append(sample.payload.to_bytes())
+
+
+@contextmanager
+def heard(bus: Bus) -> Iterator[dict[str, list[bytes]]]:
+    """All that comes on the keys of the ROS tree, and `state` and `events` of our own."""
+    seen: dict[str, list[bytes]] = {}
+    with ExitStack() as stack:
+        for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
+            got = seen.setdefault(key.rpartition("/")[2], [])
+            subscriber = bus.session.declare_subscriber(key, partial(_take, got))
+            stack.callback(subscriber.undeclare)
+        bus.ask("info")  # behind the subscriptions
+        yield seen
+
+
+def assert_among(live: Sequence[Any], told: Sequence[Any], topic: str) -> None:
+    """Each of the live ones is in the file, in order; few of the file's are missing live."""
+    at = iter(enumerate(told))
+    found = [next((n for n, other in at if other == one), None) for one in live]
+    assert None not in found, f"{topic}: live message {found.index(None)} of {len(found)}"
+    first, last = found[0], found[-1]
+    assert first is not None
+    assert last is not None
+    assert len(live) >= (1 - MISSED) * (last - first + 1), topic
+
+
+def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence[Any]:
+    """From the first change of mode on."""
+    first = next(n for n, one in enumerate(live) if reason(one).startswith("driving"))
+    assert len(live) - first > 50
+    return live[first:]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What was heard live, the static transforms as they were asked for, and the bag."""
+    where = tmp_path_factory.mktemp("export")
+    words = ["--record", str(where / "record")]
+    with (
+        Daemon(where, config=OFTEN, words=words) as daemon,
+        Bus(daemon.endpoint) as bus,
+        heard(bus) as seen,
+    ):
+        bus.linked()
+        with bus.commanding(0.3, 0.2):
+            before = len(seen["odom"])
+            until(lambda: len(seen["odom"]) > before + 150, 5.0, "odometry")
+        bus.get("srv/stop")
+        until(lambda: any(b"stop" in one for one in seen["events"]), 5.0, "the stop")
+        static = bus.get("tf_static")
+        daemon.process.terminate()
+        assert daemon.ended(5.0) == 0
+    (path,) = (where / "record").glob("*.mcap")
+    ended = finish(acsard("log", "export", str(path), str(where / "bag"), "--rosbag2"), where)
+    assert ended.code == 0, ended
+    return seen, static, bag(where / "bag")
+
+
+@pytest.mark.parametrize("topic", ["odom", "tf", "joint_states", "cmd_vel_out"])
+def test_every_message_is_to_the_byte_what_a_ros_node_got(topic: str, both: Any) -> None:
+    seen, _, told = both
+    assert len(seen[topic]) > 100
+    assert_among(seen[topic], told.data[f"/{topic}"], topic)
+
+
+def test_the_static_transforms_are_those_of_then(both: Any) -> None:
+    _, static, told = both
+    (raw,) = told.data["/tf_static"]
+    message = told.decode("/tf_static", raw)
+    for one, other in zip(static["transforms"], message.transforms, strict=True):
+        stamp = other.header.stamp
+        assert one["header"]["stamp"] == {"sec": stamp.sec, "nanosec": stamp.nanosec}
+        assert one["child_frame_id"] == other.child_frame_id
+        assert one["transform"]["translation"]["x"] == other.transform.translation.x
+
+
+def test_every_diagnostics_has_the_rows_of_then(both: Any) -> None:
+    seen, _, told = both
+
+    def rows(raw: bytes) -> Any:
+        message = told.decode("/diagnostics", raw)
+        stamp = message.header.stamp.sec, message.header.stamp.nanosec
+        return stamp, [
+            (row.level, row.name, row.message, [(v.key, v.value) for v in row.values])
+            for row in message.status
+            if row.name not in MEASURED
+        ]
+
+    live, written = (
+        [rows(raw) for raw in x] for x in (seen["diagnostics"], told.data["/diagnostics"])
+    )
+    assert_among(since_driving(live, lambda one: one[1][0][2]), written, "diagnostics")
+
+
+ALIKE = (
+    "mode",
+    "reason",
+    "x",
+    "y",
+    "yaw",
+    "linear",
+    "angular",
+    "link",
+    "source",
+    "sender",
+    "doubt",
+)
+
+
+def test_every_state_has_the_values_of_then(both: Any) -> None:
+    seen, _, told = both
+
+    def of_live(raw: bytes) -> Any:
+        one = msgspec.msgpack.decode(raw)
+        counters = {name: n for name, n in one["counters"].items() if not name.startswith("bus_")}
+        sources = [(s["name"], s["age"], s["waits_for"]) for s in one["sources"]]
+        plain = [one[name] for name in ALIKE]
+        return [tuple(one["stamp"].values()), plain, list(one["wheels"]), sources, counters]
+
+    def of_file(raw: bytes) -> Any:
+        one = told.decode("/state", raw)
+        counters = {c.name: c.count for c in one.counters if not c.name.startswith("bus_")}
+        sources = [(s.name, s.age if s.age == s.age else None, s.waits_for) for s in one.sources]
+        stamp = one.header.stamp.sec, one.header.stamp.nanosec
+        plain = [getattr(one, name) for name in ALIKE]
+        return [stamp, plain, list(one.wheels), sources, counters]
+
+    live = since_driving([of_live(raw) for raw in seen["state"]], lambda one: one[1][1])
+    assert_among(live, [of_file(raw) for raw in told.data["/state"]], "state")
+
+
+def test_every_event_of_then_is_in_the_log(both: Any) -> None:
+    seen, _, told = both
+    lines = [told.decode("/log", raw) for raw in told.data["/log"]]
+    written = [(one.stamp.sec, one.stamp.nanosec, one.name) for one in lines]
+    last = msgspec.msgpack.decode(seen["events"][-1])
+    live = [(*one["stamp"].values(), one["name"]) for one in last["events"]]
+    assert "stop" in {name for *_, name in live}
+    assert_among(live, written, "log")
+
+
+def test_what_a_commander_sent_is_there_by_its_source(both: Any) -> None:
+    _, _, told = both
+    sent = [told.decode("/cmd_vel_in/app", raw) for raw in told.data["/cmd_vel_in/app"]]
+    speeds = {(one.twist.linear.x, one.twist.angular.z) for one in sent}
+    assert speeds >= {(0.3, 0.2)}
+
+
+def test_times_in_the_file_are_when_it_was_published(both: Any) -> None:
+    _, _, told = both
+    for raw, time_ns in zip(told.data["/cmd_vel_out"], told.times["/cmd_vel_out"], strict=True):
+        stamp = told.decode("/cmd_vel_out", raw).header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == time_ns
+
+
+def test_a_full_disk_is_a_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    words = acsard("log", "export", str(RECORDED), "new.mcap")
+    full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes a file
+    ended = finish(full, tmp_path)
+    assert (ended.code, ended.err) == (1, "acsard: cannot write new.mcap: File too large")
+    assert not [*tmp_path.iterdir()]
