@@ -1,35 +1,20 @@
-"""What is new in a state, as lines of a log; pure.
-
-The daemon's own log stays with the daemon: this is what its `state` shows of it.
-"""
+"""The daemon's events as lines of a log, each once; pure."""
 
 from __future__ import annotations
 
-from acsard.messages.schema import RobotState
-from acsard.ros.shapes import LEVELS, Log
-from acsard.values import Level
-
-BAD: dict[str, Level] = {"fault": "error", "stopped": "warning", "waiting": "warning"}
-"""Modes that are more than news."""
+from acsard.messages.schema import Events
+from acsard.ros.shapes import Log, log
 
 
 class News:
-    """Knows the state before."""
+    """Knows how many there were."""
 
     def __init__(self) -> None:
-        self._before: RobotState | None = None
+        self._total = 0
 
-    def of(self, state: RobotState) -> list[Log]:
-        """What to tell of this state; of the first one, how it is."""
-        before, self._before = self._before, state
-        told: list[tuple[Level, str, str]] = []
-        if before is None or (state.mode, state.reason) != (before.mode, before.reason):
-            why = state.reason.removeprefix(f"{state.mode}: ")
-            told.append((BAD.get(state.mode, "info"), "mode", f"{state.mode}: {why}"))
-        if state.refused and (before is None or state.refused != before.refused):
-            told.append(("warning", "refused", state.refused))
-        for name in ("doubt", "recording"):
-            now, was = getattr(state, name), "" if before is None else getattr(before, name)
-            if now != was:
-                told.append(("warning", name, now) if now else ("info", name, f"over: {was}"))
-        return [Log(state.stamp, LEVELS[level], name, text) for level, name, text in told]
+    def of(self, events: Events) -> list[Log]:
+        """Those that are new; of a daemon not heard before all that it still knows."""
+        known = self._total if events.total >= self._total else 0  # another daemon
+        self._total = events.total
+        new = min(events.total - known, len(events.events))
+        return [log(one, one.stamp) for one in events.events[len(events.events) - new :]]

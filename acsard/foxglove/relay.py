@@ -22,6 +22,7 @@ from acsard.host import clock
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import (
     MESSAGES,
+    Events,
     Header,
     RobotState,
     Time,
@@ -36,7 +37,7 @@ from acsard.ros.shapes import Log
 MOST = 100
 """Messages of a topic passed on at once: a second's."""
 
-STATE = "state"
+STATE, EVENTS = "state", "events"
 
 KEPT = ("tf_static", "diagnostics", STATE)
 """What comes seldom: who begins to look gets the last one."""
@@ -85,20 +86,22 @@ class Relay:
 
     def follow(self, topics: Collection[str], fresh: Collection[str], *, state: bool) -> None:
         """Subscribe to what these need, and to `state` if it is asked for; `fresh` are new ones."""
+        if self.log_topic in fresh:
+            self._news = News()  # who opens the log sees the last events
         shown = [self._outs[topic] for topic in topics if topic in self._outs]
-        keys = {out.key for out in shown if out.key}
-        if state or self.log_topic in topics:
-            keys.add(STATE)
+        keys = {out.key for out in shown} | ({STATE} if state else set())
         for key in self._followed.keys() - keys:
             self._followed.pop(key).undeclare()
         for topic in fresh:
             out = self._outs.get(topic)
-            if out is not None and out.key in KEPT and out.key in self._followed and out.last:
+            if out is None or out.key not in self._followed:
+                continue
+            if out.key == EVENTS:
+                self._robot.ask(EVENTS, self._followed[EVENTS].add)
+            elif out.key in KEPT and out.last:
                 out.channel.log(out.last)
         for key in keys - self._followed.keys():
             self._followed[key] = self._subscribed(key)
-        if self.log_topic in fresh:
-            self._news = News()  # who opens the log sees how it is
 
     def _subscribed(self, key: str) -> Subscription:
         topic = by_key(key)
@@ -115,12 +118,14 @@ class Relay:
         for key, samples in self._followed.items():
             outs = [out for out in self._outs.values() if out.key == key]
             for message in self._messages(key, samples):
+                if isinstance(message, Events):
+                    for line in self._news.of(message):
+                        self.log(line)
+                    continue
                 for out in outs:
                     out.log(message)
                 if isinstance(message, RobotState):
                     newest = message
-                    for line in self._news.of(message):
-                        self.log(line)
         return newest
 
     def ask_state(self) -> None:

@@ -42,7 +42,7 @@ TOPICS = {
     "/cmd_vel_out": ("geometry_msgs/msg/TwistStamped", "cmd_vel_out"),
     "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "diagnostics"),
     "/state": ("acsard/msg/RobotState", "state"),
-    "/log": ("rcl_interfaces/msg/Log", ""),
+    "/log": ("rcl_interfaces/msg/Log", "events"),
 } | {
     f"/cmd_vel_in/{source}": ("geometry_msgs/msg/TwistStamped", f"cmd/{source}")
     for source in ("teleop", "app", "ros2_control", "nav")
@@ -218,12 +218,19 @@ def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
     assert told.header.stamp.sec > 0
 
 
-def test_the_log_tells_how_it_is_and_what_changes(viewer: Viewer, bus: Bus) -> None:
+def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/log")
-    until(lambda: any("ready" in line for line in lines(looked)), 5.0, "how it is")
-    bus.get("srv/stop")
+    looked.first()
+    assert bus.get("srv/stop")["success"]
+    assert bus.get("srv/clear")["success"]
     until(lambda: any("stopped by request" in line for line in lines(looked)), 5.0, "the stop")
-    bus.get("srv/clear")
+    told = [(e["name"], e["text"]) for e in bus.get("events")["events"]]
+
+    def all_of_them() -> bool:
+        messages = [looked.read(one.payload) for one in list(looked.came)]
+        return [(m.name, m.msg.partition(" (by ")[0]) for m in messages][-len(told) :] == told
+
+    until(all_of_them, 5.0, f"{told} and nothing twice")
 
 
 def lines(log: Looked) -> list[str]:

@@ -21,7 +21,7 @@ def test_each_source_has_a_topic_of_its_own() -> None:
     assert found["/cmd_vel_in/teleop"] == "cmd/teleop"
     assert found["/cmd_vel_in/app"] == "cmd/app"
     assert found["/joint_states"] == "wheel_states"
-    assert found["/log"] == ""
+    assert found["/log"] == "events"
 
 
 def test_a_namespace_is_in_front_of_all() -> None:

@@ -1,54 +1,51 @@
-"""What is new in a state is a line of the log."""
+"""The daemon's events are lines of the log, each once."""
 
 from __future__ import annotations
 
-from msgspec.structs import replace
+import pytest
 
 from acsard.foxglove.news import News
-from acsard.messages.schema import RobotState, Time
+from acsard.messages.schema import Events, Happening, Time
 
-READY = RobotState(
-    stamp=Time(7), mode="ready", reason="no commands", x=0, y=0, yaw=0, linear=0, angular=0,
-    wheels=[], link="up", source="", sources=[], refused="", counters={},
-)  # fmt: skip
+KEPT = 20
 
 
-def told(*states: RobotState) -> list[tuple[int, str, str]]:
-    """The lines of the last of these."""
+def events(total: int, of: str = "first") -> Events:
+    """What a daemon says when so many have happened."""
+    kept = range(max(0, total - KEPT), total)
+    told = [Happening(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
+    return Events(Time(total), total, told)
+
+
+def names(news: News, said: Events) -> list[str]:
+    return [line.name for line in news.of(said)]
+
+
+def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
+    lines = News().of(events(3))
+    assert [(line.stamp.sec, line.level, line.name) for line in lines] == [
+        (0, 30, "mode0"),
+        (1, 30, "mode1"),
+        (2, 30, "mode2"),
+    ]
+    assert lines[0].msg == "first 0 (by ann)"
+    assert len(News().of(events(1000))) == KEPT
+
+
+@pytest.mark.parametrize(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
+def test_each_is_told_once(before: int, now: int) -> None:
     news = News()
-    lines = [news.of(state) for state in states][-1]
-    assert all(line.stamp == states[-1].stamp for line in lines)
-    return [(line.level, line.name, line.msg) for line in lines]
+    news.of(events(before))
+    assert names(news, events(now)) == [f"mode{n}" for n in range(before, now)]
 
 
-def test_the_first_state_tells_how_it_is() -> None:
-    assert told(READY) == [(20, "mode", "ready: no commands")]
+def test_those_that_nobody_kept_are_gone() -> None:
+    news = News()
+    news.of(events(10))
+    assert names(news, events(100)) == [f"mode{n}" for n in range(80, 100)]
 
 
-def test_the_same_again_is_no_news() -> None:
-    assert told(READY, replace(READY, x=1.0, stamp=Time(8))) == []
-
-
-def test_a_mode_is_told_with_its_reason_and_weight() -> None:
-    stopped = replace(READY, mode="stopped", reason="stopped: by request")
-    fault = replace(READY, mode="fault", reason="wheel a stuck")
-    assert told(READY, stopped) == [(30, "mode", "stopped: by request")]
-    assert told(READY, fault) == [(40, "mode", "fault: wheel a stuck")]
-
-
-def test_a_refused_command_is_told_once_and_not_taken_back() -> None:
-    refused = replace(READY, refused="cmd/app: NaN")
-    assert told(READY, refused) == [(30, "refused", "cmd/app: NaN")]
-    assert told(READY, refused, refused) == []
-    assert told(refused, READY) == []
-
-
-def test_a_doubt_begins_and_ends() -> None:
-    doubt = replace(READY, doubt="the left side slips")
-    assert told(READY, doubt) == [(30, "doubt", "the left side slips")]
-    assert told(READY, doubt, READY) == [(20, "doubt", "over: the left side slips")]
-
-
-def test_what_is_not_recorded_is_told() -> None:
-    full = replace(READY, recording="the disk is full")
-    assert told(READY, full) == [(30, "recording", "the disk is full")]
+def test_another_daemon_begins_anew() -> None:
+    news = News()
+    news.of(events(10))
+    assert names(news, events(2, "second")) == ["mode0", "mode1"]
