@@ -34,7 +34,7 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """The key below the robot's id on which a row is published; "" for none."""
+    """The key below the robot's id on which a row is published."""
     return row.native.replace(SOURCE, source)
 
 

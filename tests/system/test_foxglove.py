@@ -30,7 +30,7 @@ from tests.system.harness import (
     read,
     until,
 )
-from tests.system.viewer import Looked, Viewer
+from tests.system.viewer import Looked, Viewer, opened
 
 SLOW = pytest.mark.slow
 
@@ -357,6 +357,25 @@ def test_who_publishes_too_seldom_is_told(viewer: Viewer) -> None:
         send(speed(0.0))
         time.sleep(0.5)
     viewer.status("set its publish rate to 10 Hz or more")
+
+
+@SLOW
+def test_a_viewer_that_reads_nothing_or_floods_holds_up_nobody(
+    viewer: Viewer, shows: Shows, bus: Bus
+) -> None:
+    looked = viewer.show("/odom")
+    everything = [one["id"] for one in viewer.channels.values()]
+    with opened(shows.port) as mute, bus.follow("cmd/app") as commands:
+        asked = [{"id": number, "channelId": one} for number, one in enumerate(everything)]
+        mute.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        looked.first(len(looked.came) + 50)
+        flood = 5000
+        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+        for _ in range(flood):
+            send(speed(0.0))
+        looked.first(len(looked.came) + 50)
+        # The newest goes, no faster than the bus takes them; what was in between does not.
+        assert 0 < len(commands.seen) < flood / 5
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from tests.system.harness import until
@@ -39,15 +39,21 @@ class Came(NamedTuple):
     payload: bytes
 
 
+PROTOCOL = "foxglove.sdk.v1"
+
+
+def opened(port: int, protocol: str = PROTOCOL) -> ClientConnection:
+    """A bare connection, of which nobody reads."""
+    where = f"ws://127.0.0.1:{port}"
+    return connect(where, subprotocols=[Subprotocol(protocol)], close_timeout=0.5)
+
+
 class Viewer:
     """One connection; all that comes is kept by its kind."""
 
-    def __init__(
-        self, port: int, protocol: str = "foxglove.sdk.v1", *, services: bool = True
-    ) -> None:
+    def __init__(self, port: int, protocol: str = PROTOCOL, *, services: bool = True) -> None:
         self._opened = ExitStack()
-        opening = connect(f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol(protocol)])
-        self._socket = self._opened.enter_context(opening)
+        self._socket = self._opened.enter_context(opened(port, protocol))
         self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
         self.services: dict[str, dict[str, Any]] = {}
