@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.foxglove.news import News
 from acsard.messages.schema import Events, Happening, Time
@@ -45,7 +46,15 @@ def test_those_that_nobody_kept_are_gone() -> None:
     assert names(news, events(100)) == [f"mode{n}" for n in range(80, 100)]
 
 
+def test_an_answer_that_is_older_than_what_came_by_itself_tells_nothing() -> None:
+    news = News()
+    news.of(events(10))
+    assert names(news, events(9)) == []
+    assert names(news, events(11)) == ["mode10"]
+
+
 def test_another_daemon_begins_anew() -> None:
     news = News()
     news.of(events(10))
-    assert names(news, events(2, "second")) == ["mode0", "mode1"]
+    later = replace(events(2, "second"), stamp=Time(11))
+    assert names(news, later) == ["mode0", "mode1"]
