@@ -142,6 +142,8 @@ LAUNCH = Elsewhere(
     "the file is run, with what ROS has in it stood in for",
 )
 
+FOXGLOVE = "tests/system/test_foxglove.py"
+
 IN_TYPESCRIPT = Elsewhere(
     CLIENTS, "test_the_typescript_example_follows_the_robot_through_the_bridge"
 )
@@ -215,6 +217,15 @@ COMMANDS: dict[str, How] = {
     "pip install datamodel-code-generator": TYPED,
     "datamodel-codegen --input schemas --input-file-type jsonschema "
     "--output-model-type pydantic_v2.BaseModel --output acsard_types": TYPED,
+    # deploy/foxglove
+    ".venv/bin/pip install '.[foxglove]'": Shown("an install with extras is made by other tests"),
+    ".venv/bin/acsard foxglove": Elsewhere(
+        FOXGLOVE, "test_a_held_button_drives_and_letting_go_stops"
+    ),
+    "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
+    "acsard foxglove --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
+        "tests/system/test_whoami.py", "test_a_viewer_s_foxglove_is_told_what_he_may"
+    ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
     "make": Elsewhere("tests/firmware/test_board.py", "test_it_boots_stopped_and_says_who_it_is"),

@@ -49,9 +49,8 @@ def at(block: Block) -> str:
 
 
 def test_there_is_a_page_beside_each_thing_it_describes() -> None:
-    beside = {
-        f"deploy/{part}/README.md" for part in ("clients", "firmware", "ros2", "systemd", "zenoh")
-    }
+    parts = ("clients", "firmware", "foxglove", "ros2", "systemd", "zenoh")
+    beside = {f"deploy/{part}/README.md" for part in parts}
     assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
 
 

@@ -47,6 +47,7 @@ VERBS = (
     "hz",
     "top",
     "fleet",
+    "foxglove",
     "drive",
     "call",
     "whoami",

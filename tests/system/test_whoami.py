@@ -26,6 +26,7 @@ from tests.system.harness import (
 )
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
 from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.viewer import Viewer
 
 pytestmark = pytest.mark.network
 
@@ -109,6 +110,27 @@ def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
         pytest.raises(NoAnswerError, match="unlisted is in no role's list"),
     ):
         client.drive(0.3, seconds=1.0)
+
+
+def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
+    may = "your certificate viewer is viewer: it may follow and stop, not drive"
+    port = int(free_endpoint().rpartition(":")[2])
+    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
+    where = robot.daemon.config.parent
+    with Program(acsard(*words, "--tls", robot.own("viewer")), where) as program:
+        program.says("ws://")
+        with Viewer(port) as viewer:
+            viewer.show("/odom").first()
+            send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+            send(b'{"linear": {"x": 0.3}, "angular": {}}')
+            viewer.status(may)
+            assert may in viewer.call("/acsard/clear", {})["message"]
+            viewer.set({"limits.linear_speed": 0.5})
+            viewer.status(f"not set: {may}")
+            assert viewer.call("/acsard/stop", {})["success"]
+    with Bus(robot.plain) as bus:
+        assert bus.get("srv/clear")["success"]
+        assert bus.count("commands") == 0
 
 
 @pytest.mark.slow

@@ -1,0 +1,69 @@
+"""`acsard foxglove`: the robot live in Foxglove and Lichtblick."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+
+from acsard.cli.common import add_bus, robot_address
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+from acsard.messages.text import lines
+
+DEFAULT = "127.0.0.1:8765"
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "foxglove",
+        help="the robot live in Foxglove and Lichtblick",
+        description="Show the robot to Foxglove and Lichtblick (2026 and later) on this machine: "
+        "its topics, services and settings, and a Teleop panel on /cmd_vel drives it as source "
+        "`app`. Open a connection `Foxglove WebSocket` there. Until Ctrl-C.",
+    )
+    parser.add_argument(
+        "--address",
+        default=DEFAULT,
+        metavar="HOST:PORT",
+        help=f"listen here, default {DEFAULT}; this machine only",
+    )
+    parser.add_argument(
+        "--view-only",
+        action="store_true",
+        help="show the topics and take nothing: no commands, services or settings",
+    )
+    add_bus(parser)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Show it until told otherwise."""
+    try:
+        from acsard.foxglove.bridge import Bridge
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE, f"needs the library foxglove-sdk; run: {install('foxglove')}"
+        ) from None
+    from acsard.client import connect
+    from acsard.foxglove.address import loopback
+
+    address = loopback(args.address)
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        bridge = Bridge(robot, robot_id, tls, address, _tell, view_only=args.view_only)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: bridge.end())
+        try:
+            print(
+                f"{robot_id} at ws://{address[0]}:{address[1]}: connect Foxglove there", flush=True
+            )
+            bridge.run()
+        finally:
+            bridge.close()
+    return int(Exit.OK)
+
+
+def _tell(text: str) -> None:
+    print(f"acsard: {lines(text)}", file=sys.stderr, flush=True)

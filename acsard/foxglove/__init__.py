@@ -1,0 +1,1 @@
+"""`acsard foxglove`: the robot live in Foxglove and Lichtblick, a process of its own."""

@@ -1,0 +1,29 @@
+"""Where the viewers connect to: `HOST:PORT`, on this machine only."""
+
+from __future__ import annotations
+
+import ipaddress
+
+from acsard.host.errors import UsageError
+
+DEFAULT = "127.0.0.1:8765"
+"""Where Foxglove and Lichtblick look when they are told nothing else."""
+
+
+def loopback(text: str) -> tuple[str, int]:
+    """Host and port; raises `UsageError` for what is none, or is reached from outside."""
+    host, _, digits = text.rpartition(":")
+    try:
+        address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
+        port = int(digits)
+    except ValueError:
+        raise UsageError(f"{text} is no address: write it like {DEFAULT}") from None
+    if not 0 < port < 65536:
+        raise UsageError(f"{text}: a port is a number from 1 to 65535")
+    if not address.is_loopback:
+        raise UsageError(
+            f"{text} would be reached from the network, and this protocol asks nobody who he is: "
+            f"whoever connects may drive. Listen on {DEFAULT} and, from the other machine, "
+            f"tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
+        )
+    return str(address), port

@@ -1,0 +1,169 @@
+"""A robot live in Foxglove: puts the parts together and goes round, on one thread.
+
+Round: is the daemon there? who looks at what? pass on what came; tell who drives in vain why.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from threading import Event
+
+import foxglove
+import zenoh
+
+from acsard.client import Client
+from acsard.driving import objection
+from acsard.foxglove.drives import Drives
+from acsard.foxglove.facts import Facts, learn
+from acsard.foxglove.notices import Notices
+from acsard.foxglove.objections import Objections
+from acsard.foxglove.relay import Relay
+from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
+from acsard.foxglove.services import services
+from acsard.foxglove.settings import Settings
+from acsard.host import clock
+from acsard.messages.schema import RobotState
+from acsard.messages.topics import full_key
+from acsard.ros.names import full_name
+from acsard.values import NS_PER_S, AcsardError
+
+GATHER_S = 0.015
+"""A screen shows 60 pictures a second: what comes within this goes in one round, which costs a
+third less. Commands do not wait for it."""
+
+ROUND_S = 0.5
+"""A round at least so often."""
+
+ASK_NS = NS_PER_S // 2
+"""Without a state for so long who drives has one asked for: it may be published seldom."""
+
+GONE = "daemon"
+"""The name of the status that the daemon is gone."""
+
+
+class Bridge:
+    """One robot and its viewers."""
+
+    def __init__(
+        self,
+        robot: Client,
+        robot_id: str,
+        tls: str,
+        address: tuple[str, int],
+        tell: Callable[[str], None],
+        *,
+        view_only: bool = False,
+    ) -> None:
+        self._robot, self._id, self._tls = robot, robot_id, tls
+        robot.name += ", a viewer"
+        self._wake, self._ended = Event(), Event()
+        self._notices = Notices(tell, self._wake.set)
+        facts = learn(robot, tls)
+        ros = facts.config.ros
+        self._shown = Shown(self._wake.set)
+        self._settings = Settings(robot, self._notices, facts.tables)
+        topic = full_name(ros.namespace, "cmd_vel")
+        self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
+        context = foxglove.Context()
+        self._relay = Relay(robot, context, self._wake.set)
+        self._relay.offer(facts)
+        logging.getLogger("foxglove").addHandler(Refusals(self._notices))
+        listener = Listener(self._shown, self._drives, self._settings)
+        offered = [] if view_only else services(robot, ros)
+        self._server = start(f"acsard {robot_id}", address, listener, offered, context)
+        self._objections: dict[int, Objections] = {}
+        self._state: RobotState | None = None
+        self._state_ns = clock.mono_ns()
+        self._here = self._was_here = True
+        key = full_key(robot_id, "alive")
+        self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
+
+    def run(self) -> None:
+        """Go round until `end`."""
+        while not self._ended.is_set():
+            self._wake.wait(ROUND_S)
+            time.sleep(GATHER_S)
+            self._wake.clear()
+            self._round()
+
+    def end(self) -> None:
+        """Have `run` return; may be called by a signal."""
+        self._ended.set()
+        self._wake.set()
+
+    def close(self) -> None:
+        """The robot is let go of, then the viewers are."""
+        self._drives.end()
+        self._server.stop()
+
+    def _viewer(self, client: int) -> Client:
+        """The robot as one of the viewers commands it."""
+        robot = self._robot.like(self._id)
+        robot.sender = f"{self._robot.sender}/{client}"
+        return robot
+
+    def _alive(self, sample: zenoh.Sample) -> None:
+        self._here = sample.kind == zenoh.SampleKind.PUT
+        self._wake.set()
+
+    def _round(self) -> None:
+        here = self._here
+        if here != self._was_here and (self._came_back() if here else self._went()):
+            self._was_here = here
+        driving = self._drives.driving()
+        shown, fresh = self._shown.take()
+        self._relay.follow(shown, fresh, state=bool(driving))
+        state = self._relay.pass_on()
+        if state is not None:
+            self._state, self._state_ns = state, clock.mono_ns()
+        self._object(driving)
+        if here and (news := self._settings.refresh()):
+            self._server.publish_parameter_values(as_parameters(news))
+        self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
+
+    def _went(self) -> bool:
+        self._state = None
+        words = f"the daemon of {self._id} is gone: it is waited for"
+        self._notices.say("error", "daemon", words, stays=GONE)
+        return True
+
+    def _came_back(self) -> bool:
+        """It may be another, with other sources and settings; False when it cannot be asked yet."""
+        try:
+            facts = learn(self._robot, self._tls)
+        except AcsardError as error:
+            self._notices.say("error", "daemon", str(error), stays=GONE)
+            return False
+        self._learn(facts)
+        self._notices.over(GONE)
+        self._notices.say("info", "daemon", f"the daemon of {self._id} is back")
+        return True
+
+    def _learn(self, facts: Facts) -> None:
+        self._relay.offer(facts)
+        self._drives.forbidden = facts.forbidden
+        self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
+
+    def _object(self, driving: dict[int, Client]) -> None:
+        """Tell each who drives in vain why, once, and take it back when it is over."""
+        now_ns = clock.mono_ns()
+        if driving and now_ns - self._state_ns > ASK_NS:
+            self._state_ns = now_ns
+            self._relay.ask_state()
+        for client in driving.keys() - self._objections.keys():
+            self._objections[client] = Objections()
+        for client, told in list(self._objections.items()):
+            robot, why = driving.get(client), ""
+            if robot is not None and self._state is not None:
+                why = objection(self._state, robot.source, robot.sender)
+            if told.look(why, now_ns):
+                stays = f"drive {client}"
+                if told.told:
+                    words = f"your commands do not drive: {told.told}"
+                    self._notices.say("warning", "drive", words, stays=stays)
+                else:
+                    self._notices.over(stays)
+            if robot is None:
+                del self._objections[client]

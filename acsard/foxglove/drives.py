@@ -1,0 +1,159 @@
+"""Driving by a viewer's panel: each viewer is a sender of its own, and goes by the daemon's rules.
+
+The server's threads hand over what came (`hand.py` keeps the newest); a thread of ours sends it,
+so that none of them waits for the bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Condition, Thread
+
+from acsard.client import Client
+from acsard.foxglove.hand import Hand
+from acsard.foxglove.notices import Notices
+from acsard.foxglove.twists import encoding_of, twist
+from acsard.host import clock
+from acsard.messages.encodings import DecodeError
+from acsard.values import NS_PER_S, REST, Twist
+
+CHANNELS = 64
+"""That one viewer may publish on."""
+
+END_S = 0.5
+"""The zeros at the end take some ms."""
+
+TOO_SLOW = (
+    "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 Hz "
+    "or more"
+)
+
+
+class _Viewer:
+    """One of them, with its name as a sender."""
+
+    def __init__(self, robot: Client) -> None:
+        self.robot, self.hand = robot, Hand()
+        self.channels: dict[int, tuple[str, str]] = {}
+        """For each on which it publishes the Encoding, or why that drives nothing."""
+
+
+class Drives:
+    """All viewers that publish."""
+
+    def __init__(
+        self, robot_of: Callable[[int], Client], topic: str, notices: Notices, forbidden: str
+    ) -> None:
+        self.topic, self.forbidden = topic, forbidden
+        self._robot_of, self._notices = robot_of, notices
+        self._viewers: dict[int, _Viewer] = {}
+        self._parting: list[Client] = []
+        self._news = Condition()
+        self._ended = False
+        self._thread = Thread(target=self._run, name="drives", daemon=True)
+        self._thread.start()
+
+    # the server's threads
+
+    def advertised(
+        self, client: int, channel: int, topic: str, encoding: str, schema_name: str
+    ) -> None:
+        """A viewer will publish; what drives nothing is told when it does."""
+        found, problem = "", ""
+        if topic != self.topic:
+            problem = f"nothing listens on {topic}: drive on {self.topic}"
+        else:
+            try:
+                found = encoding_of(encoding, schema_name)
+            except DecodeError as error:
+                problem = f"{topic}: {error}"
+        with self._news:
+            viewer = self._viewers.get(client)
+            if viewer is None:
+                viewer = self._viewers[client] = _Viewer(self._robot_of(client))
+            if len(viewer.channels) < CHANNELS:
+                viewer.channels[channel] = found, problem
+
+    def came(self, client: int, channel: int, data: bytes) -> None:
+        """A viewer has published."""
+        now_ns = clock.mono_ns()
+        viewer = self._viewers.get(client)
+        encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
+        if viewer is None or not encoding:
+            if problem:
+                self._notices.say("warning", "drive", problem)
+            return
+        if self.forbidden:
+            self._notices.say("error", "drive", self.forbidden)
+            return
+        try:
+            wish = twist(encoding, data)
+        except DecodeError as error:
+            self._notices.say("warning", "drive", f"{self.topic}: refused: {error}")
+            return
+        with self._news:
+            viewer.hand.take(wish, now_ns)
+            self._news.notify()
+        if viewer.hand.is_slow():
+            self._notices.say("warning", "drive", TOO_SLOW)
+
+    def withdrawn(self, client: int, channel: int) -> None:
+        """A viewer publishes no more there, or has left."""
+        with self._news:
+            viewer = self._viewers.get(client)
+            if viewer is None:
+                return
+            encoding, _ = viewer.channels.pop(channel, ("", ""))
+            if encoding and viewer.hand.end(clock.mono_ns()) is not None:
+                self._parting.append(viewer.robot)
+            if not viewer.channels:
+                del self._viewers[client]
+            self._news.notify()
+
+    # the main thread
+
+    def driving(self) -> dict[int, Client]:
+        """Who asks for a speed just now."""
+        now_ns = clock.mono_ns()
+        with self._news:
+            viewers = self._viewers.items()
+            return {one: viewer.robot for one, viewer in viewers if viewer.hand.drives(now_ns)}
+
+    def end(self) -> None:
+        """A zero for everybody who drives, then silence."""
+        with self._news:
+            for viewer in self._viewers.values():
+                if viewer.hand.end(clock.mono_ns()) is not None:
+                    self._parting.append(viewer.robot)
+            self._viewers.clear()
+            self._ended = True
+            self._news.notify()
+        self._thread.join(END_S)
+
+    # ours
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                while not (due := self._due()) and not self._ended:
+                    self._news.wait(self._left())
+            for robot, wish in due:
+                robot.send(wish.linear, wish.angular)
+            if self._ended and not due:
+                return
+
+    def _due(self) -> list[tuple[Client, Twist]]:
+        now_ns = clock.mono_ns()
+        due = [(robot, REST) for robot in self._parting]
+        self._parting.clear()
+        for viewer in self._viewers.values():
+            wish = viewer.hand.send(now_ns)
+            if wish is not None:
+                due.append((viewer.robot, wish))
+        return due
+
+    def _left(self) -> float | None:
+        """How long until something is due, s; None for nothing."""
+        times = [viewer.hand.due_ns() for viewer in self._viewers.values()]
+        known = [one for one in times if one is not None]
+        return max(0.0, (min(known) - clock.mono_ns()) / NS_PER_S) if known else None

@@ -1,0 +1,154 @@
+"""The websocket server of foxglove-sdk: what its threads call, and how it is started.
+
+The protocol is the library's. It asks nobody who he is: `address.py`.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from collections.abc import Callable
+from threading import Lock
+
+import foxglove
+from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, WebSocketServer
+
+from acsard.foxglove.drives import Drives
+from acsard.foxglove.notices import Notices
+from acsard.foxglove.settings import Settings
+from acsard.host.errors import InUseError, NotPermittedError
+
+BACKLOG = 256
+"""Messages held for one slow viewer: the oldest are dropped beyond that."""
+
+REFUSED = (
+    "a viewer was turned away: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does "
+    "not), or is none"
+)
+
+
+class Shown:
+    """Who looks at which topic."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
+        self._lock = Lock()
+        self._viewers: dict[str, set[int]] = {}
+        self._fresh: set[str] = set()
+
+    def add(self, topic: str, client: int) -> None:
+        """A viewer begins to look."""
+        with self._lock:
+            self._viewers.setdefault(topic, set()).add(client)
+            self._fresh.add(topic)
+        self._wake()
+
+    def remove(self, topic: str, client: int) -> None:
+        """A viewer looks no more."""
+        with self._lock:
+            left = self._viewers.get(topic, set())
+            left.discard(client)
+            if not left:
+                self._viewers.pop(topic, None)
+        self._wake()
+
+    def take(self) -> tuple[set[str], set[str]]:
+        """The topics that are shown, and those that somebody began to look at since the last."""
+        with self._lock:
+            fresh, self._fresh = self._fresh, set()
+            return set(self._viewers), fresh
+
+
+class Listener:
+    """What the server calls, on threads of its own."""
+
+    def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
+        self._shown, self._drives, self._settings = shown, drives, settings
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        self._shown.add(channel.topic, client.id)
+
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
+        self._shown.remove(channel.topic, client.id)
+
+    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
+        self._drives.advertised(
+            client.id, channel.id, channel.topic, channel.encoding, channel.schema_name
+        )
+
+    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
+        self._drives.withdrawn(client.id, client_channel_id)
+
+    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
+        self._drives.came(client.id, client_channel_id, data)
+
+    def on_get_parameters(
+        self, client: Client, param_names: list[str], request_id: str | None = None
+    ) -> list[foxglove.Parameter]:
+        return as_parameters(self._settings.get(param_names))
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[foxglove.Parameter], request_id: str | None = None
+    ) -> list[foxglove.Parameter]:
+        wishes = {one.name: one.get_value() for one in parameters}
+        return as_parameters(self._settings.set(wishes))
+
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:
+        self._settings.follow(followed=True)
+
+    def on_parameters_unsubscribe(self, param_names: list[str]) -> None:
+        self._settings.follow(followed=False)
+
+
+def as_parameters(values: dict[str, foxglove.AnyNativeParameterValue]) -> list[foxglove.Parameter]:
+    """Settings as the protocol has them."""
+    return [foxglove.Parameter(key, value=value) for key, value in values.items()]
+
+
+def start(
+    name: str,
+    address: tuple[str, int],
+    listener: Listener,
+    services: list[foxglove.Service],
+    context: foxglove.Context,
+) -> WebSocketServer:
+    """Listen; without services for viewers only. Raises `InUseError` when the port is taken,
+    `NotPermittedError` when it is root's."""
+    host, port = address
+    takes = [Capability.ClientPublish, Capability.Parameters, Capability.Services]
+    try:
+        return foxglove.start_server(
+            name=name,
+            host=host,
+            port=port,
+            capabilities=takes if services else [],
+            server_listener=listener,  # type: ignore[arg-type]  # it has all but playback
+            supported_encodings=["json", "cdr"],
+            services=services,
+            context=context,
+            message_backlog_size=BACKLOG,
+        )
+    except RuntimeError as error:
+        another = f"--address {host}:{max(1024, port % 65535 + 1)}"
+        if os.strerror(errno.EACCES) in str(error):
+            raise NotPermittedError(
+                f"you may not listen on {host}:{port}; take a port above 1023: {another}"
+            ) from None
+        raise InUseError(
+            f"cannot listen on {host}:{port}: {error}; stop who does (another acsard foxglove, or "
+            f"foxglove_bridge?), or give this one another port: {another}"
+        ) from None
+
+
+class Refusals(logging.Handler):
+    """What the library logs: whom it turned away is told, who just left is not."""
+
+    def __init__(self, notices: Notices) -> None:
+        super().__init__(logging.ERROR)
+        self._notices = notices
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take a line of its log."""
+        if "handshake failed" in record.getMessage():
+            self._notices.say("warning", "refused", REFUSED)

@@ -1,0 +1,66 @@
+"""The robot's services as a viewer calls them: JSON, answered in the daemon's words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import foxglove
+import msgspec
+
+from acsard.client import Client
+from acsard.config.settings import RosConfig
+from acsard.messages.encodings import DecodeError, Decoder, encode
+from acsard.messages.json_schema import SCHEMAS
+from acsard.messages.schema import ServiceReply, SetPose
+from acsard.messages.topics import SERVICES
+from acsard.ros.names import full_name
+from acsard.values import AcsardError
+
+CALLED = tuple(verb for verb in SERVICES if verb != "set")
+"""`set` is what parameters are for."""
+
+NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
+
+_poses = Decoder(SetPose)
+
+
+def services(robot: Client, ros: RosConfig) -> list[foxglove.Service]:
+    """All of them, called as in ROS: `/acsard/stop`."""
+    return [
+        _service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in CALLED
+    ]
+
+
+def _service(robot: Client, verb: str, name: str) -> foxglove.Service:
+    posed = verb == "set_pose"
+
+    def answer(request: foxglove.ServiceRequest) -> bytes:
+        return encode(called(robot, verb, request.payload), "json")
+
+    schema = foxglove.ServiceSchema(
+        "acsard/srv/SetPose" if posed else "std_srvs/srv/Trigger",
+        request=_schema(SCHEMAS["SetPose"] if posed else NOTHING),
+        response=_schema(SCHEMAS["ServiceReply"]),
+    )
+    return foxglove.Service(name, schema=schema, handler=answer)
+
+
+def called(robot: Client, verb: str, payload: bytes) -> ServiceReply:
+    """Call it; whatever keeps the daemon from answering is the answer."""
+    try:
+        fields: dict[str, float] = {}
+        if verb == "set_pose":
+            fields = msgspec.structs.asdict(_poses.decode("application/json", payload))
+        return robot.call(verb, **fields)
+    except DecodeError as error:
+        return ServiceReply(False, f"{verb} wants {{x, y, yaw}}, m and rad: {error}")
+    except AcsardError as error:
+        return ServiceReply(False, str(error))
+
+
+def _schema(schema: dict[str, Any]) -> foxglove.MessageSchema:
+    data = msgspec.json.encode(schema)
+    return foxglove.MessageSchema(
+        encoding="json",
+        schema=foxglove.Schema(name=schema["title"], encoding="jsonschema", data=data),
+    )

@@ -1,0 +1,38 @@
+"""What a viewer publishes -> a twist, or why it is none; pure.
+
+Decoded as the daemon decodes commands, by its rules: refused whole, with the reason.
+"""
+
+from __future__ import annotations
+
+from acsard.config.settings import DriveConfig, JointsConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
+from acsard.messages.encodings import DecodeError, encoding_name
+from acsard.values import Command, Twist
+
+_receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+"""For twists alone, of which neither joints nor wheels are asked."""
+
+
+def encoding_of(encoding: str, schema_name: str) -> str:
+    """The Encoding of what a viewer will publish; raises `DecodeError` for what drives nothing."""
+    package, _, name = schema_name.partition("/")
+    full = f"{package}/msg/{name.removeprefix('msg/')}"
+    if full not in (TWISTS[0], STAMPED_TWISTS[0]):
+        raise DecodeError("wrong_type", f"{schema_name or 'no type'} where {TWISTS[0]} is wanted")
+    if encoding == "cdr":
+        return f"{encoding_name('cdr')};{full}"
+    if encoding == "json":
+        return encoding_name("json")
+    raise DecodeError("unknown_encoding", f"{encoding} where json or cdr is wanted")
+
+
+def command(key: str, encoding: str, payload: bytes, arrived_ns: int) -> Command:
+    """The command in a payload on `cmd/<source>`; raises `DecodeError`."""
+    return _receiver.command(Arrival(key, True, payload, encoding, arrived_ns, None, ""))
+
+
+def twist(encoding: str, payload: bytes) -> Twist:
+    """The twist in what a viewer published; raises `DecodeError`."""
+    return command("cmd/app", encoding, payload, 0).twist

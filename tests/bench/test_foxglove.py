@@ -1,0 +1,76 @@
+"""What a viewer of all topics costs: `acsard foxglove`, and the daemon.
+
+pytest -s -m bench tests/bench/test_foxglove.py
+
+Processor time by the kernel's own account; with and without a viewer take turns beside one daemon.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import pytest
+
+from tests.system.harness import Bus, Daemon, Periods, cpu_seconds, waited_for_a_core
+from tests.system.test_foxglove import Shows
+from tests.system.viewer import Viewer
+
+pytestmark = pytest.mark.bench
+
+ROUNDS, SPAN_S = 5, 3.0
+
+
+class Cost(NamedTuple):
+    """Of a span: % of a core, and what became of the daemon's periods."""
+
+    bridge: float
+    daemon: float
+    periods: Periods
+    waited_s: float
+    """The control loop, ready and without a core."""
+
+
+def cost(daemon: Daemon, bridge: Shows, bus: Bus) -> Cost:
+    """What the next span takes."""
+    pids = bridge.pid, daemon.pid
+    first, before = bus.state(), [cpu_seconds(pid) for pid in pids]
+    waited = waited_for_a_core(daemon.pid)
+    begun = time.monotonic()
+    time.sleep(SPAN_S)
+    span = time.monotonic() - begun
+    used = [100 * (cpu_seconds(pid) - b) / span for pid, b in zip(pids, before, strict=True)]
+    waited = waited_for_a_core(daemon.pid) - waited
+    return Cost(used[0], used[1], Periods.between(first, bus.state()), waited)
+
+
+def test_a_viewer_of_all_topics(tmp_path: Path) -> None:
+    alone, watched, messages = [], [], 0
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, Shows(daemon) as bridge:
+        bus.linked()
+        for _ in range(ROUNDS):
+            alone.append(cost(daemon, bridge, bus))
+            with Viewer(bridge.port) as viewer:
+                looked = [viewer.show(topic) for topic in viewer.channels]
+                next(one for one in looked if one.channel["topic"] == "/odom").first(10)
+                before = sum(len(one.came) for one in looked)
+                watched.append(cost(daemon, bridge, bus))
+                messages += sum(len(one.came) for one in looked) - before
+    rate = messages / ROUNDS / SPAN_S
+    bridge_s = sum(one.bridge for one in watched) / 100 * SPAN_S
+    print(f"\n{rate:.0f} messages a second, {1e6 * bridge_s / messages:.0f} us each, all told")
+    for name, costs in (("no viewer", alone), ("a viewer", watched)):
+        missed = sum(one.periods.missed for one in costs)
+        print(
+            f"{name}: acsard foxglove {median(one.bridge for one in costs):.1f} % of a core, "
+            f"daemon {median(one.daemon for one in costs):.1f} %, missed periods {missed} of "
+            f"{sum(one.periods.elapsed for one in costs):.0f}, "
+            f"loop without a core {sum(one.waited_s for one in costs) * 1000:.0f} ms"
+        )
+    assert rate > 0.9 * 4 * 100
+    assert median(one.bridge for one in alone) < 0.2 * median(one.bridge for one in watched)
+    # Each period that was missed is one in which the machine had no core for the loop.
+    missed, waited = sum(one.periods.missed for one in watched), sum(o.waited_s for o in watched)
+    assert missed <= sum(one.periods.missed for one in alone) + 2 + waited / 0.01

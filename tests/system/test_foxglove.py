@@ -1,0 +1,496 @@
+"""`acsard foxglove` as a viewer has it: a client of its protocol that knows nothing of acsard."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Twist, Vector3
+from tests.system.bystander import lost
+from tests.system.harness import (
+    ZERO,
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    cpu_seconds,
+    finish,
+    free_endpoint,
+    read,
+    until,
+)
+from tests.system.viewer import Looked, Viewer, opened
+
+SLOW = pytest.mark.slow
+
+TOPICS = {
+    "/odom": ("nav_msgs/msg/Odometry", "odom"),
+    "/tf": ("tf2_msgs/msg/TFMessage", "tf"),
+    "/tf_static": ("tf2_msgs/msg/TFMessage", "tf_static"),
+    "/joint_states": ("sensor_msgs/msg/JointState", "wheel_states"),
+    "/cmd_vel_out": ("geometry_msgs/msg/TwistStamped", "cmd_vel_out"),
+    "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "diagnostics"),
+    "/state": ("acsard/msg/RobotState", "state"),
+    "/log": ("rcl_interfaces/msg/Log", "events"),
+} | {
+    f"/cmd_vel_in/{source}": ("geometry_msgs/msg/TwistStamped", f"cmd/{source}")
+    for source in ("teleop", "app", "ros2_control", "nav")
+}
+"""ROS type, and the key on the bus that says the same."""
+
+OURS = {"header": "stamp", "sources": "sources", "counters": "counters"}
+"""The fields of `state` that are shaped otherwise on the bus."""
+
+
+def free_port() -> int:
+    """A port of this machine nobody listens on."""
+    return int(free_endpoint().rpartition(":")[2])
+
+
+class Shows(Program):
+    """`acsard foxglove` on a port of its own, ready when entered."""
+
+    def __init__(self, daemon: Daemon, *words: str) -> None:
+        self.port = free_port()
+        where = ("--config", str(daemon.config), "--address", f"127.0.0.1:{self.port}")
+        super().__init__(acsard("foxglove", *where, *words), daemon.config.parent)
+
+    def __enter__(self) -> Shows:
+        super().__enter__()
+        try:
+            self.says("ws://")
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+
+@pytest.fixture(scope="module")
+def shows(shared: Daemon) -> Iterator[Shows]:
+    with Shows(shared) as program:
+        yield program
+
+
+@pytest.fixture
+def viewer(shows: Shows, bus: Bus) -> Iterator[Viewer]:
+    with Viewer(shows.port) as viewer:
+        yield viewer
+    bus.at_rest()
+
+
+def speed(linear: float, angular: float = 0.0) -> bytes:
+    """What the Teleop panels of Foxglove and Lichtblick publish in JSON."""
+    axes = {"x": 0, "y": 0, "z": 0}
+    return json.dumps({"linear": axes | {"x": linear}, "angular": axes | {"z": angular}}).encode()
+
+
+class Panel:
+    """A button that is held: 20 messages a second."""
+
+    def __init__(self, viewer: Viewer, data: bytes, encoding: str = "json") -> None:
+        self._send, self.channel = viewer.publish_on("/cmd_vel", encoding, "geometry_msgs/Twist")
+        self._data = data
+        self._released = threading.Event()
+        self._thread = threading.Thread(target=self._hold, daemon=True)
+
+    def __enter__(self) -> Panel:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        self._released.set()
+        self._thread.join()
+
+    def _hold(self) -> None:
+        while not self._released.wait(0.05):
+            try:
+                self._send(self._data)
+            except Exception:  # noqa: BLE001 - whatever a cut connection raises
+                return
+
+
+def driving(bus: Bus, faster_than: float = 0.2) -> Any:
+    """The state once the robot drives so fast."""
+
+    def look() -> Any:
+        state = bus.state()
+        return state if state["mode"] == "driving" and state["linear"] > faster_than else None
+
+    return until(look, 10.0, f"driving, {bus.state()['reason']}")
+
+
+def same(told: Any, value: Any) -> bool:
+    """A message of ROS as rosbags decodes it holds the same as one of the bus."""
+    if isinstance(value, Mapping):
+        return all(same(getattr(told, key), inner) for key, inner in value.items())
+    if isinstance(value, list):
+        return len(told) == len(value) and all(map(same, told, value))
+    return bool(told == value)
+
+
+# what is shown
+
+
+@pytest.mark.parametrize(
+    ("topic", "count"),
+    [
+        ("/odom", 4),
+        pytest.param("/tf", 4, marks=SLOW),
+        pytest.param("/joint_states", 4, marks=SLOW),
+        pytest.param("/cmd_vel_out", 4, marks=SLOW),
+        pytest.param("/diagnostics", 2, marks=SLOW),
+    ],
+)
+def test_a_topic_shows_what_was_on_the_bus_at_the_time(
+    viewer: Viewer, bus: Bus, topic: str, count: int
+) -> None:
+    type_name, key = TOPICS[topic]
+    with bus.follow(key) as on_bus:
+        looked = viewer.show(topic)
+        assert looked.channel["schemaName"] == type_name
+        messages = [looked.read(one.payload) for one in looked.first(count, 10.0)]
+
+        def found() -> int:
+            seen = [one.value for one in list(on_bus.seen)]
+            return sum(any(same(message, value) for value in seen) for message in messages)
+
+        # One was asked for, so that who looks need not wait: that is in no publication.
+        until(lambda: found() >= count - 1, 5.0, f"{messages} on {key}")
+
+
+def test_the_state_shows_what_was_on_the_bus_at_the_time(viewer: Viewer, bus: Bus) -> None:
+    with bus.follow("state") as on_bus:
+        looked = viewer.show("/state")
+        told = looked.read(looked.first(3)[-1].payload)
+        seen = on_bus.find(lambda v: same(told.header.stamp, v["stamp"]), 5.0, "that state")
+    shown = {name: value for name, value in seen.value.items() if hasattr(told, name)}
+    assert set(shown) >= {"mode", "reason", "x", "y", "yaw", "wheels", "link", "source", "gyro"}
+    assert all(same(getattr(told, k), v) for k, v in shown.items() if k not in OURS.values())
+    assert {one.name: one.count for one in told.counters} == seen.value["counters"]
+    assert [one.name for one in told.sources] == [one["name"] for one in seen.value["sources"]]
+
+
+def test_it_has_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
+    until(lambda: set(viewer.channels) >= set(TOPICS), 5.0, "all topics")
+    types = {topic: one["schemaName"] for topic, one in viewer.channels.items()}
+    assert types == {topic: type_name for topic, (type_name, _) in TOPICS.items()}
+
+
+def test_who_comes_late_gets_tf_static_and_the_last_state(
+    viewer: Viewer, shows: Shows, bus: Bus
+) -> None:
+    first = viewer.show("/tf_static").first()[0]
+    with bus.follow("tf_static") as published:
+        for _ in range(4):
+            with Viewer(shows.port) as late:
+                assert late.show("/tf_static").first()[0].payload == first.payload
+        late_ones = len(published.seen)
+    # It is published once in 5 s: none of them has waited for that.
+    assert late_ones < 4
+    viewer.show("/diagnostics").first()
+
+
+def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
+    looked = viewer.show("/cmd_vel_in/nav")
+    # Nothing tells when a subscription has reached the daemon: a zero moves nobody.
+
+    def put() -> bool:
+        bus.put("cmd/nav", ZERO)
+        return bool(looked.came)
+
+    until(put, 5.0, "a command")
+    told = looked.read(looked.came[0].payload)
+    assert (told.twist.linear.x, told.twist.angular.z) == (0.0, 0.0)
+    assert told.header.stamp.sec > 0
+
+
+def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -> None:
+    looked = viewer.show("/log")
+    looked.first()
+    assert bus.get("srv/stop")["success"]
+    assert bus.get("srv/clear")["success"]
+    until(lambda: any("stopped by request" in line for line in lines(looked)), 5.0, "the stop")
+    events = bus.get("events")["events"]
+    told = [(event["name"], event["text"].partition(" (")[0]) for event in events]
+
+    def all_of_them() -> bool:
+        messages = [looked.read(one.payload) for one in list(looked.came)]
+        found = [(m.name, m.msg.partition(" (")[0]) for m in messages]
+        # More may have happened since: a busy machine keeps a link waiting.
+        return any(found[at : at + len(told)] == told for at in range(len(found)))
+
+    until(all_of_them, 5.0, f"{told} in {lines(looked)}")
+    payloads = [one.payload for one in looked.came]
+    assert len(payloads) == len(set(payloads))
+
+
+def lines(log: Looked) -> list[str]:
+    return [log.read(one.payload).msg for one in list(log.came)]
+
+
+def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) -> None:
+    # A publisher of a name is told whether anybody listens.
+    publisher: Any = bus.session.declare_publisher(f"{bus.root}/tf")
+
+    def listened() -> bool:
+        return bool(publisher.matching_status.matching)
+
+    until(lambda: not listened(), 5.0, "nobody listens at first")
+    looked = viewer.show("/tf")
+    until(listened, 5.0, "somebody listens")
+    looked.hide()
+    until(lambda: not listened(), 5.0, "nobody listens any more")
+    publisher.undeclare()
+
+
+@SLOW
+def test_view_only_it_shows_and_takes_nothing(shared: Daemon, bus: Bus) -> None:
+    with Shows(shared, "--view-only") as own, Viewer(own.port, services=False) as viewer:
+        assert viewer.info["capabilities"] == []
+        looked = viewer.show("/odom")
+        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+        before = bus.count("commands")
+        send(speed(0.3))
+        looked.first(len(looked.came) + 20)
+        assert (viewer.services, bus.count("commands")) == ({}, before)
+
+
+@SLOW
+def test_an_older_viewer_is_turned_away_and_the_terminal_says_why(shows: Shows, bus: Bus) -> None:
+    with pytest.raises(InvalidStatus):
+        Viewer(shows.port, "foxglove.websocket.v1")
+    until(lambda: "Lichtblick before 2026 does not" in shows.stderr, 5.0, shows.stderr)
+
+
+# services and parameters
+
+
+def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None:
+    assert viewer.call("/acsard/stop", {})["message"].startswith("stopped and latched")
+    assert bus.state()["mode"] == "stopped"
+    assert viewer.call("/acsard/clear", {})["success"]
+    assert viewer.call("/acsard/set_pose", {"x": 1.0, "y": 2.0, "yaw": 0.0})["success"]
+    assert bus.state()["y"] == 2.0
+    refused = viewer.call("/acsard/set_pose", {"x": "here"})
+    assert not refused["success"]
+    assert "set_pose wants {x, y, yaw}" in refused["message"]
+    assert viewer.call("/acsard/deactivate", {})["success"]
+    assert bus.state()["mode"] == "inactive"
+    assert viewer.call("/acsard/activate", {})["success"]
+    assert viewer.call("/acsard/reset_odometry", {})["success"]
+    assert bus.state()["y"] == 0.0
+
+
+def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bus: Bus) -> None:
+    assert viewer.get()["limits.linear_speed"] == 1.0
+    assert viewer.set({"limits.linear_speed": 2}) == {"limits.linear_speed": 2.0}
+    assert bus.get("config")["limits"]["linear_speed"] == 2.0
+    # As it is, so that the panel shows it again.
+    assert viewer.set({"limits.linear_speed": 99}) == {"limits.linear_speed": 2.0}
+    assert "a number from 0 to 10 m/s" in viewer.status("not set: limits.linear_speed")["message"]
+    viewer.set({"drive.wheel_radius": 1.0})
+    viewer.status("takes a start")
+    bus.get("srv/set", {"settings": {"limits.linear_speed": 1.0}})
+    until(lambda: viewer.get()["limits.linear_speed"] == 1.0, 5.0, "what another has set")
+
+
+# driving
+
+
+@pytest.mark.parametrize("encoding", ["json", pytest.param("cdr", marks=SLOW)])
+def test_a_held_button_drives_and_letting_go_stops(viewer: Viewer, bus: Bus, encoding: str) -> None:
+    twist = Twist(Vector3(x=0.4), Vector3())
+    data = speed(0.4) if encoding == "json" else encode(twist, "cdr")
+    before = bus.state()["x"]
+    with Panel(viewer, data, encoding):
+        state = driving(bus)
+        assert state["source"] == "app"
+        until(lambda: bus.state()["x"] > before + 0.3, 10.0, "0.3 m")
+    assert bus.at_rest()["x"] > before + 0.3
+
+
+@SLOW
+def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: Bus) -> None:
+    with Panel(viewer, speed(0.2)):
+        first = driving(bus, 0.1)["sender"]
+        with Viewer(shows.port) as other, Panel(other, speed(-0.2)):
+            other.status(f"your commands do not drive: another program drives as app, {first}")
+            assert bus.state()["linear"] > 0.0
+    bus.at_rest()
+    with Viewer(shows.port) as other, Panel(other, speed(0.2)):
+        assert driving(bus, 0.1)["sender"] != first
+
+
+@SLOW
+def test_who_drives_in_vain_is_told_why_until_it_is_over(viewer: Viewer, bus: Bus) -> None:
+    bus.get("srv/stop")
+    with Panel(viewer, speed(0.2)):
+        told = viewer.status("your commands do not drive: stopped by request")
+        assert bus.get("srv/clear")["success"]
+    until(lambda: told["id"] in viewer.removed, 5.0, "it is over")
+
+
+@SLOW
+def test_what_is_no_command_is_told(viewer: Viewer) -> None:
+    send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+    send(b'{"linear": {"x": 1}}')
+    viewer.status("refused: needs both `linear` and `angular`")
+    send, _ = viewer.publish_on("/initialpose", "json", "geometry_msgs/Twist")
+    send(speed(1.0))
+    viewer.status("nothing listens on /initialpose: drive on /cmd_vel")
+
+
+@SLOW
+def test_who_publishes_too_seldom_is_told(viewer: Viewer) -> None:
+    send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+    until_told = time.monotonic() + 30.0
+    while not viewer.statuses and time.monotonic() < until_told:
+        send(speed(0.0))
+        time.sleep(0.5)
+    viewer.status("set its publish rate to 10 Hz or more")
+
+
+@SLOW
+def test_a_viewer_that_reads_nothing_or_floods_holds_up_nobody(
+    viewer: Viewer, shows: Shows, bus: Bus
+) -> None:
+    looked = viewer.show("/odom")
+    everything = [one["id"] for one in viewer.channels.values()]
+    with opened(shows.port) as mute, bus.follow("cmd/app") as commands:
+        asked = [{"id": number, "channelId": one} for number, one in enumerate(everything)]
+        mute.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        looked.first(len(looked.came) + 50)
+        flood = 5000
+        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+        for _ in range(flood):
+            send(speed(0.0))
+        looked.first(len(looked.came) + 50)
+        # The newest goes, no faster than the bus takes them; what was in between does not.
+        assert 0 < len(commands.seen) < flood / 5
+
+
+@contextmanager
+def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
+    """What is commanded and what is applied, each with its time by our clock."""
+    asked: list[Any] = []
+    applied: list[Any] = []
+
+    def keep(key: str, kept: list[Any]) -> Any:
+        def take(sample: Any) -> None:
+            kept.append((time.monotonic(), read(sample)["twist"]["linear"]["x"]))
+
+        return bus.session.declare_subscriber(f"{bus.root}/{key}", take)
+
+    subscribers = [keep("cmd/app", asked), keep("cmd_vel_out", applied)]
+    bus.ask("info")
+    try:
+        yield asked, applied
+    finally:
+        for one in subscribers:
+            one.undeclare()
+
+
+TIMEOUT_S, TICKS_S = 0.25, 0.02
+
+
+@SLOW
+@pytest.mark.parametrize("how", ["cut", "withdrawn", "killed", "left"])
+def test_whoever_is_gone_while_driving_leaves_a_robot_that_ramps_down(
+    shared: Daemon, bus: Bus, how: str
+) -> None:
+    with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, applied):
+        with Panel(viewer, speed(0.4)) as panel:
+            driving(bus, 0.35)
+            begun = time.monotonic()
+            if how == "cut":
+                viewer.cut()
+            elif how == "withdrawn":
+                panel.release()
+                viewer.withdraw(panel.channel)
+            elif how == "killed":
+                own.signal(signal.SIGKILL)
+            else:
+                own.signal(signal.SIGINT)
+                assert own.ended(1.0) == 0
+        bus.at_rest()
+        last = max(at for at, linear in asked if linear > 0)
+        slower = next(at for at, linear in applied if at > last and linear < 0.39)
+        assert slower - last < TIMEOUT_S + TICKS_S + lost(begun)
+        zeros = [at for at, linear in asked if at > last and linear == 0]
+        # Killed, it can send none: the source's timeout does it.
+        assert len(zeros) == (0 if how == "killed" else 1)
+
+
+@SLOW
+def test_what_a_process_that_stood_has_held_back_moves_nobody(shared: Daemon, bus: Bus) -> None:
+    with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, _):
+        with Panel(viewer, speed(0.4)):
+            driving(bus, 0.3)
+            own.signal(signal.SIGSTOP)
+            bus.at_rest()
+        stood = len(asked)
+        own.signal(signal.SIGCONT)
+        viewer.show("/odom").first()
+        assert [linear for _, linear in asked[stood:] if linear] == []
+
+
+# the daemon, the port, the end
+
+
+@SLOW
+def test_a_daemon_that_is_gone_is_told_and_waited_for(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    daemon = Daemon(tmp_path, endpoint=endpoint)
+    with daemon, Shows(daemon) as own, Viewer(own.port) as viewer:
+        looked = viewer.show("/odom")
+        looked.first()
+        daemon.signal(signal.SIGKILL)
+        gone = viewer.status("the daemon of acsar is gone: it is waited for")
+        with Viewer(own.port) as late:
+            late.show("/odom")
+            late.status("is gone")
+        assert not viewer.call("/acsard/stop", {})["success"]
+        with Daemon(tmp_path, endpoint=endpoint, name="again"):
+            viewer.status("the daemon of acsar is back", 10.0)
+            until(lambda: gone["id"] in viewer.removed, 5.0, "it is not gone any more")
+            count = len(looked.came)
+            until(lambda: len(looked.came) > count + 10, 10.0, "odometry again")
+            assert viewer.call("/acsard/stop", {})["success"]
+
+
+@SLOW
+def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        words = ("foxglove", "--config", str(shared.config), "--address", address)
+        ended = finish(acsard(*words), tmp_path)
+    assert ended.code == 75
+    assert f"cannot listen on {address}: " in ended.err
+    assert "Address already in use" in ended.err
+    assert "--address 127.0.0.1:" in ended.err
+    assert "Traceback" not in ended.err
+
+
+@SLOW
+def test_nobody_who_looks_costs_nothing(shows: Shows, bus: Bus) -> None:
+    before = cpu_seconds(shows.pid)
+    with bus.follow("odom") as odom:
+        until(lambda: len(odom.seen) >= 100, 5.0, "a second of odometry")
+    # A tick of the kernel's accounting is 10 ms.
+    assert cpu_seconds(shows.pid) - before <= 0.05

@@ -1,0 +1,209 @@
+"""A viewer that is not Foxglove: speaks the websocket protocol by hand, knows nothing of acsard.
+
+JSON for all that is rare; a byte of opcode and little endian for the rest.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from tests.system.harness import until
+
+MESSAGE, CALL, ANSWER = 1, 2, 3
+"""Opcodes: data either way; a service's request, and its reply."""
+
+
+RULE = "=" * 80
+TWIST = (
+    f"geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n{RULE}\n"
+    "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+)
+"""What a panel publishes in CDR has its definition beside it."""
+
+
+class Came(NamedTuple):
+    """A message of a channel, when it came, and its bytes."""
+
+    at: float
+    payload: bytes
+
+
+PROTOCOL = "foxglove.sdk.v1"
+
+
+def opened(port: int, protocol: str = PROTOCOL) -> ClientConnection:
+    """A bare connection, of which nobody reads."""
+    where = f"ws://127.0.0.1:{port}"
+    return connect(where, subprotocols=[Subprotocol(protocol)], close_timeout=0.5)
+
+
+class Viewer:
+    """One connection; all that comes is kept by its kind."""
+
+    def __init__(self, port: int, protocol: str = PROTOCOL, *, services: bool = True) -> None:
+        self._opened = ExitStack()
+        self._socket = self._opened.enter_context(opened(port, protocol))
+        self.info: dict[str, Any] = {}
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.services: dict[str, dict[str, Any]] = {}
+        self.statuses: list[dict[str, Any]] = []
+        self.removed: list[str] = []
+        self.parameters: dict[str, Any] = {}
+        self.replies: dict[str, dict[str, Any]] = {}
+        """The answers about parameters, by the question's id."""
+        self._came: dict[int, list[Came]] = {}
+        self._answers: dict[int, tuple[bool, str]] = {}
+        self._numbers = iter(range(1, 1 << 30))
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+        until(
+            lambda: self.info and self.channels and (self.services or not services),
+            5.0,
+            "what the server has",
+        )
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._opened.close()
+        self._thread.join(5.0)
+
+    def cut(self) -> None:
+        """The connection is gone without a word, as when a cable is pulled and the kernel tells."""
+        self._socket.socket.shutdown(2)
+
+    def _listen(self) -> None:
+        try:
+            for frame in self._socket:
+                if isinstance(frame, str):
+                    self._told(json.loads(frame))
+                else:
+                    self._data(frame)
+        except ConnectionClosed:
+            pass
+
+    def _told(self, said: dict[str, Any]) -> None:
+        match said["op"]:
+            case "serverInfo":
+                self.info = said
+            case "advertise":
+                self.channels |= {one["topic"]: one for one in said["channels"]}
+            case "advertiseServices":
+                self.services |= {one["name"]: one for one in said["services"]}
+            case "status":
+                self.statuses.append(said)
+            case "removeStatus":
+                self.removed += said["statusIds"]
+            case "parameterValues":
+                self.parameters |= {one["name"]: one.get("value") for one in said["parameters"]}
+                self.replies[said.get("id", "")] = said
+            case "serviceCallFailure":
+                self._answers[said["callId"]] = False, said["message"]
+
+    def _data(self, frame: bytes) -> None:
+        if frame[0] == MESSAGE:
+            (subscription,) = struct.unpack_from("<I", frame, 1)
+            self._came.setdefault(subscription, []).append(Came(time.monotonic(), frame[13:]))
+        elif frame[0] == ANSWER:
+            _, call, size = struct.unpack_from("<III", frame, 1)
+            self._answers[call] = True, frame[13 + size :].decode()
+
+    def _say(self, op: str, **fields: Any) -> None:
+        self._socket.send(json.dumps({"op": op, **fields}))
+
+    # looking
+
+    def show(self, topic: str) -> Looked:
+        """Subscribe."""
+        until(lambda: topic in self.channels, 5.0, f"{topic} in {sorted(self.channels)}")
+        number, channel = next(self._numbers), self.channels[topic]
+        subscriptions = [{"id": number, "channelId": channel["id"]}]
+        self._came[number] = []
+        self._say("subscribe", subscriptions=subscriptions)
+        return Looked(channel, self._came[number], lambda: self._hide(number))
+
+    def _hide(self, number: int) -> None:
+        self._say("unsubscribe", subscriptionIds=[number])
+
+    def status(self, words: str, within: float = 5.0) -> dict[str, Any]:
+        """The first status with these words."""
+
+        def look() -> dict[str, Any] | None:
+            return next((one for one in list(self.statuses) if words in one["message"]), None)
+
+        return until(look, within, f"{words!r} among {[s['message'] for s in self.statuses]}")
+
+    # acting
+
+    def publish_on(
+        self, topic: str, encoding: str, schema_name: str
+    ) -> tuple[Callable[[bytes], None], int]:
+        """Advertise a channel of ours; what sends on it, and its number."""
+        number = next(self._numbers)
+        channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": schema_name}
+        if encoding == "cdr":
+            channel |= {"schemaEncoding": "ros2msg", "schema": TWIST}
+        self._say("advertise", channels=[channel])
+        return lambda data: self._socket.send(struct.pack("<BI", MESSAGE, number) + data), number
+
+    def withdraw(self, number: int) -> None:
+        """Unadvertise a channel of ours."""
+        self._say("unadvertise", channelIds=[number])
+
+    def call(self, service: str, request: object) -> Any:
+        """The answer of a service; fails when there is none."""
+        number, name = next(self._numbers), b"json"
+        head = struct.pack("<BIII", CALL, self.services[service]["id"], number, len(name))
+        self._socket.send(head + name + json.dumps(request).encode())
+        done, text = until(lambda: self._answers.get(number), 5.0, f"an answer of {service}")
+        assert done, text
+        return json.loads(text)
+
+    def get(self) -> dict[str, Any]:
+        """All parameters."""
+        return self._asked("getParameters", parameterNames=[])
+
+    def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
+        """Set these; what the server says they are then."""
+        wanted = [{"name": name, "value": value} for name, value in wishes.items()]
+        return self._asked("setParameters", parameters=wanted)
+
+    def _asked(self, op: str, **fields: Any) -> dict[str, Any]:
+        number = f"q{next(self._numbers)}"
+        self._say(op, id=number, **fields)
+        said = until(lambda: self.replies.get(number), 5.0, f"an answer to {op}")
+        return {one["name"]: one.get("value") for one in said["parameters"]}
+
+
+class Looked:
+    """A topic that is shown."""
+
+    def __init__(
+        self, channel: Mapping[str, Any], came: list[Came], hide: Callable[[], None]
+    ) -> None:
+        self.channel, self.came, self.hide = channel, came, hide
+
+    def first(self, count: int = 1, within: float = 5.0) -> list[Came]:
+        """The first messages."""
+        until(lambda: len(self.came) >= count, within, f"{count} of {self.channel['topic']}")
+        return self.came[:count]
+
+    def read(self, payload: bytes) -> Any:
+        """The message, decoded by the definition that stands beside it and by nothing else."""
+        name = self.channel["schemaName"]
+        assert (self.channel["encoding"], self.channel["schemaEncoding"]) == ("cdr", "ros2msg")
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(self.channel["schema"], name))
+        return store.deserialize_cdr(payload, name)

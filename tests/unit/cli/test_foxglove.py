@@ -1,0 +1,28 @@
+"""`acsard foxglove` before it connects: what it says of its library and of an address."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import pytest
+
+from acsard.cli import foxglove
+from acsard.host.errors import UsageError
+from acsard.host.exits import Exit, ExitError
+
+
+def test_without_its_library_it_says_which_extra_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "foxglove", None)  # as if it were not installed
+    with pytest.raises(ExitError, match=r"pip install .*\[foxglove\]'") as told:
+        foxglove.main(argparse.Namespace())
+    assert told.value.code == Exit.FAILURE
+
+
+def test_beyond_this_machine_it_does_not_listen() -> None:
+    with pytest.raises(UsageError, match="asks nobody who he is"):
+        foxglove.main(argparse.Namespace(address="0.0.0.0:8765"))

@@ -1,0 +1,142 @@
+"""What of a viewer's messages goes to the robot, and when."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.foxglove.hand import DRIVES_NS, HEAP_NS, LONGEST_NS, SILENCE_NS, STALE_NS, Hand
+from acsard.values import NS_PER_S, REST, Twist
+
+AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
+MS = NS_PER_S // 1000
+
+
+class Panel:
+    """A hand, a clock, and what has gone."""
+
+    def __init__(self) -> None:
+        self.hand, self.now = Hand(), 10 * NS_PER_S
+        self.gone: list[Twist] = []
+
+    def wait(self, span_ns: int) -> None:
+        """Time passes, and all that falls due in it goes."""
+        end = self.now + span_ns
+        while (due := self.hand.due_ns()) is not None and due <= end:
+            self.now = max(self.now, due)
+            wish = self.hand.send(self.now)
+            if wish is not None:
+                self.gone.append(wish)
+        self.now = end
+
+    def press(self, twist: Twist, times: int = 1, every_ns: int = 100 * MS) -> None:
+        for _ in range(times):
+            self.hand.take(twist, self.now)
+            self.wait(every_ns)
+
+
+@pytest.fixture
+def panel() -> Panel:
+    return Panel()
+
+
+def test_each_message_goes_once_behind_one_zero(panel: Panel) -> None:
+    panel.press(AHEAD, times=5)
+    assert panel.gone == [REST, *[AHEAD] * 5]
+
+
+def test_nothing_goes_that_nobody_sends(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    before = len(panel.gone)
+    panel.wait(100 * NS_PER_S)
+    assert len(panel.gone) == before
+    assert panel.hand.due_ns() is None
+
+
+def test_a_silence_is_followed_by_a_zero_first(panel: Panel) -> None:
+    panel.press(AHEAD)
+    panel.wait(SILENCE_NS)
+    panel.press(LEFT)
+    assert panel.gone == [REST, AHEAD, REST, LEFT]
+
+
+def test_a_heap_that_was_held_back_is_lived_by_nobody(panel: Panel) -> None:
+    panel.press(AHEAD, times=3)
+    panel.wait(2 * NS_PER_S)
+    for _ in range(20):
+        panel.hand.take(AHEAD, panel.now)
+        panel.now += MS
+    panel.wait(NS_PER_S)
+    assert panel.gone == [REST, *[AHEAD] * 3, REST]
+    assert panel.hand.stale == 1
+    assert panel.hand.replaced == 19
+
+
+def test_behind_a_heap_what_the_person_wants_now_goes(panel: Panel) -> None:
+    panel.press(AHEAD, times=4, every_ns=0)
+    panel.wait(100 * MS)
+    panel.press(LEFT, times=2)
+    assert panel.gone == [REST, LEFT, LEFT]
+
+
+def test_of_those_that_wait_the_newest_goes(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.hand.take(AHEAD, panel.now)
+    panel.hand.take(LEFT, panel.now)
+    panel.wait(0)
+    assert panel.gone == [REST, AHEAD, AHEAD, LEFT]
+    assert panel.hand.replaced == 1
+
+
+def test_what_waited_too_long_does_not_go(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.hand.take(AHEAD, panel.now)
+    assert panel.hand.send(panel.now + STALE_NS + 1) is None
+    assert panel.hand.stale == 1
+    assert panel.hand.due_ns() is None
+
+
+def test_who_begins_waits_for_the_heap_and_nobody_else(panel: Panel) -> None:
+    panel.hand.take(AHEAD, panel.now)
+    assert panel.hand.send(panel.now) == REST
+    assert panel.hand.send(panel.now + HEAP_NS - 1) is None
+    assert panel.hand.send(panel.now + HEAP_NS) == AHEAD
+    panel.now += 100 * MS
+    panel.hand.take(AHEAD, panel.now)
+    assert panel.hand.send(panel.now) == AHEAD
+
+
+def test_who_lets_go_while_driving_leaves_one_zero(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.hand.take(AHEAD, panel.now)
+    assert panel.hand.end(panel.now) == REST
+    assert panel.hand.end(panel.now) is None
+    assert panel.hand.due_ns() is None
+
+
+def test_who_does_not_drive_leaves_nothing(panel: Panel) -> None:
+    assert panel.hand.end(panel.now) is None
+    panel.press(AHEAD, times=2)
+    panel.press(REST)
+    assert panel.hand.end(panel.now) is None
+    panel.press(AHEAD, times=2)
+    assert panel.hand.end(panel.now + LONGEST_NS + NS_PER_S) is None
+
+
+def test_he_drives_while_he_asks_for_a_speed(panel: Panel) -> None:
+    assert not panel.hand.drives(panel.now)
+    panel.press(AHEAD)
+    assert panel.hand.drives(panel.now)
+    assert not panel.hand.drives(panel.now + DRIVES_NS)
+    panel.press(REST)
+    assert not panel.hand.drives(panel.now)
+
+
+@pytest.mark.parametrize(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
+def test_a_panel_that_publishes_too_seldom_is_known(panel: Panel, rate: float, slow: bool) -> None:
+    panel.press(AHEAD, times=6, every_ns=int(NS_PER_S / rate))
+    assert panel.hand.is_slow() is slow
+
+
+def test_single_presses_are_no_slow_panel(panel: Panel) -> None:
+    panel.press(AHEAD, times=6, every_ns=4 * NS_PER_S)
+    assert not panel.hand.is_slow()

@@ -1,0 +1,72 @@
+"""A viewer's message is taken whole or refused with the reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.foxglove.twists import command, encoding_of, twist
+from acsard.messages.encodings import DecodeError, encode
+from acsard.messages.schema import Header, Time, TwistStamped, Vector3
+from acsard.messages.schema import Twist as Message
+from acsard.values import Twist
+
+MESSAGE = Message(Vector3(x=0.3), Vector3(z=-0.2))
+STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
+
+
+@pytest.mark.parametrize("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
+    encoding = encoding_of(form, name)
+    assert twist(encoding, encode(MESSAGE, "json" if form == "json" else "cdr")) == Twist(0.3, -0.2)
+
+
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_stamped_one_too(form: str) -> None:
+    encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
+    assert twist(encoding, encode(STAMPED, "json" if form == "json" else "cdr")) == Twist(0.3, -0.2)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        ("json", "std_msgs/msg/String"),
+        ("json", "Twist"),
+        ("json", ""),
+        ("ros1", "geometry_msgs/Twist"),
+        ("", "geometry_msgs/Twist"),
+    ],
+)
+def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> None:
+    with pytest.raises(DecodeError, match="wanted"):
+        encoding_of(form, name)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{}",
+        b'{"linear": {"x": 1}}',
+        b'{"linear": {"x": "fast"}, "angular": {}}',
+        b'{"linear": {"x": NaN}, "angular": {}}',
+        b'{"linear": {"x": 1}, "angular": {}, "more": 1}',
+        b"\xff" * 60,
+        b'{"linear": {"x": 1}, "angular": {}}' + b" " * 5000,
+    ],
+)
+def test_what_is_no_twist_is_refused(payload: bytes) -> None:
+    for encoding in (encoding_of("json", "geometry_msgs/Twist"),):
+        with pytest.raises(DecodeError):
+            twist(encoding, payload)
+
+
+@pytest.mark.parametrize("cut", range(0, 52, 4))
+def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
+    with pytest.raises(DecodeError):
+        twist(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
+
+
+def test_a_command_on_the_bus_is_read_by_the_same_rules() -> None:
+    found = command("cmd/nav", "", encode(STAMPED, "msgpack"), 7)
+    assert (found.source, found.twist, found.arrived_ns) == ("nav", Twist(0.3, -0.2), 7)
