@@ -219,11 +219,11 @@ COMMANDS: dict[str, How] = {
     "--output-model-type pydantic_v2.BaseModel --output acsard_types": TYPED,
     # deploy/foxglove
     ".venv/bin/pip install '.[foxglove]'": Shown("an install with extras is made by other tests"),
-    ".venv/bin/acsard foxglove": Elsewhere(
+    ".venv/bin/acsard foxglove --drive": Elsewhere(
         FOXGLOVE, "test_a_held_button_drives_and_letting_go_stops"
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
-    "acsard foxglove --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
+    "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
         "tests/system/test_whoami.py", "test_a_viewer_s_foxglove_is_told_what_he_may"
     ),
     # deploy/firmware

@@ -20,8 +20,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "foxglove",
         help="the robot live in Foxglove and Lichtblick",
         description="Show the robot to Foxglove and Lichtblick (2026 and later) on this machine: "
-        "its topics, services and settings, and a Teleop panel on /cmd_vel drives it as source "
-        "`app`. Open a connection `Foxglove WebSocket` there. Until Ctrl-C.",
+        "its topics, and a service that stops it. With --drive also the other services, the "
+        "settings, and a Teleop panel on /cmd_vel drives it as source `app`. Open a connection "
+        "`Foxglove WebSocket` there. Until Ctrl-C.",
     )
     parser.add_argument(
         "--address",
@@ -30,9 +31,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help=f"listen here, default {DEFAULT}; this machine only",
     )
     parser.add_argument(
-        "--view-only",
+        "--drive",
         action="store_true",
-        help="show the topics and take nothing: no commands, services or settings",
+        help="take commands, services and settings too; any page that is open in a browser on "
+        "this machine can send them while this runs",
     )
     add_bus(parser)
     parser.set_defaults(main=main)
@@ -52,13 +54,13 @@ def main(args: argparse.Namespace) -> int:
     address = loopback(args.address)
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-        bridge = Bridge(robot, robot_id, tls, address, _tell, view_only=args.view_only)
+        bridge = Bridge(robot, robot_id, tls, address, _tell, acts=args.drive)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
-            print(
-                f"{robot_id} at ws://{address[0]}:{address[1]}: connect Foxglove there", flush=True
-            )
+            may = "" if args.drive else "; it shows and stops, --drive takes commands too"
+            where = f"ws://{address[0]}:{address[1]}"
+            print(f"{robot_id} at {where}: connect Foxglove there{may}", flush=True)
             bridge.run()
         finally:
             bridge.close()

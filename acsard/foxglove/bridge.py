@@ -21,7 +21,7 @@ from acsard.foxglove.notices import Notices
 from acsard.foxglove.objections import Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
-from acsard.foxglove.services import services
+from acsard.foxglove.services import CALLED, STOPS, services
 from acsard.foxglove.settings import Settings
 from acsard.host import clock
 from acsard.messages.schema import RobotState
@@ -54,7 +54,7 @@ class Bridge:
         address: tuple[str, int],
         tell: Callable[[str], None],
         *,
-        view_only: bool = False,
+        acts: bool = False,
     ) -> None:
         self._robot, self._id, self._tls = robot, robot_id, tls
         robot.name += ", a viewer"
@@ -71,8 +71,8 @@ class Bridge:
         self._relay.offer(facts)
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
-        offered = [] if view_only else services(robot, ros)
-        self._server = start(f"acsard {robot_id}", address, listener, offered, context)
+        offered = services(robot, ros, CALLED if acts else STOPS)
+        self._server = start(f"acsard {robot_id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._state: RobotState | None = None
         self._state_ns = clock.mono_ns()

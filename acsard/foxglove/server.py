@@ -112,17 +112,23 @@ def start(
     listener: Listener,
     services: list[foxglove.Service],
     context: foxglove.Context,
+    *,
+    acts: bool,
 ) -> WebSocketServer:
-    """Listen; without services for viewers only. Raises `InUseError` when the port is taken,
-    `NotPermittedError` when it is root's."""
+    """Listen; `acts` is whether commands and settings are taken.
+
+    Raises `InUseError` when the port is taken, `NotPermittedError` when it is root's.
+    """
     host, port = address
-    takes = [Capability.ClientPublish, Capability.Parameters, Capability.Services]
+    takes = [Capability.Services]
+    if acts:
+        takes += [Capability.ClientPublish, Capability.Parameters]
     try:
         return foxglove.start_server(
             name=name,
             host=host,
             port=port,
-            capabilities=takes if services else [],
+            capabilities=takes,
             server_listener=listener,  # type: ignore[arg-type]  # it has all but playback
             supported_encodings=["json", "cdr"],
             services=services,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import foxglove
@@ -19,16 +20,17 @@ from acsard.values import AcsardError
 CALLED = tuple(verb for verb in SERVICES if verb != "set")
 """`set` is what parameters are for."""
 
+STOPS = ("stop",)
+"""What anybody may who comes in: a browser does not say which of its pages it is."""
+
 NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
 
 _poses = Decoder(SetPose)
 
 
-def services(robot: Client, ros: RosConfig) -> list[foxglove.Service]:
-    """All of them, called as in ROS: `/acsard/stop`."""
-    return [
-        _service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in CALLED
-    ]
+def services(robot: Client, ros: RosConfig, verbs: Iterable[str]) -> list[foxglove.Service]:
+    """These, called as in ROS: `/acsard/stop`."""
+    return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
 
 
 def _service(robot: Client, verb: str, name: str) -> foxglove.Service:

@@ -64,7 +64,7 @@ class Shows(Program):
     def __init__(self, daemon: Daemon, *words: str) -> None:
         self.port = free_port()
         where = ("--config", str(daemon.config), "--address", f"127.0.0.1:{self.port}")
-        super().__init__(acsard("foxglove", *where, *words), daemon.config.parent)
+        super().__init__(acsard("foxglove", *where, *words or ("--drive",)), daemon.config.parent)
 
     def __enter__(self) -> Shows:
         super().__enter__()
@@ -258,15 +258,21 @@ def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) ->
 
 
 @SLOW
-def test_view_only_it_shows_and_takes_nothing(shared: Daemon, bus: Bus) -> None:
-    with Shows(shared, "--view-only") as own, Viewer(own.port, services=False) as viewer:
-        assert viewer.info["capabilities"] == []
+def test_unless_it_is_to_drive_it_shows_and_stops_and_takes_nothing_else(
+    shared: Daemon, bus: Bus
+) -> None:
+    with Shows(shared, "--id", "acsar") as own, Viewer(own.port) as viewer:
+        assert viewer.info["capabilities"] == ["services"]
         looked = viewer.show("/odom")
         send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
         before = bus.count("commands")
         send(speed(0.3))
         looked.first(len(looked.came) + 20)
-        assert (viewer.services, bus.count("commands")) == ({}, before)
+        assert bus.count("commands") == before
+        assert set(viewer.services) == {"/acsard/stop"}
+        assert viewer.call("/acsard/stop", {})["success"]
+        assert bus.state()["mode"] == "stopped"
+        assert bus.get("srv/clear")["success"]
 
 
 @SLOW

@@ -115,7 +115,7 @@ def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
 def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
     may = "your certificate viewer is viewer: it may follow and stop, not drive"
     port = int(free_endpoint().rpartition(":")[2])
-    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
+    words = ["foxglove", "--drive", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
     where = robot.daemon.config.parent
     with Program(acsard(*words, "--tls", robot.own("viewer")), where) as program:
         program.says("ws://")
