@@ -318,6 +318,10 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/acsard log replay": Elsewhere(
         LOG, "test_a_replay_says_that_all_is_the_same"
     ),
+    "acsard log report FILE": Elsewhere(
+        "tests/unit/cli/test_log_report.py",
+        "test_the_numbers_of_the_file_are_those_of_the_recording",
+    ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
         UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import load
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 
 if TYPE_CHECKING:
     from acsard.record.file import Closing, Recording
@@ -54,7 +55,19 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     recover.add_argument("file", metavar="FILE")
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.set_defaults(main=recover_one)
-    for one in (show, replay, recover):
+    report = inner.add_parser(
+        "report",
+        help="draw it: one HTML file with path, speeds, who drove and why, link, events",
+        description="Draw what happened as one HTML file that needs no network. Needs the library "
+        "plotly; without it, it tells what to type.",
+    )
+    report.add_argument("file", nargs="?", metavar="FILE")
+    report.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
+    report.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
+    report.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+    report.add_argument("--force", action="store_true", help="overwrite a file that is there")
+    report.set_defaults(main=report_one)
+    for one in (show, replay, recover, report):
         _directory(one, argparse.SUPPRESS)
 
 
@@ -160,6 +173,48 @@ def recover_one(args: argparse.Namespace) -> int:
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
     print(f"{count} messages in {new}{_state(recording)}")
+    return int(Exit.OK)
+
+
+def report_one(args: argparse.Namespace) -> int:
+    """Draw it."""
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        message = f"needs the library plotly; run: {install('report')}"
+        raise ExitError(Exit.FAILURE, message) from None
+    from acsard.record.again import Onlooker, verdict
+    from acsard.report.account import Origin
+    from acsard.report.course import Course
+    from acsard.report.page import page
+
+    recording = _recording(args)
+    new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
+    if new.exists() and not args.force:
+        raise ExitError(Exit.FAILURE, f"{new} is there already; another name, or --force")
+    about, looked = recording.about, Onlooker(recording)
+    began_s = about.wall_ns / 1e9
+    begin, end = (_seconds(text, began_s) for text in (args.begin, args.end))
+    course = Course(looked.config, begin, end)
+    for step, outputs, robot in looked.steps():
+        course.step(step, outputs, robot)
+    if course.began is None:
+        raise ExitError(Exit.FAILURE, f"{recording.path} has no step of that time to draw")
+    course.end()
+    notes = (_state(recording).strip(" []"), *looked.notes)
+    if not looked.replay.tally.same:
+        notes += (f"this acsard computes it otherwise than it was: {verdict(looked.replay.tally)}",)
+    said = [note for note in notes if note]
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
+    offset_s = time.localtime(course.began).tm_gmtoff
+    text = page(course, origin, get_plotlyjs(), _clock, offset_s)
+    try:
+        new.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
+    print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
+    for note in said:
+        print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
 
 
