@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -184,7 +185,7 @@ def report_one(args: argparse.Namespace) -> int:
         message = f"needs the library plotly; run: {install('report')}"
         raise ExitError(Exit.FAILURE, message) from None
     from acsard.record.again import Onlooker, verdict
-    from acsard.report.account import Origin
+    from acsard.report.account import Origin, notes
     from acsard.report.course import Course
     from acsard.report.page import page
 
@@ -198,13 +199,16 @@ def report_one(args: argparse.Namespace) -> int:
     course = Course(looked.config, begin, end)
     for step, outputs, robot in looked.steps():
         course.step(step, outputs, robot)
+        if course.over:
+            deque(recording.messages(), maxlen=0)  # only what is missing of it
+            break
     if course.began is None:
         raise ExitError(Exit.FAILURE, f"{recording.path} has no step of that time to draw")
     course.end()
-    notes = (_state(recording).strip(" []"), *looked.notes)
-    if not looked.replay.tally.same:
-        notes += (f"this acsard computes it otherwise than it was: {verdict(looked.replay.tally)}",)
-    said = [note for note in notes if note]
+    said = [*filter(None, [_state(recording).strip(" []")]), *looked.notes]
+    tally = looked.replay.tally
+    if not (tally.same or looked.notes or course.missing):
+        said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
     origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
     offset_s = time.localtime(course.began).tm_gmtoff
     text = page(course, origin, get_plotlyjs(), _clock, offset_s)
@@ -213,7 +217,7 @@ def report_one(args: argparse.Namespace) -> int:
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
     print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
-    for note in said:
+    for note in notes(course, origin):
         print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
 

@@ -19,6 +19,9 @@ Clock = Callable[[float, bool], str]
 
 MOST_REASONS = 8
 
+FINE_S = 0.05
+"""s; what a point stands for is said from there on."""
+
 MOST_NAMES = 5
 """Who stopped it, of those that are named."""
 
@@ -114,6 +117,34 @@ def reasons(course: Course) -> list[tuple[str, str, str, float]]:
     return [(*key, total) for key, total in longest[:MOST_REASONS]]
 
 
+def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
+    """What was said, and when first."""
+    first: dict[str, Mark] = {}
+    for mark in marks:
+        first.setdefault(mark.text, mark)
+    told = [f"{clock(began + one.t, False)} {one.text}" for one in first.values()]
+    more = f"; and {len(told) - MOST_NAMES} more" if len(told) > MOST_NAMES else ""
+    return "; ".join(told[:MOST_NAMES]) + more
+
+
+def notes(course: Course, origin: Origin) -> list[str]:
+    """What a reader has to know of these pictures."""
+    found = list(origin.notes)
+    if course.missing:
+        found.append(
+            f"{many(course.missing, 'step is', 'steps are')} missing: after that, speeds wished "
+            "and limited and what sources wait for are computed without knowing what happened."
+        )
+    curves = [*course.linear.values(), *course.angular.values()]
+    width = max(curve.width for curve in curves)
+    if width > FINE_S:
+        found.append(
+            f"A point of a picture stands for up to {width:.2g} s: the lowest and the highest of "
+            "each such time are drawn. --from and --to show a shorter time finer."
+        )
+    return found
+
+
 def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
     """What each row of the summary is about, and what it says."""
     began, config = course.began or 0.0, course.config
@@ -130,8 +161,7 @@ def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, st
     for name, title in (("fault", "Faults"), ("stop", "Stops")):
         told = [mark for mark in marks if mark.name == name]
         count = course.marks.counts[name]
-        texts = [f"{clock(began + mark.t, False)} {mark.text}" for mark in told[:MOST_NAMES]]
-        yield title, f"{count}: {'; '.join(texts)}" if count else "none"
+        yield title, f"{count}: {_first_of_each(told, began, clock)}" if count else "none"
     totals = course.link.totals
     shares = f"{totals.sent} lines sent, {totals.good} answers, {totals.dropped} dropped"
     lost = "" if config.mcu.reply_period else f", {totals.unanswered} without an answer"

@@ -104,18 +104,25 @@ class Course:
         self.steps = self.missing = 0
         self._story = Story()
         self._mono_ns = self._wall_ns = 0
+        self._wall = -math.inf
+        """s since 1970 of the last step."""
         self._number: int | None = None
         self._place: Place | None = None
         self._jumps = True
         self._looked = self._left = -math.inf
         self._status: tuple[str, ...] = ()
 
+    @property
+    def over(self) -> bool:
+        """No step to come counts."""
+        return self._wall > self._window[1]
+
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
         """A step as it was recorded, and what `robot` made of it now."""
         now = step.inputs.now
         if self._number is None:
             self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
-        wall = (self._wall_ns + now.mono_ns - self._mono_ns) / NS_PER_S
+        self._wall = wall = (self._wall_ns + now.mono_ns - self._mono_ns) / NS_PER_S
         counts = self._window[0] <= wall <= self._window[1]
         known = self._number is None or step.number == self._number + 1
         if counts and self.began is None:
@@ -219,6 +226,6 @@ class Course:
         if status == self._status and t - self._looked < LOOK_S and not refused:
             return
         self._status, self._looked = status, t
-        self.modes.add(t, mode, reason[:MOST_TEXT])
-        self.links.add(t, link)
+        self.modes.add(t, mode[:MOST_TEXT], reason[:MOST_TEXT])
+        self.links.add(t, link[:MOST_TEXT])
         self.commanders.look(step, t, robot)

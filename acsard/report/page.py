@@ -15,14 +15,11 @@ from collections.abc import Sequence
 import msgspec
 
 from acsard.messages.text import printable
-from acsard.report.account import Clock, Origin, differences, lasted, reasons, rows, summary
+from acsard.report.account import Clock, Origin, differences, lasted, notes, reasons, rows, summary
 from acsard.report.course import Course
-from acsard.report.figures import Figure, Pictures, width_s
+from acsard.report.drawing import Figure
+from acsard.report.figures import Pictures
 from acsard.report.look import PROGRAM, STYLE
-
-FINE_S = 0.05
-"""s; what a point stands for is said from there on."""
-
 
 MOST_OPEN = 40
 """Events; a longer list is shown when it is asked for."""
@@ -40,7 +37,7 @@ def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: f
     body = [
         f"<h1>{title}</h1>",
         f'<p class="lead">{escaped(summary(course))}</p>',
-        *[f'<p class="note">{escaped(note)}</p>' for note in _notes(course, origin)],
+        *[f'<p class="note">{escaped(note)}</p>' for note in notes(course, origin)],
         _rows(course, origin, clock),
         "<noscript><p class=note>The pictures need JavaScript.</p></noscript>",
         *[_figure(one) + (_reasons(course) if one.name == "who" else "") for one in figures],
@@ -73,22 +70,6 @@ def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: f
 def _hash(program: str) -> str:
     digest = hashlib.sha256(program.encode()).digest()
     return f"'sha256-{binascii.b2a_base64(digest, newline=False).decode()}'"
-
-
-def _notes(course: Course, origin: Origin) -> list[str]:
-    notes = list(origin.notes)
-    if course.missing:
-        notes.append(
-            f"{course.missing} steps are missing: after them, speeds wished and limited and what "
-            "sources wait for are computed without knowing what happened meanwhile."
-        )
-    width = width_s(course)
-    if width > FINE_S:
-        notes.append(
-            f"A point of a picture stands for up to {width:.2g} s: the lowest and the highest of "
-            "each such time are drawn. --from and --to show a shorter time finer."
-        )
-    return notes
 
 
 def _rows(course: Course, origin: Origin, clock: Clock) -> str:

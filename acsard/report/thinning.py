@@ -52,12 +52,13 @@ class Curve:
             if bins:
                 bins[-1] = bins[-1]._replace(breaks=True)
             return
-        point = Point(t, value)
-        new = _Bin(int(t / self.width), point, point)
-        if bins and bins[-1].number == new.number:
-            bins[-1] = _merged(bins[-1], new)
+        number, point = int(t / self.width), Point(t, value)
+        if bins and bins[-1].number == number:
+            _, low, high, breaks = bins[-1]
+            if breaks or not low.value <= value <= high.value:
+                bins[-1] = _merged(bins[-1], _Bin(number, point, point))
             return
-        bins.append(new)
+        bins.append(_Bin(number, point, point))
         while len(bins) > self._most:
             self.width *= 2
             self._bins = bins = list(_halved(bins))

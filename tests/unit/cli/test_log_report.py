@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import binascii
 import json
 import re
 import shutil
-import struct
 import sys
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +16,7 @@ from acsard.cli import main
 from acsard.record.again import steps
 from acsard.record.file import Recording
 from acsard.record.steps import MICRO
+from tests.unit.report.seen import column
 
 QUIET = Path(__file__).parents[2] / "recordings" / "quiet.mcap"
 
@@ -33,11 +32,6 @@ def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
     text = path.read_text(encoding="utf-8")
     (data,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', text)
     return {figure["name"]: figure["data"] for figure in json.loads(data)}
-
-
-def column(packed: dict[str, str]) -> list[float]:
-    data = binascii.a2b_base64(packed["bdata"])
-    return list(struct.unpack(f"<{len(data) // 8}d", data))
 
 
 @lru_cache
@@ -88,6 +82,22 @@ def test_a_part_of_the_time_and_what_was_cut(
     assert "no end: cut" in new.read_text(encoding="utf-8")
     times = column(pictures(new)["speeds"][2]["x"])
     assert times[-1] - times[0] == pytest.approx(1000, abs=30)
+
+
+def test_what_is_damaged_is_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
+    data = bytearray(QUIET.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20] = bytes(20)
+    bad.write_bytes(data)
+    code, _, err = report(capsys, bad, new)
+    assert code == 0
+    assert "1 damaged chunks are left out" in err
+    assert "steps are missing" in err
+    text = new.read_text(encoding="utf-8")
+    assert "1 damaged chunks are left out" in text
+    assert "steps are missing" in text
 
 
 def test_of_a_time_without_steps_there_is_no_report(

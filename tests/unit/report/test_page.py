@@ -70,8 +70,7 @@ def evil_steps() -> list[Step]:
             refusal = Refusal("undecodable", f"cmd/nav: {EVIL}", "nav", EVIL, now_ns)
             inputs = replace(inputs, commands=(command,), refusals=(refusal,))
             event = Event("stop", EVIL, by=EVIL)
-            mode, _, link, source = said.status
-            said = replace(said, events=(event,), status=(mode, EVIL, link, source))
+            said = replace(said, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
         found.append(replace(step, inputs=inputs, said=said))
     return found
 
@@ -97,9 +96,9 @@ def test_no_word_of_a_stranger_is_markup_or_program() -> None:
 def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
     (pictures,) = [text for attrs, text in Read(evil()).scripts if attrs.get("id") == "pictures"]
     assert "<" not in pictures
-    texts = [
-        text for f in json.loads(pictures) for t in f["data"] for text in t.get("hovertext", ())
-    ]
+    traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
+    texts = [text for t in traces for key in ("hovertext", "text") for text in t.get(key, ())]
+    texts += [trace["name"] for trace in traces]
     said = [text for text in texts if "alert(1)" in text]
     assert len(said) >= 3  # the event, the mode, the refusal
     tags = {tag for text in texts for tag in re.findall(r"<[^>]*>", text)}
