@@ -17,6 +17,9 @@ DOES = ("refused", "waits", "sends", "drives")
 """What a source does while it is not silent; those first that stay where too many are to be drawn.
 `sends`: its commands count, and the robot stands for another reason."""
 
+MOVES = ("ready", "driving")
+"""The modes in which a source decides whether the robot moves: in others it waits for no source."""
+
 OTHERS = "others"
 """The sources that are in no list, whatever they call themselves."""
 
@@ -105,7 +108,7 @@ class Commanders:
                 yield one.name, "refused", lately
             elif wait.what == "command":
                 yield one.name, "", ""
-            elif wait.what in ("nothing", "senders"):
+            elif mode not in MOVES or wait.what in ("nothing", "senders"):
                 yield one.name, "sends", f"{mode}: {reason}"[:MOST_TEXT]
             else:
                 yield one.name, "waits", waiting(wait)

@@ -47,6 +47,7 @@ summary h2 { display: inline }
   .rows tr { display: block; padding: 6px 0; border-bottom: 1px solid var(--rule) }
   .rows td { display: inline; border: 0; padding: 0 8px 0 0 }
   .rows td.name { font-weight: 600 }
+  .settings td:last-child::before { content: "default " }
   .rows td:last-child { color: var(--soft) }
 }
 @media print { .modebar { display: none } }

@@ -130,10 +130,10 @@ def _settings(course: Course) -> str:
         return "<h2>Configuration</h2><p>As by default, every key.</p>"
     cells = [tuple(f"<td>{escaped(part)}</td>" for part in setting) for setting in changed]
     heading = "<h2>Configuration, where it is not the default</h2>"
-    return heading + _table(["key", "here", "default"], cells)
+    return heading + _table(["key", "here", "default"], cells, "rows settings")
 
 
-def _table(names: list[str], cells: Sequence[tuple[str, ...]]) -> str:
+def _table(names: list[str], cells: Sequence[tuple[str, ...]], kind: str = "rows") -> str:
     head = "".join(f"<th>{name}</th>" for name in names)
     body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
-    return f'<table class="rows"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+    return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'

@@ -30,9 +30,16 @@ def test_who_waits_says_for_whom() -> None:
     assert 1.5 < wait.end - wait.begin < 2.5
 
 
-def test_who_sends_to_a_stopped_robot_reads_why_it_stands() -> None:
-    words = [span.words for span in spans("teleop") if span.kind in ("sends", "waits")]
-    assert any("stopped by request" in text for text in words)
+def test_who_sends_to_a_robot_in_fault_reads_the_fault_and_no_other_reason() -> None:
+    def dead(world: World) -> None:
+        world.drive(0.5, seconds=0.4)
+        with world.mcu.dead_motor(0):
+            world.hold(0.5, 0.4, seconds=1.2)
+
+    course, _ = course_of(dead)
+    (fault,) = [span for span in course.modes.spans() if span.kind == "fault"]
+    said = [s for s in course.commanders.bands["app"].spans() if s.begin > fault.begin]
+    assert {(span.kind, span.words) for span in said} == {("sends", f"fault: {fault.words}")}
 
 
 def test_a_source_in_no_list_is_refused_among_the_others() -> None:
