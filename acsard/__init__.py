@@ -39,6 +39,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     door/          S  `acsard door`: where TLS ends, a process of its own
     client.py      S  drive and follow a robot from Python
     driving.py     S  one drive of the client, and what `state` says becomes of it
+    report/        P  `acsard log report`: course (what a recording shows), thinning (a day in a
+                      minute's room), account (words), figures, page
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
     foxglove/      S  `acsard foxglove`, outside too: hand (what of a viewer's messages goes),
                       drives, relay (what comes), settings, services, bridge (goes round)

@@ -333,6 +333,10 @@ COMMANDS: dict[str, How] = {
         "tests/unit/cli/test_log_export.py",
         "test_a_number_and_a_name_are_taken_and_what_is_there_stays",
     ),
+    "acsard log report FILE": Elsewhere(
+        "tests/unit/cli/test_log_report.py",
+        "test_the_numbers_of_the_file_are_those_of_the_recording",
+    ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
         UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"

@@ -18,7 +18,7 @@ UNIT = Path(__file__).parent / "unit"
 
 PURE_ROOMS = (
     "values", "config", "mcu", "drive", "messages", "ros", "incoming", "robot", "guard", "sim",
-    "checkup", "calibration",
+    "checkup", "calibration", "report",
 )  # fmt: skip
 """No clock, no I/O, no asyncio, no logging, no randomness."""
 
@@ -58,9 +58,9 @@ PURE_AMONG_SHELLS = (
 
 PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
-    "functools", "heapq", "ipaddress", "itertools", "math", "msgspec", "numpy", "operator", "re",
-    "rich.cells", "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit",
-    "tomllib", "typing", "xxhash", "zlib",
+    "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math", "msgspec", "numpy",
+    "operator", "re", "rich.cells", "rich.console.Group", "rich.text", "statistics", "struct",
+    "textwrap", "tomlkit", "tomllib", "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
 itself, knows the time or anything of chance."""

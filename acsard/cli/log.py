@@ -6,12 +6,14 @@ import argparse
 import re
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli import log_export
 from acsard.cli.common import load
 from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
 
 if TYPE_CHECKING:
     from acsard.record.file import Closing, Recording
@@ -56,7 +58,18 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     export = log_export.add(inner)
     _span(export)
     export.set_defaults(main=export_one)
-    for one in (show, replay, recover, export):
+    report = inner.add_parser(
+        "report",
+        help="draw it: one HTML file with path, speeds, who drove and why, link, events",
+        description="Draw what happened as one HTML file that needs no network. Needs the library "
+        "plotly; without it, it tells what to type.",
+    )
+    report.add_argument("file", nargs="?", metavar="FILE")
+    report.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
+    _span(report)
+    report.add_argument("--force", action="store_true", help="overwrite a file that is there")
+    report.set_defaults(main=report_one)
+    for one in (show, replay, recover, export, report):
         _directory(one, argparse.SUPPRESS)
 
 
@@ -178,6 +191,51 @@ def export_one(args: argparse.Namespace) -> int:
     trouble = log_export.export_one(recording, args, lambda text: _seconds(text, began_s))
     note = trouble or _state(recording).strip()
     if note:
+        print(f"{recording.path}: {note}", file=sys.stderr)
+    return int(Exit.OK)
+
+
+def report_one(args: argparse.Namespace) -> int:
+    """Draw it."""
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        message = f"needs the library plotly; run: {install('report')}"
+        raise ExitError(Exit.FAILURE, message) from None
+    from acsard.record.again import Onlooker, verdict
+    from acsard.report.account import Origin, notes
+    from acsard.report.course import Course
+    from acsard.report.page import page
+
+    recording = _recording(args)
+    new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
+    if new.exists() and not args.force:
+        raise ExitError(Exit.FAILURE, f"{new} is there already; another name, or --force")
+    about, looked = recording.about, Onlooker(recording)
+    began_s = about.wall_ns / 1e9
+    begin, end = (_seconds(text, began_s) for text in (args.begin, args.end))
+    course = Course(looked.config, begin, end)
+    for step, outputs, robot in looked.steps():
+        course.step(step, outputs, robot)
+        if course.over:
+            deque(recording.messages(), maxlen=0)  # only what is missing of it
+            break
+    if course.began is None:
+        raise ExitError(Exit.FAILURE, f"{recording.path} has no step of that time to draw")
+    course.end()
+    said = [*filter(None, [_state(recording).strip(" []")]), *looked.notes]
+    tally = looked.replay.tally
+    if not (tally.same or looked.notes or course.missing):
+        said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
+    offset_s = time.localtime(course.began).tm_gmtoff
+    text = page(course, origin, get_plotlyjs(), _clock, offset_s)
+    try:
+        new.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
+    print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
+    for note in notes(course, origin):
         print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
 

@@ -15,6 +15,7 @@ from acsard.record.replay import Difference, Replay, Seen, Tally
 from acsard.record.state import State, StateError, thaw
 from acsard.record.steps import MICRO, Step
 from acsard.robot import Robot
+from acsard.values import Outputs
 
 HUNDREDTHS = 100.0
 
@@ -94,6 +95,34 @@ def live(recording: Recording, other: Config | None = None) -> Lived:
     for step in course.steps():
         replay.step(step)
     return Lived(replay.tally, course.trouble)
+
+
+class Onlooker:
+    """Lives a recording for who looks on: all that can be read of it, whatever is missing."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Raises `RecordingError`."""
+        self._recording = recording
+        self.notes: list[str] = []
+        """What is not as it was then, in words."""
+        self.config = config_of(recording)
+        try:
+            self._began = _state(recording)
+        except RecordingError as error:
+            self._began = None
+            self.notes.append(f"what is computed begins with a robot that knows nothing: {error}")
+        self.replay = Replay(self.config, *(self._began or ()))
+
+    def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
+        """Each step as it was recorded, what it decides now, and the robot after it."""
+        number = None
+        for step in steps(self._recording):
+            if number is None and self._began is None and step.number > 0 and not self.notes:
+                self.notes.append("its first steps are missing: the robot is begun without them")
+            number = step.number
+            self.replay.step(step)
+            if self.replay.outputs is not None:
+                yield step, self.replay.outputs, self.replay.robot
 
 
 def _state(recording: Recording) -> State | None:

@@ -90,9 +90,11 @@ class Replay:
 
     def __init__(self, config: Config, robot: Robot | None = None, last: bytes = b"") -> None:
         """`robot` and the `last` line as they were before the first step, None at the start."""
-        self._robot = robot or Robot(config)
-        self._watched_by(self._robot.config)
-        self._last = last or self._robot.session.codec.stop
+        self.robot = robot or Robot(config)
+        self.outputs: Outputs | None = None
+        """What the last step decided now."""
+        self._watched_by(self.robot.config)
+        self._last = last or self.robot.session.codec.stop
         self._checksum = 0
         self._here: Micropose = (0, 0, 0)
         self.tally = Tally()
@@ -101,9 +103,9 @@ class Replay:
         """Live it; what came out otherwise than then, None when nothing did."""
         if step.begins:
             self._checksum = 0
-        outputs = lived(self._robot, step)
-        if self._robot.config is not self._config:  # a setting was changed
-            self._watched_by(self._robot.config)
+        outputs = self.outputs = lived(self.robot, step)
+        if self.robot.config is not self._config:  # a setting was changed
+            self._watched_by(self.robot.config)
         line, trip = self._guard.check(outputs, self._last)
         self._checksum = checksum(outputs.estimates, self._checksum)
         if step.said.left is not None:
@@ -119,7 +121,7 @@ class Replay:
     def _watched_by(self, config: Config) -> None:
         """A guard as the loop has it."""
         self._config = config
-        self._guard = Guard.of(self._robot.session.codec.stop, config)
+        self._guard = Guard.of(self.robot.session.codec.stop, config)
 
     def _compare(self, step: Step, now: Seen, line: bytes | None) -> Difference | None:
         said = step.said

@@ -1,0 +1,178 @@
+"""A recording in words: the paragraph on top of a report, and the rows below it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from acsard.config.live import flat
+from acsard.config.parsing import effective
+from acsard.config.settings import Config
+from acsard.config.validation import show
+from acsard.report.course import Course, Mark
+
+Clock = Callable[[float, bool], str]
+"""A time, s since 1970, as the clocks here tell it, with the day or without."""
+
+MOST_REASONS = 8
+
+FINE_S = 0.05
+"""s; what a point stands for is said from there on."""
+
+MOST_NAMES = 5
+"""Who stopped it, of those that are named."""
+
+
+class Origin(Struct, frozen=True):
+    """Where the pictures are from."""
+
+    file: str
+    robot: str
+    version: str
+    """Of the acsard that recorded it."""
+    python: str
+    notes: tuple[str, ...] = ()
+    """What is missing of it, in words."""
+
+
+class Setting(NamedTuple):
+    key: str
+    here: str
+    default: str
+
+
+def differences(config: Config) -> list[Setting]:
+    """What is set otherwise than by default; a source that is new, or gone, by its priority."""
+    here, default = (dict(flat(effective(one))) for one in (config, Config()))
+    return [
+        Setting(key, _shown(here, key), _shown(default, key))
+        for key in {**default, **here}
+        if key not in here or key not in default or _plain(here[key]) != _plain(default[key])
+    ]
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _shown(table: dict[str, object], key: str) -> str:
+    return show(table[key]) if key in table else "-"
+
+
+def lasted(seconds: float) -> str:
+    """A time as people say it."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def many(count: int, one: str, more: str = "") -> str:
+    """So many of them; `no` for none."""
+    return f"{count or 'no'} {one if count == 1 else more or one + 's'}"
+
+
+def summary(course: Course) -> str:
+    """What happened, in three sentences."""
+    fast, counts = course.fastest, course.marks.counts
+    drove = sum(one.seconds for one in course.driven.values())
+    way = (
+        f"It drove {course.metres:.2f} m in {lasted(drove)} of {lasted(course.seconds)}, "
+        f"at most {fast.linear:.2f} m/s and {fast.angular:.2f} rad/s."
+        if drove
+        else f"It did not drive in these {lasted(course.seconds)}."
+    )
+    stops = many(counts["stop"], "stop")
+    by = _names([mark for mark in course.marks.all() if mark.name == "stop"])
+    faults = many(counts["fault"], "fault")
+    lost = counts["link_down"] + counts["link_stale"]
+    link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
+    return f"{way} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
+
+
+def _be(count: int) -> str:
+    return "was" if count == 1 else "were"
+
+
+def _names(marks: list[Mark]) -> str:
+    names = list(dict.fromkeys(mark.by for mark in marks if mark.by))
+    if not names:
+        return ""
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return f" (by {', '.join(names[:MOST_NAMES])}{more})"
+
+
+def reasons(course: Course) -> list[tuple[str, str, str, float]]:
+    """Source, what it did but drive, why, and for how many s: the longest first."""
+    seconds: dict[tuple[str, str, str], float] = defaultdict(float)
+    for name, band in course.commanders.bands.items():
+        for span in band.spans():
+            if span.kind != "drives":
+                seconds[name, span.kind, span.words] += span.end - span.begin
+    longest = sorted(seconds.items(), key=lambda one: -one[1])
+    return [(*key, total) for key, total in longest[:MOST_REASONS]]
+
+
+def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
+    """What was said, and when first."""
+    first: dict[str, Mark] = {}
+    for mark in marks:
+        first.setdefault(mark.text, mark)
+    told = [f"{clock(began + one.t, False)} {one.text}" for one in first.values()]
+    more = f"; and {len(told) - MOST_NAMES} more" if len(told) > MOST_NAMES else ""
+    return "; ".join(told[:MOST_NAMES]) + more
+
+
+def notes(course: Course, origin: Origin) -> list[str]:
+    """What a reader has to know of these pictures."""
+    found = list(origin.notes)
+    if course.missing:
+        found.append(
+            f"{many(course.missing, 'step is', 'steps are')} missing: after that, speeds wished "
+            "and limited and what sources wait for are computed without knowing what happened."
+        )
+    curves = [*course.linear.values(), *course.angular.values()]
+    width = max(curve.width for curve in curves)
+    if width > FINE_S:
+        found.append(
+            f"A point of a picture stands for up to {width:.2g} s: the lowest and the highest of "
+            "each such time are drawn. --from and --to show a shorter time finer."
+        )
+    return found
+
+
+def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
+    """What each row of the summary is about, and what it says."""
+    began, config = course.began or 0.0, course.config
+    yield "When", f"{clock(began, True)} to {clock(began + course.seconds, True)}"
+    yield "How long", f"{lasted(course.seconds)}, {course.steps} steps"
+    yield "How far", f"{course.metres:.2f} m, both ways counted"
+    fast = course.fastest
+    yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
+    driven = [
+        f"{name} {one.metres:.2f} m in {lasted(one.seconds)}" for name, one in course.driven.items()
+    ]
+    yield "Who drove", ", ".join(driven) or "nobody"
+    marks = course.marks.all()
+    for name, title in (("fault", "Faults"), ("stop", "Stops")):
+        told = [mark for mark in marks if mark.name == name]
+        count = course.marks.counts[name]
+        yield title, f"{count}: {_first_of_each(told, began, clock)}" if count else "none"
+    totals = course.link.totals
+    shares = f"{totals.sent} lines sent, {totals.good} answers, {totals.dropped} dropped"
+    lost = "" if config.mcu.reply_period else f", {totals.unanswered} without an answer"
+    yield "Serial line", shares + lost
+    late = course.lateness
+    yield (
+        "Control loop",
+        f"{config.rate_hz:g} Hz, at most {late.most:.1f} ms late, {many(late.missed, 'period')} "
+        "missed",
+    )
+    simulated = " on the simulator" if config.mcu.simulated else f" on {config.mcu.port}"
+    yield "Robot", f"{origin.robot}{simulated}"
+    yield "Recorded by", f"acsard {origin.version}, Python {origin.python}"
+    yield "File", origin.file

@@ -1,0 +1,231 @@
+"""What a recording shows, taken step by step: what to draw and what to say of it.
+
+Mode, reasons, path, events and whose commands came are as they were recorded. What was wished,
+allowed and measured is of the robot that is run over the same inputs beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+
+from msgspec import Struct
+
+from acsard.config.settings import Config
+from acsard.mcu.contract import WATCHDOG_S
+from acsard.record.steps import MICRO, Step
+from acsard.record.story import Story, Told
+from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
+from acsard.report.line import Lateness, Link
+from acsard.report.thinning import Band, Curve, Place, Track
+from acsard.robot import Robot
+from acsard.values import NS_PER_S, Outputs, Twist
+
+MODES = ("fault", "stopped", "leaving", "waiting", "inactive", "driving", "ready")
+"""The worst first: where there are too many to draw, these stay."""
+
+LINKS = ("down", "stale", "booting", "up")
+
+FIRST, LAST = 30, 30
+"""Events of one name that are kept."""
+
+
+class Mark(Struct, frozen=True):
+    """An event, at `t` s, and where the robot was then by odometry."""
+
+    t: float
+    name: str
+    text: str
+    level: str
+    by: str
+    count: int
+    place: Place | None
+
+
+class Marks:
+    """Events: of each name the first ones and the last ones."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, list[Mark]] = {}
+        self._last: dict[str, deque[Mark]] = {}
+        self.counts: Counter[str] = Counter()
+        """All there were, each for as many as it stands for."""
+        self.left_out = 0
+
+    def add(self, mark: Mark) -> None:
+        """One more."""
+        self.counts[mark.name] += mark.count
+        first = self._first.setdefault(mark.name, [])
+        if len(first) < FIRST:
+            first.append(mark)
+            return
+        last = self._last.setdefault(mark.name, deque(maxlen=LAST))
+        self.left_out += len(last) == LAST
+        last.append(mark)
+
+    def all(self) -> list[Mark]:
+        """Those that are kept, by time."""
+        rows = [mark for kept in (self._first, self._last) for row in kept.values() for mark in row]
+        return sorted(rows, key=lambda mark: mark.t)
+
+
+class Driven(Struct):
+    """What one source did with the robot."""
+
+    seconds: float = 0.0
+    metres: float = 0.0
+
+
+class Course:
+    """Takes one step after the other, those between `begin` and `end` (s since 1970) count."""
+
+    def __init__(
+        self, config: Config, begin: float | None = None, end: float | None = None
+    ) -> None:
+        self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
+        self.config = config
+        """In force at the beginning."""
+        self.path = Track()
+        self.linear = {name: Curve() for name in ("wished", "limited", "measured")}
+        self.angular = {name: Curve() for name in ("wished", "limited", "measured")}
+        self.asked, self.turned = [Curve() for _ in range(4)], [Curve() for _ in range(4)]
+        """rad/s, in `WHEELS` order."""
+        self.modes, self.links = Band(MODES), Band(LINKS)
+        self.commanders = Commanders(config.commands.sources)
+        self.link = Link()
+        self.lateness = Lateness(config.rate_hz)
+        self.marks = Marks()
+        self.began: float | None = None
+        """s since 1970 of the first step that counts: t is 0 there."""
+        self.seconds = self.metres = 0.0
+        self.driven: dict[str, Driven] = {}
+        self.fastest = Twist()
+        """Each axis by itself, without its sign."""
+        self.steps = self.missing = 0
+        self._story = Story()
+        self._mono_ns = self._wall_ns = 0
+        self._wall = -math.inf
+        """s since 1970 of the last step."""
+        self._number: int | None = None
+        self._place: Place | None = None
+        self._jumps = True
+        self._looked = self._left = -math.inf
+        self._status: tuple[str, ...] = ()
+
+    @property
+    def over(self) -> bool:
+        """No step to come counts."""
+        return self._wall > self._window[1]
+
+    def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
+        """A step as it was recorded, and what `robot` made of it now."""
+        now = step.inputs.now
+        if self._number is None:
+            self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
+        self._wall = wall = (self._wall_ns + now.mono_ns - self._mono_ns) / NS_PER_S
+        counts = self._window[0] <= wall <= self._window[1]
+        known = self._number is None or step.number == self._number + 1
+        if counts and self.began is None:
+            self.began = wall
+        t = max(self.seconds, wall - (self.began or wall))
+        self._drive(step, t, counts)
+        refused = self.commanders.hear(step, t, robot)
+        told = list(self._story.step(step))
+        if counts:
+            if not known:
+                self.missing += step.number - (self._number or 0) - 1
+            self.steps += 1
+            self._speeds(step, outputs, t)
+            self._line(step, outputs, robot, t, known)
+            self._look(step, t, robot, refused)
+            for one in told:
+                self.marks.add(self._mark(one, t))
+            self.seconds = t
+        self._number = step.number
+
+    def end(self) -> None:
+        """There are no more steps."""
+        t = self.seconds
+        for band in (self.modes, self.links, *self.commanders.bands.values()):
+            band.end(t)
+        self.link.end()
+
+    def _mark(self, one: Told, t: float) -> Mark:
+        text, by = one.text[:MOST_TEXT], one.by[:MOST_TEXT]
+        return Mark(t, one.name, text, one.level, by, one.count, self._place)
+
+    # what it drove
+
+    def _drive(self, step: Step, t: float, counts: bool) -> None:
+        mode, _, _, source = step.said.status
+        by = self._driven(source) if mode == "driving" and counts else None
+        if by is not None and t > self.seconds:
+            by.seconds += t - self.seconds
+        for x, y, yaw in step.said.poses:
+            place = Place(t, x / MICRO, y / MICRO, yaw / MICRO, self._jumps)
+            if self._place is not None and not self._jumps and counts:
+                way = math.hypot(place.x - self._place.x, place.y - self._place.y)
+                self.metres += way
+                if by is not None:
+                    by.metres += way
+            self._place, self._jumps = place, False
+            if counts:
+                self.path.add(place)
+        # Requests are served after the poses of their step.
+        if any(request.verb in ("set_pose", "reset_odometry") for request in step.inputs.requests):
+            self._jumps = True
+
+    def _driven(self, source: str) -> Driven:
+        return self.driven.setdefault(self.commanders.name(source), Driven())
+
+    def _speeds(self, step: Step, outputs: Outputs, t: float) -> None:
+        wish = self.commanders.wish(outputs)
+        curves = ((self.linear, "linear"), (self.angular, "angular"))
+        for curve, axis in curves:
+            curve["wished"].add(t, None if wish is None else getattr(wish, axis))
+            self._asked(curve["limited"], step, t, getattr(outputs.applied, axis))
+        for wheel, speed in zip(self.asked, outputs.speeds.as_tuple(), strict=True):
+            self._asked(wheel, step, t, speed)
+        if step.said.left is not None:
+            self._left = t
+        if step.said.status[2] != "up":
+            for one in (self.linear["measured"], self.angular["measured"], *self.turned):
+                one.add(t, None)
+        for estimate in outputs.estimates:
+            twist, most = estimate.twist, self.fastest
+            self.linear["measured"].add(t, twist.linear)
+            self.angular["measured"].add(t, twist.angular)
+            for wheel, speed in zip(self.turned, estimate.speeds.as_tuple(), strict=True):
+                wheel.add(t, speed)
+            self.fastest = Twist(
+                max(most.linear, abs(twist.linear)), max(most.angular, abs(twist.angular))
+            )
+
+    def _asked(self, curve: Curve, step: Step, t: float, speed: float) -> None:
+        """What a line that left says counts until the microcontroller has waited for another."""
+        if step.said.left is not None:
+            curve.add(t, speed)
+        elif t - self._left > WATCHDOG_S:
+            curve.add(t, None)
+
+    # what the line and the modes were
+
+    def _line(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
+        inputs, left = step.inputs, step.said.left is not None
+        session = robot.session
+        rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
+        impossible = {"line_impossible": robot.counters["line_impossible"]}
+        self.link.step(t, left, {"lines": session.good_lines} | rejected | impossible)
+        if inputs.tick:
+            self.lateness.tick(t, inputs.now.mono_ns, inputs.missed, known)
+        elif outputs.due and left:
+            self.lateness.at_once()
+
+    def _look(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
+        mode, reason, link, _ = status = step.said.status
+        if status == self._status and t - self._looked < LOOK_S and not refused:
+            return
+        self._status, self._looked = status, t
+        self.modes.add(t, mode[:MOST_TEXT], reason[:MOST_TEXT])
+        self.links.add(t, link[:MOST_TEXT])
+        self.commanders.look(step, t, robot)

@@ -1,0 +1,249 @@
+"""The pictures of a course over time, and `Pictures.all`: every picture of it.
+
+Time is in ms since 1970 by the clock on the wall here: the library knows no time zones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from acsard.report.commanders import OTHERS
+from acsard.report.course import Course, Mark
+from acsard.report.drawing import (
+    COLOURS,
+    LIMITED,
+    MEASURED,
+    UNKNOWN,
+    WISHED,
+    Figure,
+    Key,
+    Trace,
+    label,
+    layout,
+    note,
+    numbers,
+    sentence,
+)
+from acsard.report.path import path
+from acsard.report.thinning import Point, Span
+from acsard.values import WHEELS
+
+ROW_PX, ROOM_PX = 54, 60
+"""Height of a row of bands, and what the time axis takes beside the rows."""
+
+
+class Line(NamedTuple):
+    """A curve of a picture, and how it goes from one value to the next."""
+
+    name: str
+    colour: str
+    points: Sequence[Point]
+    shape: str = "linear"
+
+
+class Part(NamedTuple):
+    """One of several pictures above one time axis."""
+
+    title: str
+    lines: list[Line]
+
+
+class Pictures:
+    """Draws a course; `offset_s` is what the clocks here are ahead of UTC."""
+
+    def __init__(self, course: Course, offset_s: float) -> None:
+        self._course = course
+        self._zero_ms = 1000 * ((course.began or 0.0) + offset_s)
+
+    def all(self) -> list[Figure]:
+        """In the order of the page."""
+        return [
+            path(self._course), self.speeds(), self.who(), self.events(), self.wheels(),
+            self.link(), self.loop(),
+        ]  # fmt: skip
+
+    def speeds(self) -> Figure:
+        """What was wished, allowed and measured."""
+        course = self._course
+        parts = [
+            Part(
+                title,
+                [
+                    Line("wished", WISHED, curves["wished"].points(), "hv"),
+                    Line("limited", LIMITED, curves["limited"].points(), "hv"),
+                    Line("measured", MEASURED, curves["measured"].points()),
+                ],
+            )
+            for title, curves in (
+                ("forward, m/s", course.linear),
+                ("turning, rad/s", course.angular),
+            )
+        ]
+        caption = (
+            "Wished by who is followed; limited is what was asked of the wheels; measured is what "
+            "they said. Turning left and driving forward are above zero."
+        )
+        return self._stack("speeds", "Speed", caption, parts, 210)
+
+    def wheels(self) -> Figure:
+        """What each wheel was asked, and what it said."""
+        pairs = zip(WHEELS, self._course.asked, self._course.turned, strict=True)
+        parts = [
+            Part(
+                f"{name.replace('_', ' ')}, rad/s",
+                [
+                    Line("asked", LIMITED, asked.points(), "hv"),
+                    Line("measured", MEASURED, turned.points()),
+                ],
+            )
+            for name, asked, turned in pairs
+        ]
+        caption = "Above zero drives the robot forward."
+        return self._stack("wheels", "The four wheels", caption, parts, 150)
+
+    def link(self) -> Figure:
+        """Lines a second."""
+        link = self._course.link
+        bad = [Line("dropped", COLOURS["error"], link.dropped.points(), "hvh")]
+        if not self._course.config.mcu.reply_period:
+            bad.append(Line("no answer", WISHED, link.unanswered.points(), "hvh"))
+        parts = [
+            Part(
+                "lines a second",
+                [
+                    Line("sent", LIMITED, link.sent.points(), "hvh"),
+                    Line("answered", MEASURED, link.good.points(), "hvh"),
+                ],
+            ),
+            Part("lost a second", bad),
+        ]
+        caption = (
+            "Dropped lines came and could not be read or believed; those without an answer are "
+            "lost on the way there or back."
+        )
+        return self._stack("link", "The serial line", caption, parts, 170)
+
+    def loop(self) -> Figure:
+        """How late it was."""
+        late = Line("late", LIMITED, self._course.lateness.points(), "hv")
+        caption = "From when a period was due to its step, against the one that was least late."
+        return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
+
+    def who(self) -> Figure:
+        """Mode, link and sources as bands."""
+        course, silent = self._course, list[str]()
+        rows: list[tuple[str, list[Span]]] = [
+            ("mode", course.modes.spans()),
+            ("link", course.links.spans()),
+        ]
+        for name, band in course.commanders.bands.items():
+            if band.spans():
+                rows.append((name, band.spans()))
+            elif name != OTHERS:
+                silent.append(name)
+        kinds = dict.fromkeys(span.kind for _, spans in rows for span in spans)
+        data = [
+            self._bars(
+                kind,
+                [(at, s) for at, (_, spans) in enumerate(rows) for s in spans if s.kind == kind],
+            )
+            for kind in kinds
+        ]
+        keys = [Key("■", COLOURS.get(kind, UNKNOWN), kind) for kind in kinds]
+        axes = self._timed() | {
+            "barmode": "overlay",
+            "uniformtext": {"mode": "hide", "minsize": 11},
+            "yaxis": {"range": [len(rows) - 0.45, -0.75], "visible": False, "fixedrange": True},
+            "annotations": [note(name, 0, at - 0.44) for at, (name, _) in enumerate(rows)],
+        }
+        caption = "Point at a band to read why. A source waits while another one before it sends."
+        if silent:
+            caption += f" Silent all the time: {', '.join(silent)}."
+        height = ROW_PX * len(rows) + ROOM_PX
+        return Figure("who", "Who drove, and why others did not", caption, keys, height, data, axes)
+
+    def _bars(self, kind: str, spans: list[tuple[int, Span]]) -> Trace:
+        colour = COLOURS.get(kind, UNKNOWN)
+        return {
+            "type": "bar",
+            "orientation": "h",
+            "name": label(kind),
+            "base": numbers(self._ms(span.begin) for _, span in spans),
+            "x": numbers(1000 * (span.end - span.begin) for _, span in spans),
+            "y": numbers(at for at, _ in spans),
+            "width": 0.5,
+            # However short it is, a line of it is seen.
+            "marker": {"color": colour, "line": {"color": colour, "width": 1}},
+            "hovertext": [f"<b>{label(kind)}</b><br>{label(span.words)}" for _, span in spans],
+            "hovertemplate": "%{hovertext}<extra></extra>",
+            "text": [label(kind) for _ in spans],
+            "textposition": "inside",
+            "insidetextanchor": "middle",
+            "textangle": 0,
+        }
+
+    def events(self) -> Figure:
+        """All events as marks."""
+        levels, kept = ("info", "warning", "error"), self._course.marks
+        data = [
+            self._marks(level, at, [mark for mark in kept.all() if mark.level == level])
+            for at, level in enumerate(levels)
+        ]
+        axes = self._timed() | {
+            "yaxis": {"range": [-0.5, len(levels)], "visible": False, "fixedrange": True},
+            "annotations": [note(level, 0, at + 0.42) for at, level in enumerate(levels)],
+        }
+        caption = "Point at a mark to read it; the list is at the end."
+        keys = [Key("◆", COLOURS[level], level) for level in reversed(levels)]
+        return Figure("events", "Events", caption, keys, 230, data, axes)
+
+    def _marks(self, level: str, at: int, marks: list[Mark]) -> Trace:
+        return {
+            "type": "scatter",
+            "mode": "markers",
+            "name": level,
+            "x": numbers(self._ms(mark.t) for mark in marks),
+            "y": numbers(at for _ in marks),
+            "marker": {"symbol": "diamond", "size": 11, "color": COLOURS[level]},
+            "hovertext": [sentence(mark) for mark in marks],
+            "hovertemplate": "%{hovertext}<extra></extra>",
+        }
+
+    # what is alike in them
+
+    def _ms(self, t: float) -> float:
+        return self._zero_ms + 1000 * t
+
+    def _timed(self) -> dict[str, Any]:
+        seconds = max(self._course.seconds, 0.1)
+        axis = {"type": "date", "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)]}
+        return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 36}}
+
+    def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
+        """Pictures above each other, with one time axis and one legend."""
+        axes, data, notes = self._timed(), list[Trace](), list[dict[str, Any]]()
+        share, gap = 1 / len(parts), 30 / (px * len(parts))
+        for at, part in enumerate(parts):
+            top, n = 1 - at * share, "" if not at else str(at + 1)
+            axes[f"yaxis{n}"] = {"domain": [top - share, top - gap], "rangemode": "tozero"}
+            where = {"xref": "paper", "yref": "paper", "yanchor": "bottom"}
+            notes.append(note(part.title, 0, top - gap) | where)
+            data += [self._line(line, f"y{n}") for line in part.lines]
+        axes["xaxis"]["anchor"] = f"y{len(parts)}" if len(parts) > 1 else "y"
+        axes["annotations"] = notes
+        lines = dict.fromkeys((line.name, line.colour) for part in parts for line in part.lines)
+        keys = [Key("━", colour, meaning) for meaning, colour in lines]
+        return Figure(name, title, caption, keys, px * len(parts) + 70, data, axes)
+
+    def _line(self, line: Line, axis: str) -> Trace:
+        return {
+            "type": "scatter",
+            "mode": "lines",
+            "name": line.name,
+            "x": numbers(self._ms(point.t) for point in line.points),
+            "y": numbers(point.value for point in line.points),
+            "yaxis": axis,
+            "line": {"color": line.colour, "width": 1.6, "shape": line.shape},
+            "hovertemplate": f"{line.name} %{{y:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>",
+        }

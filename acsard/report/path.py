@@ -1,0 +1,115 @@
+"""The picture of where a robot went."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+from acsard.report.course import Course, Marks
+from acsard.report.drawing import (
+    COLOURS,
+    END,
+    LIMITED,
+    MEASURED,
+    Figure,
+    Key,
+    Trace,
+    layout,
+    numbers,
+    sentence,
+)
+from acsard.report.thinning import Place
+
+HEADINGS = 12
+"""Arrows along a path."""
+
+NOTED = ("fault", "stop", "link_down", "link_stale")
+"""Events that the path shows where they happened."""
+
+
+def path(course: Course) -> Figure:
+    """Where it went."""
+    places = course.path.places()
+    keys: list[Key] = []
+    data: list[Trace] = []
+    if places:
+        arrows = _spread(places)
+        data = [
+            _places("path", _broken(places), "lines", line={"color": LIMITED, "width": 2.5}),
+            _places("heading", arrows, "markers", marker=_arrows(arrows)),
+            _places("start", places[:1], "markers", marker=_dot("circle", MEASURED, 14)),
+            _places("end", places[-1:], "markers", marker=_dot("square", END, 13)),
+        ]
+        keys = [Key("▶", LIMITED, "heading"), Key("●", MEASURED, "start"), Key("■", END, "end")]
+    for name in NOTED:
+        trace = _noted(name, course.marks)
+        if trace:
+            data.append(trace)
+            keys.append(Key("✖", trace["marker"]["color"], trace["name"]))
+    axes = layout() | {
+        "xaxis": {"title": {"text": "x, m"}, "automargin": True},
+        "yaxis": {"title": {"text": "y, m"}, "scaleanchor": "x", "scaleratio": 1},
+        "margin": {"l": 58, "r": 12, "t": 8, "b": 48},
+    }
+    caption = (
+        "By odometry, both axes in m and equal."
+        if places
+        else "No feedback that could be believed: nothing is known of where it went."
+    )
+    return Figure("path", "The path", caption, keys, 460, data, axes, timed=False)
+
+
+def _noted(name: str, marks: Marks) -> Trace | None:
+    """Where these events happened."""
+    marks_here = [mark for mark in marks.all() if mark.name == name]
+    here = [(mark, mark.place) for mark in marks_here if mark.place is not None]
+    if not here:
+        return None
+    dot = _dot("x", COLOURS["error" if name == "fault" else "warning"], 11)
+    trace = _places(name.replace("_", " "), [at for _, at in here], "markers", marker=dot)
+    words = [sentence(mark) for mark, _ in here]
+    return trace | {"hovertext": words, "hovertemplate": "%{hovertext}<extra></extra>"}
+
+
+def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
+    return {
+        "type": "scatter",
+        "mode": mode,
+        "name": name,
+        "x": numbers(place.x for place in places),
+        "y": numbers(place.y for place in places),
+        "hovertemplate": f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
+        **look,
+    }
+
+
+def _broken(places: list[Place]) -> list[Place]:
+    """With a gap where it was set elsewhere."""
+    gap = Place(0.0, math.nan, math.nan, 0.0)
+    found = [one for place in places for one in ((gap, place) if place.new else (place,))]
+    return found[1:] if found and found[0] is gap else found
+
+
+def _spread(places: list[Place]) -> list[Place]:
+    """Some of them, as far from each other by way as can be."""
+    ways = [0.0]
+    for one, other in pairwise(places):
+        step = 0.0 if other.new else math.hypot(other.x - one.x, other.y - one.y)
+        ways.append(ways[-1] + step)
+    every, found, due = ways[-1] / HEADINGS, list[Place](), 0.0
+    for place, way in zip(places, ways, strict=True):
+        if way >= due and (not found or way > 0):
+            found.append(place)
+            due += max(every, way - due)
+    return found
+
+
+def _arrows(places: list[Place]) -> dict[str, Any]:
+    """The library's angles are in degrees from up, clockwise."""
+    angles = [round(90 - math.degrees(place.yaw), 2) for place in places]
+    return {"symbol": "arrow", "size": 13, "color": LIMITED, "angle": angles}
+
+
+def _dot(symbol: str, colour: str, size: int) -> dict[str, Any]:
+    return {"symbol": symbol, "size": size, "color": colour}

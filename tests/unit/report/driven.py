@@ -1,0 +1,62 @@
+"""Drives of the simulator as courses, for the tests of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+from acsard.config.settings import Config
+from acsard.record.replay import Replay
+from acsard.record.steps import Step
+from acsard.report.course import Course
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def course_of(
+    drive: Callable[[World], None], begin: float | None = None, end: float | None = None
+) -> tuple[Course, list[Step]]:
+    """What a drive shows, and its steps."""
+    config, tape = Config(), Tape()
+    world = World(config, recorder=tape)
+    drive(world)
+    steps = tape.steps()
+    return followed(steps, config, begin, end), steps
+
+
+def followed(
+    steps: list[Step],
+    config: Config | None = None,
+    begin: float | None = None,
+    end: float | None = None,
+) -> Course:
+    """The course of these steps."""
+    config = config or Config()
+    course, replay = Course(config, begin, end), Replay(config)
+    for step in steps:
+        replay.step(step)
+        assert replay.outputs is not None
+        course.step(step, replay.outputs, replay.robot)
+    course.end()
+    return course
+
+
+def two_drivers(world: World) -> None:
+    """Nav drives, teleop takes over, somebody stops it; then a stranger and an old command."""
+    world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
+    for n in range(40):
+        world.send(0.5, 0.3, "nav")
+        world.send(-0.3 if n else 0.0, -0.8 if n else 0.0, "teleop")
+        world.run(0.05)
+    world.call("stop")
+    world.hold(0.3, seconds=0.5, source="teleop")
+    world.call("clear")
+    world.run(0.5)
+    world.send(0.1, 0.0, "stranger")
+    world.run(0.2)
+
+
+@lru_cache
+def drive_of_two() -> tuple[Course, list[Step]]:
+    """That drive, which nobody changes."""
+    return course_of(two_drivers)

@@ -1,0 +1,68 @@
+"""A recording in words."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.config.settings import Config, Source
+from acsard.report.account import Origin, Setting, differences, lasted, reasons, rows, summary
+from tests.scenarios.world import World
+from tests.unit.report.driven import course_of, drive_of_two
+
+
+def test_the_summary_says_how_far_how_fast_and_who_stopped_it() -> None:
+    course, _ = drive_of_two()
+    text = summary(course)
+    assert text.startswith(f"It drove {course.metres:.2f} m in ")
+    assert f"at most {course.fastest.linear:.2f} m/s and {course.fastest.angular:.2f} rad/s" in text
+    assert text.endswith("There were no faults, 1 stop (by unnamed (native)).")
+
+
+def test_a_robot_that_stood_did_not_drive() -> None:
+    course, _ = course_of(lambda world: world.run(0.5))
+    assert summary(course).startswith("It did not drive in these 0.5 s.")
+
+
+def test_a_fault_is_told_with_its_time_and_its_words() -> None:
+    def stuck(world: World) -> None:
+        world.drive(0.5, seconds=0.5)
+        with world.mcu.dead_motor(0):
+            world.hold(0.5, 0.4, seconds=1.5)
+
+    course, _ = course_of(stuck)
+    assert "There was 1 fault" in summary(course)
+    origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
+    table = dict(rows(course, origin, lambda s, day: f"<{s:.0f}{' day' if day else ''}>"))
+    assert table["Faults"].startswith("1: <1800000")
+    assert "front_right wheel" in table["Faults"]
+    assert table["When"] == "<1800000000 day> to <1800000002 day>"
+    assert table["Recorded by"] == "acsard 0.1.0, Python 3.11.0"
+
+
+def test_only_what_is_not_the_default_is_told_of_a_configuration() -> None:
+    config = Config()
+    assert differences(config) == []
+    sources = (*config.commands.sources, Source("joe", 7))
+    other = replace(
+        config,
+        limits=replace(config.limits, linear_speed=0.3),
+        commands=replace(config.commands, sources=sources),
+    )
+    assert differences(other) == [
+        Setting("limits.linear_speed", "0.3", "1.0"),
+        Setting("commands.sources.joe.priority", "7", "-"),
+        Setting("commands.sources.joe.timeout", "0.25", "-"),
+    ]
+
+
+def test_the_longest_reason_comes_first() -> None:
+    course, _ = drive_of_two()
+    first, *rest = reasons(course)
+    assert first[:2] == ("nav", "waits")
+    assert all(first[3] >= other[3] for other in rest)
+
+
+def test_times_are_said_as_people_do() -> None:
+    assert [lasted(s) for s in (0.04, 59.94, 60.0, 3599.7, 86400.0)] == [
+        "0.0 s", "59.9 s", "1 min 0 s", "1 h 0 min", "24 h 0 min",
+    ]  # fmt: skip

@@ -1,0 +1,131 @@
+"""What a course says is what was recorded, and what the robot makes of it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from acsard.record.steps import MICRO
+from acsard.report.course import FIRST, LAST, Mark, Marks
+from tests.scenarios.world import START, World
+from tests.unit.report.driven import course_of, drive_of_two, followed
+
+
+def test_the_path_and_its_length_are_the_recorded_poses() -> None:
+    course, steps = drive_of_two()
+    poses = [pose for step in steps for pose in step.said.poses]
+    way = sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(poses)) / MICRO
+    assert course.metres == pytest.approx(way)
+    last = course.path.places()[-1]
+    assert (last.x, last.y, last.yaw) == tuple(value / MICRO for value in poses[-1])
+
+
+def test_what_was_wished_limited_and_measured() -> None:
+    course, _ = drive_of_two()
+    top = {name: max(p.value for p in curve.points()) for name, curve in course.linear.items()}
+    low = {name: min(p.value for p in curve.points()) for name, curve in course.angular.items()}
+    assert (top["wished"], low["wished"]) == (0.5, -0.8)
+    assert top["limited"] == pytest.approx(0.5)
+    assert low["limited"] == pytest.approx(-0.8)
+    assert top["measured"] == course.fastest.linear
+    assert course.fastest.angular == -low["measured"]
+    assert top["measured"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_each_wheel_follows_what_it_was_asked() -> None:
+    course, _ = drive_of_two()
+    for asked, turned in zip(course.asked, course.turned, strict=True):
+        most = max(point.value for point in asked.points())
+        assert max(point.value for point in turned.points()) == pytest.approx(most, rel=0.05)
+    right, left = (max(p.value for p in course.asked[wheel].points()) for wheel in (0, 1))
+    assert right > left  # it turned left
+
+
+def test_what_no_line_says_is_no_value() -> None:
+    def unplugged(world: World) -> None:
+        world.drive(0.5, seconds=0.6)
+        world.port.unplug()
+        world.run(1.0)
+        world.port.plug(world.mcu)
+        world.run(0.5)
+
+    course, _ = course_of(unplugged)
+    for curve in (course.linear["measured"], course.linear["limited"], course.asked[0]):
+        points = curve.points()
+        gap = next(at for at, p in enumerate(points) if math.isnan(p.value) and p.t > 0.5)
+        assert points[gap + 1].t - points[gap].t > 0.6
+
+
+def test_the_bands_of_the_mode_are_those_recorded() -> None:
+    course, steps = drive_of_two()
+    modes = [span.kind for span in course.modes.spans()]
+    recorded = [step.said.status[0] for step in steps]
+    changes = [recorded[0], *[b for a, b in pairwise(recorded) if a != b]]
+    assert [kind for at, kind in enumerate(modes) if not at or kind != modes[at - 1]] == changes
+    assert "stopped by request" in next(
+        s.words for s in course.modes.spans() if s.kind == "stopped"
+    )
+
+
+def test_who_drove_how_far_and_for_how_long() -> None:
+    course, steps = drive_of_two()
+    assert set(course.driven) == {"nav", "teleop"}
+    driving = sum(
+        b.inputs.now.mono_ns - a.inputs.now.mono_ns
+        for a, b in pairwise(steps)
+        if b.said.status[0] == "driving"
+    )
+    assert sum(one.seconds for one in course.driven.values()) == pytest.approx(driving / 1e9)
+    assert 0.0 < sum(one.metres for one in course.driven.values()) <= course.metres
+
+
+def test_events_are_marks_with_who_asked_and_where() -> None:
+    course, _ = drive_of_two()
+    (stop,) = [mark for mark in course.marks.all() if mark.name == "stop"]
+    assert stop.by == "unnamed (native)"
+    assert stop.place is not None
+    assert stop.place.x > 0.3
+    assert [mark.t for mark in course.marks.all()] == sorted(m.t for m in course.marks.all())
+
+
+def test_of_very_many_events_of_one_name_the_first_and_the_last_are_kept() -> None:
+    marks = Marks()
+    for n in range(1000):
+        marks.add(Mark(float(n), "stop", "stopped", "info", "joe", 2, None))
+    marks.add(Mark(500.5, "fault", "a wheel", "error", "", 1, None))
+    stops = [mark.t for mark in marks.all() if mark.name == "stop"]
+    assert stops == [*range(FIRST), *range(1000 - LAST, 1000)]
+    assert marks.left_out == 1000 - FIRST - LAST
+    assert marks.counts == {"stop": 2000, "fault": 1}
+
+
+def test_a_pose_that_is_set_is_no_way_driven() -> None:
+    def set_away(world: World) -> None:
+        world.drive(0.3, seconds=0.3)
+        world.call("set_pose", b'{"x": 100.0, "y": 0.0, "yaw": 0.0}')
+        world.run(0.2)
+
+    course, _ = course_of(set_away)
+    assert course.metres < 1.0
+    assert [place.new for place in course.path.places()].count(True) == 2  # the first is new too
+
+
+def test_a_part_of_the_time_is_that_part_alone() -> None:
+    _, steps = drive_of_two()
+    begin = START.wall_ns / 1e9 + 1.0
+    course = followed(steps, begin=begin, end=begin + 0.9)
+    assert course.began == pytest.approx(begin, abs=0.02)
+    assert course.seconds == pytest.approx(0.9, abs=0.03)
+    assert set(course.driven) == {"nav"}
+    assert "stop" not in course.marks.counts
+    assert course.linear["measured"].points()[0].value == pytest.approx(0.5, rel=0.1)
+    assert followed(steps, begin=begin + 1e6).began is None
+
+
+def test_missing_steps_are_counted() -> None:
+    _, steps = drive_of_two()
+    course = followed(steps[:200] + steps[260:])
+    assert course.missing == 60
+    assert course.marks.counts["gap"] == 1

@@ -1,0 +1,71 @@
+"""The pictures: the library takes them, and their numbers are those of the course."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import plotly.graph_objects as library
+import pytest
+
+from acsard.report.drawing import Figure
+from acsard.report.figures import Pictures
+from tests.scenarios.world import START
+from tests.unit.report.driven import course_of, drive_of_two
+from tests.unit.report.seen import column, trace
+
+OFFSET_S = 3600.0
+
+
+@pytest.fixture(scope="module")
+def figures() -> dict[str, Figure]:
+    course, _ = drive_of_two()
+    return {figure.name: figure for figure in Pictures(course, OFFSET_S).all()}
+
+
+def known(values: Iterable[float]) -> list[float | None]:
+    """With what compares as equal in place of NaN."""
+    return [None if math.isnan(value) else value for value in values]
+
+
+def test_the_library_knows_every_word_of_them(figures: dict[str, Figure]) -> None:
+    for figure in figures.values():
+        made = library.Figure(data=figure.data, layout=figure.layout)
+        assert len(made.data) == len(figure.data)
+
+
+def test_a_speed_is_at_the_time_of_the_clock_on_the_wall(figures: dict[str, Figure]) -> None:
+    course, _ = drive_of_two()
+    points, drawn = course.linear["measured"].points(), trace(figures["speeds"], "measured")
+    assert known(column(drawn["y"])) == known(point.value for point in points)
+    zero_ms = 1000 * (START.wall_ns / 1e9 + OFFSET_S)
+    times = [(ms - zero_ms) / 1000 for ms in column(drawn["x"])]
+    assert times == pytest.approx([point.t for point in points], abs=0.02)
+
+
+def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None:
+    course, _ = drive_of_two()
+    for n, curve in enumerate(course.turned):
+        drawn = trace(figures["wheels"], "measured", f"y{n + 1}" if n else "y")
+        assert known(column(drawn["y"])) == known(point.value for point in curve.points())
+
+
+def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
+    waits = trace(figures["who"], "waits")
+    words = [text.replace("<br>", " ") for text in waits["hovertext"]]
+    assert "<b>waits</b> teleop has the higher priority: until it is silent" in words
+    assert max(column(waits["x"])) > 1500  # ms
+    rows = [note["text"] for note in figures["who"].layout["annotations"]]
+    assert rows == ["mode", "link", "teleop", "nav", "others"]
+    assert "Silent all the time: app, ros2_control." in figures["who"].caption
+
+
+def test_a_robot_that_was_never_heard_is_drawn_all_the_same() -> None:
+    def mute(world: Any) -> None:
+        world.port.unplug()
+        world.run(1.0)
+
+    course, _ = course_of(mute)
+    for figure in Pictures(course, 0.0).all():
+        library.Figure(data=figure.data, layout=figure.layout)

@@ -1,0 +1,163 @@
+"""The file: one page that loads nothing, and in which no word of a stranger is more than a word."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from functools import lru_cache
+from html.parser import HTMLParser
+
+import pytest
+
+from acsard.record.steps import Step
+from acsard.report.account import Origin
+from acsard.report.course import Course, Mark
+from acsard.report.page import MOST_OPEN, escaped, page
+from acsard.values import Command, Event, Refusal, Twist
+from tests.unit.report.driven import drive_of_two, followed
+
+EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\u202e\x00<!--'
+
+LIBRARY = "var Plotly = {};"
+
+
+class Read(HTMLParser):
+    """What a browser would see."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[tuple[dict[str, str | None], str]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "script":
+            self.scripts.append((dict(attrs), ""))
+
+    def handle_data(self, data: str) -> None:
+        if self.lasttag == "script" and data.strip():
+            attrs, before = self.scripts[-1]
+            self.scripts[-1] = attrs, before + data
+        elif data.strip():
+            self.words.append(data)
+
+
+def clock(seconds: float, day: bool) -> str:
+    return f"{seconds:.1f}"
+
+
+def origin(**others: str) -> Origin:
+    known = {"file": "a.mcap", "robot": "r", "version": "1", "python": "3"} | others
+    return Origin(known["file"], known["robot"], known["version"], known["python"])
+
+
+def evil_steps() -> list[Step]:
+    """A drive in which everything that strangers write is hostile."""
+    from msgspec.structs import replace
+
+    _, steps = drive_of_two()
+    found = []
+    for n, step in enumerate(steps[:300]):
+        inputs, said = step.inputs, step.said
+        if n == 150:
+            now_ns = inputs.now.mono_ns
+            command = Command(EVIL, Twist(), now_ns, sender=EVIL)
+            refusal = Refusal("undecodable", f"cmd/nav: {EVIL}", "nav", EVIL, now_ns)
+            inputs = replace(inputs, commands=(command,), refusals=(refusal,))
+            event = Event("stop", EVIL, by=EVIL)
+            said = replace(said, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
+        found.append(replace(step, inputs=inputs, said=said))
+    return found
+
+
+@lru_cache
+def evil() -> str:
+    return page(followed(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock)
+
+
+def test_no_word_of_a_stranger_is_markup_or_program() -> None:
+    read = Read(evil())
+    assert not {"img", "iframe", "object", "a", "link"} & {tag for tag, _ in read.tags}
+    assert all(not name.startswith("on") for _, attrs in read.tags for name in attrs)
+    assert [bool(text) for _, text in read.scripts] == [True, True, True]
+    assert "<script>alert" not in evil()
+    assert evil().count("</script") == 3
+    assert "\u202e" not in evil()
+    assert "\x00" not in evil()
+    # And yet a person reads them, and who sent it.
+    assert sum("<script>alert(1)</script>" in words for words in read.words) >= 4
+
+
+def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
+    (pictures,) = [text for attrs, text in Read(evil()).scripts if attrs.get("id") == "pictures"]
+    assert "<" not in pictures
+    traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
+    texts = [text for t in traces for key in ("hovertext", "text") for text in t.get(key, ())]
+    texts += [trace["name"] for trace in traces]
+    said = [text for text in texts if "alert(1)" in text]
+    assert len(said) >= 3  # the event, the mode, the refusal
+    tags = {tag for text in texts for tag in re.findall(r"<[^>]*>", text)}
+    assert tags <= {"<b>", "</b>", "<br>"}
+
+
+def test_it_loads_nothing_and_only_its_own_programs_may_run() -> None:
+    course, _ = drive_of_two()
+    text = page(course, origin(), LIBRARY, clock)
+    assert re.findall(r"(?:https?:)?//[\w.]+\.\w+", text) == []
+    read = Read(text)
+    assert all(not {"src", "href"} & set(attrs) for _, attrs in read.tags)
+    (policy,) = [
+        attrs["content"] for tag, attrs in read.tags if attrs.get("http-equiv") is not None
+    ]
+    assert policy is not None
+    assert policy.startswith("default-src 'none'; ")
+    programs = [body for attrs, body in read.scripts if "type" not in attrs]
+    assert programs[0] == LIBRARY
+    for program in programs:
+        digest = base64.b64encode(hashlib.sha256(program.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_every_event_has_a_row_with_who_asked() -> None:
+    course, _ = drive_of_two()
+    words = Read(page(course, origin(), LIBRARY, clock)).words
+    marks = course.marks.all()
+    assert f"All {len(marks)} events" in words
+    for mark in marks:
+        assert escaped_words(mark) in words
+    assert "unnamed (native)" in words
+
+
+def escaped_words(mark: Mark) -> str:
+    return mark.text or mark.name.replace("_", " ")
+
+
+def test_what_is_missing_is_said_on_top() -> None:
+    _, steps = drive_of_two()
+    course = followed(steps[:200] + steps[260:])
+    notes = Origin("a", "r", "1", "3", ("no end: cut, or being written",))
+    words = Read(page(course, notes, LIBRARY, clock)).words
+    assert "no end: cut, or being written" in words
+    assert any(text.startswith("60 steps are missing: ") for text in words)
+
+
+@pytest.mark.parametrize(("count", "opened"), [(MOST_OPEN, True), (MOST_OPEN + 1, False)])
+def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
+    from acsard.config.settings import Config
+
+    course = Course(Config())
+    for n in range(count):
+        course.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
+    (details,) = [
+        a for tag, a in Read(page(course, origin(), LIBRARY, clock)).tags if tag == "details"
+    ]
+    assert ("open" in details) is opened
+
+
+def test_escaped_is_one_line_of_text() -> None:
+    assert escaped('<a href="x">\n&') == "&lt;a href=&quot;x&quot;&gt; &amp;"
