@@ -166,7 +166,9 @@ class Arbiter:
             self._holder = None
             doubtful = (source.proof for source in self._ranking if source.doubtful(now_ns))
             return Choice(wait=next(doubtful, COMMAND))
-        source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
+        source, sender = live[0]
+        if len(live) > 1:
+            source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
         self._holder = source
         if sender.state != "free":
             lasts = _lasts(now_ns - sender.came_ns)

@@ -63,6 +63,8 @@ class _Wheel:
         self.expected = 0.0
         self.seen = 0.0
         self.evidence = dict.fromkeys(_FAULTS, 0.0)
+        self.suspected = False
+        """There is some of that."""
         self.slowest = 0.0
         """rad/s; down to here it has slowed since it is faster than it should be."""
 
@@ -158,7 +160,11 @@ class Sanity:
         self._notice(seen, dt, still)
         rows = zip(WHEELS, self._wheels, sent.as_tuple(), seen.as_tuple(), strict=True)
         for name, wheel, told, speed in rows:
-            for kind, bad in zip(_FAULTS, wheel.signs(told, speed, share, still), strict=True):
+            signs = wheel.signs(told, speed, share, still)
+            if not (True in signs or wheel.suspected):
+                continue
+            wheel.suspected = True in signs
+            for kind, bad in zip(_FAULTS, signs, strict=True):
                 lasted = wheel.evidence[kind] + dt if bad else 0.0
                 wheel.evidence[kind] = lasted
                 if limit and lasted > limit:
@@ -167,8 +173,10 @@ class Sanity:
 
     def _notice(self, seen: WheelSpeeds, dt: float, still: bool) -> None:
         """Tell once in a while of wheels that turn though they were at rest and are told to be."""
-        rows = zip(self._wheels, map(abs, seen.as_tuple()), strict=True)
-        fastest = max([speed for wheel, speed in rows if still and not wheel.driven], default=0.0)
+        fastest = 0.0
+        if still:
+            rows = zip(self._wheels, map(abs, seen.as_tuple()), strict=True)
+            fastest = max([speed for wheel, speed in rows if not wheel.driven], default=0.0)
         self._rolled = self._rolled + dt if fastest > SLACK else 0.0
         self._untold += dt
         self.turned = ""

@@ -18,6 +18,7 @@ import re
 import time
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import serial
@@ -81,6 +82,16 @@ class Robot:
         }
 
 
+def session_of(config: dict[str, Any]) -> tuple[zenoh.Session, str, str]:
+    """A session, what its keys begin with, and the source of commands."""
+    settings = zenoh.Config()
+    settings.insert_json5("mode", '"peer"')
+    settings.insert_json5("listen/endpoints", json.dumps(config["bus"]["listen"]))
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    root, source = f"acsard/{config['robot']['id']}", config["commands"]["sources"][0]["name"]
+    return zenoh.open(settings), root, source
+
+
 def main() -> None:
     """Until it is killed."""
     parser = argparse.ArgumentParser()
@@ -89,14 +100,9 @@ def main() -> None:
     parser.add_argument("--drain", action="store_true")
     args = parser.parse_args()
     config = tomllib.loads(args.config.read_text())
-    robot, root = Robot(), f"acsard/{config['robot']['id']}"
-    settings = zenoh.Config()
-    settings.insert_json5("mode", '"peer"')
-    settings.insert_json5("listen/endpoints", json.dumps(config["bus"]["listen"]))
-    settings.insert_json5("scouting/multicast/enabled", "false")
+    robot = Robot()
     with serial.Serial(args.port, config["mcu"]["baud_rate"], timeout=0) as port:
-        session = zenoh.open(settings)
-        source = config["commands"]["sources"][0]["name"]
+        session, root, source = session_of(config)
         kept = session.declare_subscriber(f"{root}/cmd/{source}", robot.on_command)
         odometry = session.declare_publisher(f"{root}/odom")
         period = 1.0 / config["control"]["rate"]

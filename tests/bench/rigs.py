@@ -22,6 +22,9 @@ from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original's way."""
 
+BY_EVENTS = (sys.executable, "-m", "tests.bench.by_events")
+"""As little as the polled one does, in our way."""
+
 DRAINING = (*POLLED, "--drain")
 """The same with its obvious mend."""
 

@@ -18,6 +18,7 @@ from acsard.bench.matching import staircase
 from acsard.bench.record import feedback_fates
 from acsard.bench.rig import ACSARD, SPACING_S
 from tests.bench.rigs import (
+    BY_EVENTS,
     DRAINING,
     POLLED,
     config,
@@ -81,20 +82,24 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
 
 
 def test_what_a_commanded_robot_costs_beside_polled() -> None:
-    costs: dict[str, list[float]] = {"acsard": [], "polled": []}
+    ways = {"acsard": ACSARD, "by events": BY_EVENTS, "polled": POLLED}
+    costs: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(ROUNDS):
-        for name, words in (("acsard", ACSARD), ("polled", POLLED)):
+        for name, words in ways.items():
             with rig(config(), words) as running:
                 costs[name].append(running.command(SECONDS, staircase, number))
                 running.end()
-    ratios = [ours / theirs for ours, theirs in zip(*costs.values(), strict=True)]
     print(f"\none subscriber, {1 / SPACING_S[1]:.0f} to {1 / SPACING_S[0]:.0f} commands a second:")
+    ratios = {}
     for name, shares in costs.items():
-        print(f"  {name:8}{100 * median(shares):.1f} % of a core")
-    print(
-        f"  {median(ratios):.2f} times as much (by round {', '.join(f'{r:.2f}' for r in ratios)})"
-    )
-    assert median(ratios) < 5.0
+        by_round = [ours / theirs for ours, theirs in zip(shares, costs["polled"], strict=True)]
+        ratios[name] = median(by_round)
+        print(
+            f"  {name:10}{100 * median(shares):5.1f} % of a core, {ratios[name]:.2f} times polled "
+            f"(by round {', '.join(f'{one:.2f}' for one in by_round)})"
+        )
+    # What no decision can save is the wake-ups' and the hand-over's.
+    assert ratios["by events"] < ratios["acsard"] < 5.0
 
 
 def standing(waiting: list[int], per_second: int) -> list[int]:
