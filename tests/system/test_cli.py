@@ -36,6 +36,7 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
+from tests.system.typed import typed
 
 VERBS = (
     "run",
@@ -56,9 +57,7 @@ VERBS = (
 
 def tool(shared: Daemon, *words: str) -> Finished:
     """A tool that knows where the shared daemon is, run to its end."""
-    ended = finish(acsard(*words, "--config", str(shared.config)), shared.config.parent)
-    assert "Traceback" not in ended.err, ended.err
-    return ended
+    return typed(*words, "--config", str(shared.config))
 
 
 # help
@@ -73,8 +72,8 @@ def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_has_a_help_that_says_what_it_does(tmp_path: Path, verb: str) -> None:
-    ended = finish(acsard(verb, "--help"), tmp_path)
+def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
+    ended = typed(verb, "--help")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith(f"usage: acsard {verb}")
     assert "--config" in ended.out
@@ -86,8 +85,8 @@ def test_version(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"]])
-def test_a_mistyped_command_ends_with_2(tmp_path: Path, words: list[str]) -> None:
-    ended = finish(acsard(*words), tmp_path)
+def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
+    ended = typed(*words)
     assert (ended.code, ended.out) == (2, "")
     assert "usage: acsard" in ended.err
 
@@ -118,8 +117,8 @@ def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
 # topics and check need no daemon
 
 
-def test_topics_lists_every_key_with_its_meaning(tmp_path: Path) -> None:
-    ended = finish(acsard("topics"), tmp_path)
+def test_topics_lists_every_key_with_its_meaning(shared: Daemon) -> None:
+    ended = tool(shared, "topics")
     assert (ended.code, ended.err) == (0, "")
     head, *rows = ended.out.splitlines()
     assert head.split() == ["KEY", "TYPE", "RATE", "MEANING"]
@@ -139,7 +138,7 @@ def test_check_prints_a_toml_document_that_checks_again(tmp_path: Path) -> None:
     assert ended.out.startswith("# effective configuration from built-in defaults")
     assert tomllib.loads(ended.out)["drive"]["wheel_radius"] == 0.05
     (tmp_path / "again.toml").write_text(ended.out)
-    again = finish(acsard("check", "--config", "again.toml"), tmp_path)
+    again = typed("check", "--config", str(tmp_path / "again.toml"))
     assert again.code == 0
     assert again.out.splitlines()[1:] == ended.out.splitlines()[1:]
 
@@ -266,10 +265,10 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
 
 @pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
 def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
-    tmp_path: Path, words: list[str]
+    shared: Daemon, words: list[str]
 ) -> None:
     endpoint, begun = free_endpoint(), time.monotonic()
-    ended = finish(acsard(*words, "--connect", endpoint), tmp_path)
+    ended = tool(shared, *words, "--connect", endpoint)
     assert (ended.code, ended.out) == (69, "")
     (told,) = ended.err.splitlines()
     assert endpoint in told
@@ -286,10 +285,10 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
 
 @pytest.mark.parametrize("robot_id", ["a/b*", "", "**", "robot 1"])
 def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
-    tmp_path: Path, robot_id: str
+    shared: Daemon, robot_id: str
 ) -> None:
     for words in (["call", "clear"], ["echo", "odom"], ["hz", "odom"]):
-        ended = finish(acsard(*words, f"--id={robot_id}"), tmp_path)
+        ended = tool(shared, *words, f"--id={robot_id}")
         assert (ended.code, ended.out) == (2, "")
         assert f"{robot_id!r} is not a robot's id" in ended.err
 
@@ -352,16 +351,14 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
     file.write_text(f"{text}\n[rates]\nstate = 10.0  # often\n", encoding="utf-8")
     words = ("set", "rates.state", "5", "log.level", "debug", "--config", str(file))
     try:
-        ended = finish(acsard(*words), tmp_path)
+        ended = typed(*words)
         assert (ended.code, ended.out) == (
             0,
             'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); until the next start',
         )
         assert bus.get("config")["rates"]["state"] == 5.0
         assert "state = 10.0  # often" in file.read_text(encoding="utf-8")
-        ended = finish(
-            acsard("set", "rates.state", "4", "--write", "--config", str(file)), tmp_path
-        )
+        ended = typed("set", "rates.state", "4", "--write", "--config", str(file))
         assert (ended.code, ended.out) == (
             0, f"rates.state = 4.0 (was 5.0); written to {file}",
         )  # fmt: skip
