@@ -476,12 +476,22 @@ os.execv(sys.executable, [sys.executable, "-m", "acsard", *sys.argv[1:]])
 """Makes its standard input the controlling terminal, as a shell does, so that ^C is a signal."""
 
 
+UNDER_A_SHELL = """\
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+words = ["bash", "--norc", "-ic", '"$@"; true', "bash", sys.executable, "-m", "acsard"]
+os.execvp("bash", [*words, *sys.argv[1:]])
+"""
+"""The same, as a job of a shell."""
+
+
 class Terminal:
     """A person at a terminal: presses keys, reads the screen."""
 
     def __init__(self) -> None:
         self.screen = ""
         self._master, self.slave = pty.openpty()
+        self._open = True
         self._leave = threading.Event()
         self._reader = threading.Thread(target=self._read)
 
@@ -490,6 +500,12 @@ class Terminal:
         return self
 
     def __exit__(self, *error: object) -> None:
+        if self._open:
+            self.close()
+
+    def close(self) -> None:
+        """The window is closed."""
+        self._open = False
         self._leave.set()
         self._reader.join()
         os.close(self._master)
@@ -541,6 +557,29 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
             start_new_session=True,
         ) as program:
             until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state on the screen")
+            yield terminal, program
+
+
+@contextmanager
+def without_a_screen(
+    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal that can have no screen."""
+    with Terminal() as terminal:
+        size = struct.pack("HHHH", 24, columns, 0, 0)
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
+        env = environment(TERM="dumb")
+        env.pop("COLUMNS", None)
+        with Program(
+            [sys.executable, "-c", how, "drive", "--config", str(shared.config)],
+            shared.config.parent,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
             yield terminal, program
 
 
@@ -613,27 +652,44 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
 
 
 @pytest.mark.slow
-def test_without_a_screen_there_is_a_line_a_second_and_the_help(shared: Daemon, bus: Bus) -> None:
-    with Terminal() as terminal:
-        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
-        with Program(
-            words,
-            shared.config.parent,
-            environment(TERM="dumb"),
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ):
-            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
-            begun = time.monotonic()
-            with held(terminal, "i"):
-                until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some lines")
-            took = time.monotonic() - begun
+def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
+    shared: Daemon, bus: Bus
+) -> None:
+    with without_a_screen(shared, columns=50) as (terminal, _):
+        begun = time.monotonic()
+        with held(terminal, "i"):
+            until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some news")
+        took = time.monotonic() - begun
     lines = terminal.screen.splitlines()
     assert any("u  i  o" in line for line in lines)
     assert terminal.screen.count("driving: ") <= 2 * took + 2
-    assert "yaw" in lines[-1]
+    assert max(map(len, lines)) <= 50
+    bus.at_rest()
+
+
+def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon, bus: Bus) -> None:
+    with without_a_screen(shared) as (terminal, program):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+        terminal.press("\x03")
+        assert program.ended(5.0) == 0
+        until(lambda: "left: the robot stands; " in terminal.screen, 2.0, "the last word")
+    assert "forward +0.00 m/s" in terminal.screen.partition("left: ")[2]
+
+
+def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silence(
+    shared: Daemon, bus: Bus
+) -> None:
+    # It hears that twice: by its keys, or by its shell, and once more while it says its zeros.
+    with (
+        bus.follow("cmd/teleop") as commands,
+        without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
+    ):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+        closed = time.monotonic()
+        terminal.close()
+        commands.find(lambda value: value["twist"]["linear"]["x"] == 0, 1.0, "a zero", after=closed)
     bus.at_rest()
 
 
