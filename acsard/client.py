@@ -61,7 +61,7 @@ from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
-from acsard.messages.topics import by_key, full_key, service_key
+from acsard.messages.topics import by_key, full_key, key_hint, service_key, unknown
 from acsard.values import AcsardError, Plain, Pose
 
 __all__ = (
@@ -253,9 +253,9 @@ class Client:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
             self._require(name)
+            listed = f"no such key is listed: {key_hint(name)}" if unknown(name) else ""
             raise NoAnswerError(
-                f"no answer on {self.key(name)}; is the daemon running with robot.id "
-                f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
+                f"no answer on {self.key(name)}; {listed or self._absent()}",
             )
         return found
 
@@ -264,6 +264,12 @@ class Client:
         key = name.partition("?")[0]
         if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
             raise NotPermittedError(why)
+
+    def _absent(self) -> str:
+        return (
+            f'is the daemon running with robot.id "{self._id}", is there such a key '
+            "(`acsard topics`), and may you ask it?"
+        )
 
     def _unheard(self, error: UnheardError) -> MendableError:
         """The same with what our certificate has to do with it."""

@@ -116,9 +116,9 @@ def main(args: argparse.Namespace) -> int:
     from acsard.client import connect
     from acsard.host.errors import NotPermittedError, UsageError
 
+    endpoint, robot_id, tls = robot_address(args)
     if not sys.stdin.isatty():
         raise UsageError("drive reads keys and needs a terminal; use acsard.client")
-    endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         if tls and (us := robot.whoami()).role == "viewer":
             raise NotPermittedError(us.words())

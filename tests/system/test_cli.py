@@ -293,6 +293,44 @@ def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
         assert f"{robot_id!r} is not a robot's id" in ended.err
 
 
+@pytest.mark.parametrize("verb", ["top", "hz", "whoami", "set", "drive", "odom", "calibrate"])
+@pytest.mark.parametrize("ids", ["*", "robot1,robot2"])
+def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
+    words = {"hz": ["odom"]}.get(verb, [])
+    ended = tool(shared, verb, *words, "--id", ids)
+    assert (ended.code, ended.out) == (2, "")
+    assert f"`acsard {verb}` is for one" in ended.err
+    assert "acsard fleet" in ended.err
+
+
+# words that nothing is called
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["get", "inof"], "info"),
+        (["echo", "oddom", "--timeout", "0.01"], "odom"),
+        (["hz", "diagnostic", "-n", "1"], "diagnostics"),
+        (["set", "linear_speed", "0.5"], "limits.linear_speed"),
+        (["call", "stpo"], "stop"),
+        (["dirve"], "drive"),
+    ],
+)
+def test_a_misspelt_key_service_setting_or_verb_is_asked_about(
+    shared: Daemon, bus: Bus, words: list[str], meant: str
+) -> None:
+    ended = tool(shared, *words)
+    assert f"did you mean {meant}?" in ended.out + ended.err
+    assert ended.code != 0 or words[0] == "hz"
+
+
+def test_a_key_like_no_other_is_told_where_they_are_listed(shared: Daemon) -> None:
+    ended = tool(shared, "get", "nonsense")
+    assert (ended.code, ended.out) == (69, "")
+    assert "`acsard topics`" in ended.err
+
+
 # call
 
 
