@@ -104,6 +104,7 @@ def test_fish_offers_the_same_values(
     assert all(one.startswith(words.split()[-1]) for one in told)
 
 
+@pytest.mark.slow
 def test_zsh_completes_the_same_values_with_tab(scripts: dict[str, Path], tmp_path: Path) -> None:
     require("zsh")
     begin = (
