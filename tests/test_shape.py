@@ -40,6 +40,7 @@ PURE_AMONG_SHELLS = (
     "record.steps",
     "record.story",
     "top.sections",
+    "top.stacked",
     "top.roster",
     "top.seen",
     "top.teleop",

@@ -618,7 +618,7 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     [
         ("steady", 1),
         ("stalls", 1),
-        *(pytest.param(kind, 6, marks=pytest.mark.slow) for kind in KINDS),
+        *(pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS),
         *(
             pytest.param(kind, 100, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
             for kind in KINDS
