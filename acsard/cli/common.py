@@ -76,6 +76,21 @@ def find(path: str | None) -> tuple[str, bytes]:
     return "built-in defaults", b""
 
 
+def writable(path: str | None) -> Path:
+    """The file that --write is to change; raises `ExitError` where it has none, or no tomlkit."""
+    from acsard.host.files import require_tomlkit
+
+    require_tomlkit()
+    where, text = find(path)
+    if not text and not Path(where).is_file():
+        raise ExitError(
+            Exit.FAILURE,
+            "--write has no configuration file to write to: name it by --config, or make an "
+            "acsard.toml here (an empty one is valid)",
+        )
+    return Path(where)
+
+
 def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
     """Where the configuration is and the configuration; raises `ExitError` with every problem."""
     where, text = find(path)

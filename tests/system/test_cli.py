@@ -599,26 +599,36 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
 
 
 @contextmanager
-def without_a_screen(
-    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+def at_terminal(
+    daemon: Daemon, verb: str, term: str, columns: int = 80, how: str = ON_TERMINAL
 ) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard drive` at a terminal that can have no screen."""
+    """A verb at a terminal of its own, of that kind and width and 24 lines."""
     with Terminal() as terminal:
         size = struct.pack("HHHH", 24, columns, 0, 0)
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
-        env = environment(TERM="dumb")
-        env.pop("COLUMNS", None)
+        env = environment(TERM=term)
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            env.pop(name, None)
         with Program(
-            [sys.executable, "-c", how, "drive", "--config", str(shared.config)],
-            shared.config.parent,
+            [sys.executable, "-c", how, verb, "--config", str(daemon.config)],
+            daemon.config.parent,
             env,
             stdin=terminal.slave,
             stdout=terminal.slave,
             stderr=subprocess.PIPE,
             start_new_session=True,
         ) as program:
-            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
             yield terminal, program
+
+
+@contextmanager
+def without_a_screen(
+    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal that can have no screen."""
+    with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
+        until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
+        yield terminal, program
 
 
 def screens(terminal: Terminal) -> list[str]:
@@ -630,24 +640,9 @@ def screens(terminal: Terminal) -> list[str]:
 @contextmanager
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """`acsard drive` at a terminal of that width that can have a screen."""
-    with Terminal() as terminal:
-        size = struct.pack("HHHH", 24, columns, 0, 0)
-        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
-        env = environment(TERM="xterm-256color")
-        for name in ("COLUMNS", "LINES", "NO_COLOR"):
-            env.pop(name, None)
-        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
-        with Program(
-            words,
-            shared.config.parent,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
-            yield terminal, program
+    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
+        until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
+        yield terminal, program
 
 
 @pytest.mark.parametrize("columns", [40, 80])
