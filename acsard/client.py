@@ -253,9 +253,10 @@ class Client:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         if not found:
             self._require(name)
-            listed = f"no such key is listed: {key_hint(name)}" if unknown(name) else ""
+            listed = key_hint(name) if unknown(name) else "`acsard topics`"
             raise NoAnswerError(
-                f"no answer on {self.key(name)}; {listed or self._absent()}",
+                f"no answer on {self.key(name)}; is the daemon running with robot.id "
+                f'"{self._id}", is there such a key ({listed}), and may you ask it?',
             )
         return found
 
@@ -264,12 +265,6 @@ class Client:
         key = name.partition("?")[0]
         if self._tls and least_role(key) != "viewer" and (why := self.whoami().lacks(key)):
             raise NotPermittedError(why)
-
-    def _absent(self) -> str:
-        return (
-            f'is the daemon running with robot.id "{self._id}", is there such a key '
-            "(`acsard topics`), and may you ask it?"
-        )
 
     def _unheard(self, error: UnheardError) -> MendableError:
         """The same with what our certificate has to do with it."""

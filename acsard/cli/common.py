@@ -156,7 +156,7 @@ def require_followed(key: str) -> None:
 def warn_of_unknown(key: str) -> None:
     """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
     if unknown(key):
-        said = f"{key} is not in the topic table; {key_hint(key)} Waiting."
+        said = f"{key} is not in the topic table ({key_hint(key)}); waiting"
         print(f"acsard: {printable(said)}", file=sys.stderr)
 
 

@@ -150,7 +150,7 @@ def unknown(key: str) -> bool:
 def key_hint(key: str) -> str:
     """What was probably meant by a key that is not there, or where they all are."""
     known = [topic.key for topic in TOPICS if "<" not in topic.key]
-    return hint(key, known, "`acsard topics` lists the keys.")
+    return hint(key, known, "`acsard topics` lists the keys")
 
 
 def by_key(key: str) -> Topic | None:
