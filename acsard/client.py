@@ -60,7 +60,7 @@ from acsard.host.threads import in_thread
 from acsard.messages import schema
 from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
-from acsard.messages.topics import by_key, full_key, service_key
+from acsard.messages.topics import by_key, full_key, key_hint, service_key, unknown
 from acsard.values import AcsardError, Plain, Pose
 
 __all__ = (
@@ -250,9 +250,10 @@ class Client:
             if reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
         self._require(name)
+        listed = key_hint(name) if unknown(name) else "`acsard topics`"
         raise NoAnswerError(
             f"no answer on {self.key(name)}; is the daemon running with robot.id "
-            f'"{self._id}", is there such a key (`acsard topics`), and may you ask it?',
+            f'"{self._id}", is there such a key ({listed}), and may you ask it?',
         )
 
     def _require(self, name: str) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadGroupScheduling
 
 # No deadline: a slow machine must not fail a true sentence. The same examples every time: what a
 # change is judged by must not be luck. `explore` looks for new ones.
@@ -56,9 +57,24 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
 
 
+class _ByFile(LoadGroupScheduling):  # type: ignore[misc]
+    """Groups, and of all else whole files: after each test all that its worker was ever given is
+    counted anew, so 10,000 handed out one by one take the time of many tests."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        scope: str = super()._split_scope(nodeid)
+        return nodeid.partition("::")[0] if scope == nodeid else scope
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
+    config.option.loadscopereorder = False  # the longest group is first as it is
+    return _ByFile(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
         timed = item.path.relative_to(here).parts[0] in TIMED
         if timed and not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group("timed"))
+    items.sort(key=lambda item: item.path.relative_to(here).parts[0] not in TIMED)

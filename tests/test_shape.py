@@ -48,6 +48,7 @@ PURE_AMONG_SHELLS = (
     "record.story",
     "record.table",
     "top.sections",
+    "top.stacked",
     "top.roster",
     "top.seen",
     "top.teleop",

@@ -7,7 +7,6 @@ a few of them is refused, since what is left would not be what was recorded.
 
 from __future__ import annotations
 
-import difflib
 import math
 from array import array
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.config.nearest import nearest
 from acsard.values import AcsardError
 
 Floats = npt.NDArray[np.float64]
@@ -147,7 +147,7 @@ def _columns(header: list[str], number: int) -> list[str]:
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
     """What may have been meant."""
     others = [name for name in header if name and name not in COLUMNS]
-    near = [m for n in names for m in difflib.get_close_matches(n, others, n=1, cutoff=0.6)]
+    near = [one for name in names for one in nearest(name, others)]
     return f" (is {near[0]} it? rename it)" if near else ""
 
 

@@ -44,6 +44,7 @@ from acsard.cli import (
 )
 from acsard.cli import set as setting
 from acsard.cli.exits import code_of
+from acsard.config.nearest import nearest
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
 from acsard.messages.text import lines
@@ -89,9 +90,22 @@ try:  acsard run                (the robot, on the built-in simulator)
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what was probably meant, for verbs and all that is one of a few."""
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            near = nearest(str(value), map(str, action.choices or ()))
+            if near:
+                error.message = f"invalid choice: {value!r}; did you mean {near[0]}?"
+            raise
+
+
 def parser() -> argparse.ArgumentParser:
     """Every verb with its options."""
-    whole = argparse.ArgumentParser(
+    whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
         "microcontroller below, Zenoh bus above. Without a verb: run.",

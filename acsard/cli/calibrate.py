@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, guided
-from acsard.cli.common import add_bus, find, load
+from acsard.cli.common import add_bus, load, writable
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
-from acsard.host.files import change, require_tomlkit
+from acsard.host.files import change
 
 if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
@@ -82,13 +82,7 @@ def main(args: argparse.Namespace) -> int:
 
     where, config = load(args.config)
     if args.write:
-        require_tomlkit()
-        if not find(args.config)[1] and not Path(where).is_file():
-            raise ExitError(
-                Exit.FAILURE,
-                "--write has no configuration file to write to: name it by --config, or make an "
-                "acsard.toml here (an empty one is valid)",
-            )
+        writable(args.config)
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:

@@ -63,9 +63,11 @@ def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibr
     from acsard.calibration.guided.steps import GuideError
     from acsard.calibration.guided.ways import KINDS
     from acsard.cli.calibrate_robot import SOURCE, Robot
+    from acsard.cli.common import require_one
     from acsard.client import connect
     from acsard.messages.topics import full_key
 
+    require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
     _usable(args, full_key(robot_id, "odom"))
     with ExitStack() as stack:

@@ -13,7 +13,8 @@ from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
-from acsard.messages.topics import row_of
+from acsard.messages.text import printable
+from acsard.messages.topics import key_hint, row_of, unknown
 
 PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
@@ -75,6 +76,21 @@ def find(path: str | None) -> tuple[str, bytes]:
     return "built-in defaults", b""
 
 
+def writable(path: str | None) -> Path:
+    """The file that --write is to change; raises `ExitError` where it has none, or no tomlkit."""
+    from acsard.host.files import require_tomlkit
+
+    require_tomlkit()
+    where, text = find(path)
+    if not text and not Path(where).is_file():
+        raise ExitError(
+            Exit.FAILURE,
+            "--write has no configuration file to write to: name it by --config, or make an "
+            "acsard.toml here (an empty one is valid)",
+        )
+    return Path(where)
+
+
 def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
     """Where the configuration is and the configuration; raises `ExitError` with every problem."""
     where, text = find(path)
@@ -93,9 +109,24 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Where the robot is that a tool talks to: the options, else the configuration."""
+    """Where the robot is that a tool talks to: the options, else the configuration.
+
+    Raises `UsageError` for an `--id` that names many.
+    """
+    require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
+
+
+def require_one(args: argparse.Namespace) -> None:
+    """Raises `UsageError` for an `--id` that names many."""
+    from acsard.bus.fleet import named
+
+    if named(args.id or ""):
+        raise UsageError(
+            f"--id '{args.id}' names many robots and `acsard {args.verb}` is for one: "
+            "`acsard fleet` says who is there; echo, get and call stop go to many"
+        )
 
 
 def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
@@ -120,6 +151,13 @@ def require_followed(key: str) -> None:
         instead = "is a token without messages: acsard fleet shows who is there"
     if instead is not None:
         raise UsageError(f"nothing is published on {key}: it {instead}")
+
+
+def warn_of_unknown(key: str) -> None:
+    """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
+    if unknown(key):
+        said = f"{key} is not in the topic table ({key_hint(key)}); waiting"
+        print(f"acsard: {printable(said)}", file=sys.stderr)
 
 
 def require_asked(key: str) -> None:

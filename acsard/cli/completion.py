@@ -22,9 +22,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     completion = verbs.add_parser(
         "completion",
         help="the script by which a shell completes with Tab",
-        description="Print the script by which a shell completes verbs, options and files with "
-        f"Tab. Write it to where the shell looks ({places}). Needs the library shtab; without it, "
-        "it tells what to type.",
+        description="Print the script by which a shell completes verbs, options, keys, settings, "
+        f"recordings and files with Tab. Write it to where the shell looks ({places}). Needs the "
+        "library shtab; without it, it tells what to type.",
     )
     completion.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
     completion.set_defaults(main=main_completion)
@@ -41,18 +41,23 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main_completion(args: argparse.Namespace) -> int:
     """Print the script."""
     from acsard.cli import parser
+    from acsard.cli.values import RECORDING, words
 
     try:
         import shtab
     except ImportError:
         raise _missing("shtab") from None
     whole = parser()
-    for action in _actions(whole):
-        kind = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}.get(
-            str(action.metavar)
-        )
+    kinds = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}
+    known = words()
+    for verb, action in _actions(whole):
+        kind = kinds.get(str(action.metavar))
+        if verb == "log" and action.dest == "file":
+            kind = RECORDING
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
+        elif (verb, action.dest) in known:
+            action.choices = known[verb, action.dest]  # only offered: these parse nothing
     print(shtab.complete(whole, args.shell))
     return 0
 
@@ -75,10 +80,12 @@ def _missing(library: str) -> ExitError:
     return ExitError(Exit.FAILURE, f"needs the library {library}; run: {install('shell')}")
 
 
-def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Every option and argument, of every verb."""
+def _actions(
+    parser: argparse.ArgumentParser, verb: str = ""
+) -> Iterator[tuple[str, argparse.Action]]:
+    """Every option and argument with its verb, also those of `log show` as of `log`."""
     for action in parser._actions:
-        yield action
+        yield verb, action
         if isinstance(action, argparse._SubParsersAction):
-            for below in action.choices.values():
-                yield from _actions(below)
+            for name, below in action.choices.items():
+                yield from _actions(below, verb or name)

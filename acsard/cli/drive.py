@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
 import time
 from collections import deque
@@ -39,7 +40,12 @@ ASK_S = 0.5
 """Without a state for so long it is asked for: it may be published seldom."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Without a screen: a line at most so often, while it moves, and while nothing happens."""
+"""Without a screen: news at most so often, while it moves, and while nothing happens."""
+
+PART_S = 2.0
+"""A robot stands within, by the ramp of its own."""
+
+NO_WIDTH = 10_000
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -111,20 +117,19 @@ def main(args: argparse.Namespace) -> int:
     from acsard.client import connect
     from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 
+    endpoint, robot_id, tls = robot_address(args)
     if not sys.stdin.isatty():
         raise UsageError("drive reads keys and needs a terminal; use acsard.client")
-    endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         if tls and (us := robot.whoami()).role in ("", "viewer"):
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())
         ride = _Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
         try:
             _show(ride)
-        except KeyboardInterrupt:
-            pass
         finally:
             for _ in range(ZEROS):
                 robot.send(0.0, 0.0)
+        _part(ride)
     return 0
 
 
@@ -142,33 +147,50 @@ def _show(ride: _Ride) -> None:
 
 
 def _plain(ride: _Ride) -> None:
-    """A line when there is news, and now and then."""
-    import signal
+    """Some lines when there is news, and now and then."""
+    from acsard.top.keys import keys, until_told
+    from acsard.top.teleop import news
 
-    from acsard.top.keys import keys
-
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
-    news = News()
-    print(HELP)
-    with keys() as read:
+    due = News()
+    with until_told(), keys() as read:
+        print(HELP)
         while (typed := read(PERIOD_S)) is not None:
             ride.step(typed)
-            told = news.tell(ride.seen(), time.monotonic())
-            if told:
-                print(told, flush=True)
+            seen = ride.seen()
+            if due.tell(seen, time.monotonic()):
+                print("\n".join(news(seen, _width())), flush=True)
+
+
+def _part(ride: _Ride) -> None:
+    """The last word, to who is still there: not that it drives, when it stands a moment later."""
+    from acsard.top.teleop import moves, parting
+
+    left = time.monotonic()
+    while os.isatty(0) and os.isatty(1):
+        ride.take()
+        seen, took = ride.seen(), time.monotonic() - left
+        rests = seen.state is not None and seen.age < took and not moves(seen.state)
+        if rests or took > PART_S:
+            print("\n".join(parting(seen, _width())), flush=True)
+            return
+        time.sleep(PERIOD_S)
+
+
+def _width() -> int:
+    """Of the terminal that is written to; of a file there is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_WIDTH
 
 
 class News:
-    """Which lines are worth a line where there is no screen; pure."""
+    """What is worth some lines where there is no screen; pure."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
         self._at = -QUIET_S
 
-    def tell(self, seen: Seen, now: float) -> str:
-        """The line to print at `now` s, "" for none."""
-        from acsard.top.teleop import SILENT_S, line
+    def tell(self, seen: Seen, now: float) -> bool:
+        """At `now` s it is."""
+        from acsard.top.teleop import SILENT_S
 
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
@@ -176,9 +198,9 @@ class News:
         moves = state is not None and (state.linear != 0.0 or state.angular != 0.0)
         wait = NEWS_S if what != self._shown else SAME_S if moves else QUIET_S
         if now - self._at < wait:
-            return ""
+            return False
         self._shown, self._at = what, now
-        return line(seen)
+        return True
 
 
 class _Ride:
@@ -206,10 +228,15 @@ class _Ride:
             self._robot.send(wish.linear, wish.angular)
         if wish in (None, REST):
             self._fine = now
+        self.take()
+
+    def take(self) -> None:
+        """Take what has come; ask when nothing does."""
         while self._answers:  # first: what comes by itself is later
             self._take(self._answers.popleft())
         while (sample := self._states.try_recv()) is not None:
             self._take(sample)
+        now = time.monotonic()
         if now - max(self._heard, self._asked) > ASK_S:
             self._asked = now
             self._robot.ask("state", self._answers.append)

@@ -6,7 +6,14 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import MANY, add_bus, count, require_followed, robots_address
+from acsard.cli.common import (
+    MANY,
+    add_bus,
+    count,
+    require_followed,
+    robots_address,
+    warn_of_unknown,
+)
 from acsard.host.exits import Exit, ExitError
 from acsard.messages import text
 
@@ -56,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
         raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
     left, topic = args.n, args.topic[0]
     require_followed(topic)
-    _hint(topic)
+    warn_of_unknown(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         samples = robot.samples(topic, args.timeout)
         if many:
@@ -131,19 +138,6 @@ def of_robot(whose: str, line: str) -> str:
 
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return text.json_line(msgspec.json.encode(told).decode())
-
-
-def _hint(topic: str) -> None:
-    """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
-    import difflib
-
-    from acsard.messages.topics import TOPICS, by_key
-
-    prefix = topic.partition("/")[0]
-    if by_key(topic) is None and prefix not in ("cmd", "wheel_cmd", "json"):
-        near = difflib.get_close_matches(topic, [t.key for t in TOPICS], n=1)
-        hint = f"did you mean {near[0]}?" if near else "`acsard topics` lists the keys"
-        print(f"acsard: {topic} is not in the topic table; {hint} Waiting.", file=sys.stderr)
 
 
 def json_line(encoding: str, payload: bytes) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from acsard.cli.common import add_bus, count, require_followed, robot_address
+from acsard.cli.common import add_bus, count, require_followed, robot_address, warn_of_unknown
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,6 +32,7 @@ def main(args: argparse.Namespace) -> int:
     from acsard.client import connect
 
     require_followed(args.topic)
+    warn_of_unknown(args.topic)
     endpoint, robot_id, tls = robot_address(args)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n

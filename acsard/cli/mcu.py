@@ -10,12 +10,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import Overrides, add_config, find, load
+from acsard.cli.common import Overrides, add_config, load, writable
 from acsard.cli.person import SIMULATOR, answering, ended_by_signals
 from acsard.host.colours import coloured
 from acsard.host.errors import MendableError
-from acsard.host.exits import Exit, ExitError
-from acsard.host.files import change, require_tomlkit
+from acsard.host.exits import Exit
+from acsard.host.files import change
 
 if TYPE_CHECKING:
     from acsard.checkup.findings import Finding
@@ -83,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, given)
     _, configured = load(args.config)
     if args.write:
-        _writable(args.config)
+        writable(args.config)
     port = config.mcu.port
     person = answering(args, port)
     findings: list[Finding] = []
@@ -131,14 +131,3 @@ def _wire(config: Config) -> Wire:
     from acsard.serial.blocking import BlockingPort
 
     return BlockingPort(config.mcu.port)
-
-
-def _writable(path: str | None) -> None:
-    require_tomlkit()
-    where, text = find(path)
-    if not text and not Path(where).is_file():
-        raise ExitError(
-            Exit.FAILURE,
-            "--write has no configuration file to write to: name it by --config, or make an "
-            "acsard.toml here (an empty one is valid)",
-        )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, find, robot_address
+from acsard.cli.common import add_bus, robot_address, writable
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 from acsard.messages.text import json_line, lines
@@ -101,7 +101,6 @@ def _value(word: str) -> Plain:
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
     """What --write is to change; said before anything is set."""
     from acsard.host.errors import UsageError
-    from acsard.host.files import require_tomlkit
 
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
@@ -110,15 +109,7 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
             "--write cannot change [[commands.sources]]: write the timeout into the file yourself, "
             "and set it without --write"
         )
-    require_tomlkit()
-    where, text = find(path)
-    if not text and not Path(where).is_file():
-        raise ExitError(
-            Exit.FAILURE,
-            "--write has no configuration file to write to: name it by --config, or make an "
-            "acsard.toml here (an empty one is valid)",
-        )
-    return Path(where)
+    return writable(path)
 
 
 def _tell(config: object, as_json: bool) -> None:

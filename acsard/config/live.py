@@ -7,7 +7,6 @@ robot (its own `use`). All others shape the wire, the bus or the base, and take 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -15,6 +14,7 @@ from msgspec import Struct
 from msgspec.structs import fields, replace
 
 from acsard.config.contradictions import contradictions
+from acsard.config.nearest import hint
 from acsard.config.parsing import ConfigError, effective
 from acsard.config.settings import Config
 from acsard.config.validation import build, show
@@ -28,10 +28,6 @@ WHEN: dict[When, str] = {
 }
 """A lower deceleration could not stop in time a robot that still drives faster than its new limits
 allow; the wheels' limit cuts a speed off at once; new timeouts forget who commands."""
-
-
-LONGEST_KEY = 80
-"""Characters of a name that is looked for: it may be a stranger's."""
 
 
 class Live(Struct, frozen=True):
@@ -143,9 +139,7 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
             f"{key} = {show(value)}: takes a start: change it in acsard.toml and start acsard anew "
             "(`acsard set` lists what does not)"
         )
-    near = difflib.get_close_matches(key[:LONGEST_KEY], known, n=1, cutoff=0.6)
-    hint = f"did you mean {near[0]}?" if near else "`acsard set` lists what can be set"
-    return f"{show(key)}: unknown key; {hint}"
+    return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists what can be set')}"
 
 
 def _put(tables: dict[str, Any], path: list[str], value: object) -> None:

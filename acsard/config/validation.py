@@ -5,7 +5,6 @@ Generic: knows msgspec types, nothing of robots. The rules between keys are in `
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Mapping
@@ -14,6 +13,8 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 from msgspec.structs import FieldInfo, fields
+
+from acsard.config.nearest import nearest
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -45,7 +46,7 @@ def build_partly(
     prefix, complete = f"{path}." if path else "", True
     for key in table:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+            near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
             spoilt |= {prefix + name for name in near}  # what was meant is not known
     values: dict[str, Any] = {}

@@ -42,11 +42,6 @@ class WheelCounter:
         self._missing = self._patience = LEARNED_FROM
         """Changes until it is searched, and how many more if that does not help."""
 
-    @property
-    def searches(self) -> bool:
-        """It is being looked for a lattice."""
-        return self._search is not None
-
     def learn(self, speed: float) -> None:
         """The next report of a wheel whose counts are unknown."""
         if speed and self._told is not None:

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
+from acsard.config.nearest import hint
 from acsard.config.settings import Config
 from acsard.values import ROOT, Verb
 
@@ -140,6 +141,17 @@ def source_keys(sources: Iterable[str]) -> list[str]:
     templates = [topic.key for topic in TOPICS if "<source>" in topic.key]
     names = list(sources)
     return [key.replace("<source>", name) for key in templates for name in names]
+
+
+def unknown(key: str) -> bool:
+    """No row is like it, but it may be a stranger's."""
+    return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
+
+
+def key_hint(key: str) -> str:
+    """What was probably meant by a key that is not there, or where they all are."""
+    known = [topic.key for topic in TOPICS if "<" not in topic.key]
+    return hint(key, known, "`acsard topics` lists the keys")
 
 
 def by_key(key: str) -> Topic | None:

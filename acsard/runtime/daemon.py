@@ -10,8 +10,9 @@ import asyncio
 import gc
 import os
 import sys
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
 
 from acsard import __version__
 from acsard.bus.access import access_control
@@ -92,22 +93,7 @@ async def _run(
             stack.callback(recorder.close)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
         path = config.mcu.port if simulated is None else simulated.path
-        sources = tuple(source.name for source in config.commands.sources)
-        bus = ZenohBus(
-            config.bus,
-            config.ros,
-            left_out(config),
-            config.robot.id,
-            sources,
-            access_control(config),
-            wake,
-            offered(config),
-            published(config),
-        )
-        period_ns = int(NS_PER_S / config.rate_hz)
-        port = SerialPort(
-            path, config.mcu.baud_rate, _stop_line(config), period_ns, wake, events.append
-        )
+        bus, port = _bus(config, wake), _port(config, path, wake, events.append)
         ends_ns = _certificates(config, door is not None)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):
@@ -136,16 +122,42 @@ async def _run(
         announce(path, port.trouble)
         manager.ready()
         departure.started()
-        async with asyncio.TaskGroup() as tasks:
-            helpers = [
-                tasks.create_task(port.keep_open()),
-                tasks.create_task(_repeat_latched(bus, control)),
-            ]
-            if door is not None and config.bus.outside:
-                helpers.append(tasks.create_task(_keep_door(door, events.append)))
+        helpers = [port.keep_open(), _repeat_latched(bus, control)]
+        if door is not None and config.bus.outside:
+            helpers.append(_keep_door(door, events.append))
+        async with _beside(helpers):
             await _control(config, control, departure, wake, manager)
-            for helper in helpers:
-                helper.cancel()
+
+
+def _bus(config: Config, wake: Wakeup) -> ZenohBus:
+    """Not open yet."""
+    return ZenohBus(
+        config.bus,
+        config.ros,
+        left_out(config),
+        config.robot.id,
+        tuple(source.name for source in config.commands.sources),
+        access_control(config),
+        wake,
+        offered(config),
+        published(config),
+    )
+
+
+def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
+    """Not open yet."""
+    stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
+    return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
+
+
+@asynccontextmanager
+async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator[None]:
+    """These run beside what is done within, and end with it."""
+    async with asyncio.TaskGroup() as group:
+        tasks = [group.create_task(helper) for helper in helpers]
+        yield
+        for task in tasks:
+            task.cancel()
 
 
 def _certificates(config: Config, ours: bool) -> int | None:

@@ -1,15 +1,50 @@
-"""The keys of a person's terminal, one by one and unseen; what is left is as it was."""
+"""The keys of a terminal, one by one and unseen, until a signal; what is left is as it was."""
 
 from __future__ import annotations
 
+import errno
 import os
 import select
+import signal
 import sys
 import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def until_told() -> Iterator[None]:
+    """Ends what is done within at the first signal that ends a program, or with its terminal.
+
+    No later one disturbs what is done behind it: a terminal that is closed under a shell sends two,
+    and Ctrl-C may be held down.
+    """
+
+    def deaf() -> None:
+        for number in LEAVES:
+            signal.signal(number, signal.SIG_IGN)
+
+    def leave(*_: object) -> None:
+        deaf()
+        raise KeyboardInterrupt
+
+    for number in LEAVES:
+        signal.signal(number, leave)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        # The terminal has been closed: nobody to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    finally:
+        deaf()
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 from rich.text import Text
 
@@ -46,11 +47,7 @@ FIGURES = {
 
 def motion(state: RobotState, width: int) -> list[Text]:
     """Pose and twist on the left, the wheels as they sit on the robot on the right."""
-    wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
-    right, left, rear_left, rear_right = wheels
-    known = [abs(speed) for speed in wheels if math.isfinite(speed)]
-    top = max(known, default=0.0)
-    scale = next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
+    (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
     place = f"x {signed(state.x, 3, 8)} m  y {signed(state.y, 3, 8)} m  "
@@ -61,12 +58,19 @@ def motion(state: RobotState, width: int) -> list[Text]:
     for told, axle, one, other in rows:
         line = Text(told.ljust(40))
         line.append(axle.ljust(6), "dim")
-        line.append_text(_wheel(one, scale, cells)).append("  ")
-        lines.append(line.append_text(_wheel(other, scale, cells)))
+        line.append_text(wheel(one, scale, cells)).append("  ")
+        lines.append(line.append_text(wheel(other, scale, cells)))
     return lines
 
 
-def _wheel(speed: float, scale: float, cells: int) -> Text:
+def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
+    """Of the four wheels, NaN where there is none, and what a whole bar is, rad/s."""
+    wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
+    top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
+    return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
+
+
+def wheel(speed: float, scale: float, cells: int) -> Text:
     """Direction, speed and bar in `10 + cells` cells."""
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
@@ -86,62 +90,98 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
     lines = [rule(width, at)]
     shown = state.sources[: room if len(state.sources) <= room else room - 1]
     lines += [_source(source, state, room_name) for source in shown]
-    hidden = [clean(source.name) for source in state.sources[len(shown) :]]
-    if hidden:
-        names = ", ".join(hidden[:MOST_REASONS])
-        lines.append(Text(f"  and {count(len(hidden))} more: {names}", "dim"))
+    if len(shown) < len(state.sources):
+        lines.append(Text(hidden(state.sources[len(shown) :]), "dim"))
     return lines if state.sources else [*lines, Text("  none", "dim")]
 
 
+def hidden(left: Sequence[SourceState]) -> str:
+    """Those that there is no room for."""
+    names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
+    return f"  and {count(len(left))} more: {names}"
+
+
+def drives(source: SourceState, state: RobotState) -> bool:
+    """The robot does what it says."""
+    return source.name == state.source and state.mode == "driving" and not source.waits_for
+
+
+def waits(source: SourceState, state: RobotState) -> str:
+    """For what, in words."""
+    if source.waits_for:
+        return clean(source.waits_for)
+    if drives(source, state):
+        return "nothing: it drives"
+    return f"nothing, but the robot is {clean(state.mode)}"
+
+
 def _source(source: SourceState, state: RobotState, room: int) -> Text:
-    drives = source.name == state.source and state.mode == "driving" and not source.waits_for
-    live = drives or source.waits_for != "a command"
-    told = clean(source.waits_for)
-    if not told:
-        told = "nothing: it drives" if drives else f"nothing, but the robot is {clean(state.mode)}"
-    mark, style = ("▶ ", "bold green") if drives else ("  ", "" if live else "dim")
+    drive = drives(source, state)
+    live = drive or source.waits_for != "a command"
+    mark, style = ("▶ ", "bold green") if drive else ("  ", "" if live else "dim")
     name = Text(clean(source.name))
     name.truncate(room, overflow="ellipsis", pad=True)
     figures = f"{count(source.priority):>8}  {ago(source.age):<7}"
-    return Text(f"{mark}{name.plain} {figures}{told}", style)
+    return Text(f"{mark}{name.plain} {figures}{waits(source, state)}", style)
 
 
 def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
     """The serial line, the commands, and all that was refused."""
     before = seen.before or state
-    title = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
-    if seen.info is not None:
-        sim = seen.info.simulated
-        title.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
-    titles: list[tuple[int, str | Text]] = [(0, title)]
+    head = title(seen, state)
+    titles: list[tuple[int, str | Text]] = [(0, head)]
     if state.certificate:
-        style = "" if state.certificate.startswith("valid for") else "bold red"
-        told = Text(f"certificate {clean(state.certificate)}", style)
-        titles.append((max(title.cell_len + 2, width - told.cell_len - 4), told))
-    seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
-
-    def counted(name: str) -> str:
-        now, then = state.counters.get(name, 0), before.counters.get(name, 0)
-        return f"{rate(now, then, seconds)} of {count(now):<10}"
-
-    counters = state.counters
-    superseded, overrun = counters.get("lines_superseded", 0), counters.get("bus_overrun", 0)
-    met = counters.get("commands_first_contact", 0)
+        told = certificate(state)
+        titles.append((max(head.cell_len + 2, width - told.cell_len - 4), told))
+    counted = rates(state, before)
+    superseded = state.counters.get("lines_superseded", 0)
     lines = [
         rule(width, titles),
-        row("lines", f"in {counted('lines')} out {counted('lines_sent')}").append(
+        row("lines", f"in {counted('lines'):<21} out {counted('lines_sent'):<21}").append(
             f" superseded {count(superseded)}"
         ),
-        row("commands", f"   {counted('commands')} ").append_text(_missed(state, before)),
+        row("commands", f"   {counted('commands'):<21} ").append_text(missed(state, before)),
     ]
-    if met:
+    if met := state.counters.get("commands_first_contact", 0):
         lines[-1].append(f"  first contact {count(met)}", "dim")
-    if overrun:
-        lines[-1].append(f"  bus overrun {count(overrun)}", "yellow")
+    if lost := overrun(state):
+        lines[-1].append("  ").append_text(lost)
     if state.gyro != "off":
         lines.append(_gyro(state.gyro))
     lines += _refusals(state, before)
     return lines
+
+
+def title(seen: Seen, state: RobotState) -> Text:
+    """The link and where it goes."""
+    told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
+    if seen.info is not None:
+        sim = seen.info.simulated
+        told.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
+    return told
+
+
+def certificate(state: RobotState) -> Text:
+    """How long it is good for."""
+    style = "" if state.certificate.startswith("valid for") else "bold red"
+    return Text(f"certificate {clean(state.certificate)}", style)
+
+
+def rates(state: RobotState, before: RobotState) -> Callable[[str], str]:
+    """How often a counter counts, and what it has counted."""
+    seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
+
+    def counted(name: str) -> str:
+        now, then = state.counters.get(name, 0), before.counters.get(name, 0)
+        return f"{rate(now, then, seconds)} of {count(now)}"
+
+    return counted
+
+
+def overrun(state: RobotState) -> Text:
+    """Samples that the bus could not hold, where there were any."""
+    lost = state.counters.get("bus_overrun", 0)
+    return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
 
 
 def _gyro(does: str) -> Text:
@@ -157,14 +197,26 @@ def _port(info: Info) -> str:
     return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
 
 
-def _missed(state: RobotState, before: RobotState) -> Text:
+def missed(state: RobotState, before: RobotState) -> Text:
+    """Periods, in yellow while they grow."""
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
     return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
-    """What was rejected, by reason, what grows in yellow; and the last refusal in words."""
+    """What was rejected, by reason, and the last refusal in words."""
+    kinds = [
+        Text(f"{kind} ").append_text(Text(", ").join(parts))
+        for kind, parts in refused(state, before)
+    ]
+    joined = Text(" · ").join(kinds) if kinds else Text("nothing", "dim")
+    last = row("last one", clean(state.refused)) if state.refused else row("last one", "-", "dim")
+    return [row("rejected", "").append_text(joined), last]
+
+
+def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
+    """What was rejected, by kind and reason, what grows in yellow."""
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
@@ -175,10 +227,8 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
             told = f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}"
             parts.append(Text(told, "yellow" if grows else ""))
         if parts:
-            kinds.append(Text(f"{kind} ").append_text(Text(", ").join(parts)))
-    joined = Text(" · ").join(kinds) if kinds else Text("nothing", "dim")
-    last = row("last one", clean(state.refused)) if state.refused else row("last one", "-", "dim")
-    return [row("rejected", "").append_text(joined), last]
+            kinds.append((kind, parts))
+    return kinds
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
@@ -192,14 +242,15 @@ def timing(state: RobotState, width: int) -> list[Text]:
     for name in NAMES:
         line = Text(f"{name:<16}").append(FIGURES[name][long].ljust(room), "dim")
         one = state.figures.get(name)
-        for spread in (one.last_minute, one.since_start) if one else (None, None):
-            line.append_text(_spread(spread))
+        for figures in (one.last_minute, one.since_start) if one else (None, None):
+            line.append_text(spread(figures))
         lines.append(line)
     return lines
 
 
-def _spread(spread: Spread | None) -> Text:
-    if spread is None or spread.count <= 0:
+def spread(found: Spread | None) -> Text:
+    """Of one figure, in 21 cells."""
+    if found is None or found.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
-    p50, p99, most = (duration(value).rjust(7) for value in (spread.p50, spread.p99, spread.max))
+    p50, p99, most = (duration(value).rjust(7) for value in (found.p50, found.p99, found.max))
     return Text.assemble(p50, (p99, "bold"), (most, "dim"))

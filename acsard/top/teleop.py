@@ -71,15 +71,29 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[tuple[Loo
     return [*shown[: max(1, height - len(below))], *below][:height]
 
 
-def line(seen: Teleop) -> str:
-    """All of it but the help in one line."""
+def news(seen: Teleop, width: int) -> list[str]:
+    """All of it but the help in few lines, broken between words and between figures."""
     told = [f"keys ask {asked(seen)}"]
     if seen.state is None or seen.age > SILENT_S:
-        return f"{silence(seen)}; {told[0]}"
+        return _words([silence(seen), *told], width)
     if seen.objection:
         told.insert(0, f"your keys do not drive: {printable(seen.objection)}")
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
-    return "; ".join([why, *told, "  ".join(measured(seen.state))])
+    return _words([why, *told], width, measured(seen.state))
+
+
+def parting(seen: Teleop, width: int) -> list[str]:
+    """The same at the end: whether the robot that is left stands, and where."""
+    if seen.state is None or seen.age > SILENT_S:
+        return _words([f"left: {silence(seen)}"], width)
+    what = "still moves" if moves(seen.state) else "stands"
+    why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
+    return _words([f"left: the robot {what}", why], width, measured(seen.state))
+
+
+def moves(state: RobotState) -> bool:
+    """Not all of it stands."""
+    return any((state.linear, state.angular, *state.wheels))
 
 
 def silence(seen: Teleop) -> str:
@@ -119,6 +133,13 @@ def flow(parts: Sequence[str], width: int) -> list[str]:
         else:
             found.append(part[:width])
     return found
+
+
+def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list[str]:
+    """Sentences and figures below each other, what goes on set in."""
+    width = max(20, width)
+    lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
+    return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]
 
 
 def _wrapped(look: Look, text: str, width: int) -> list[tuple[Look, str]]:

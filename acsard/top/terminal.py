@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import signal
@@ -17,7 +16,7 @@ from rich.text import Text
 
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
-from acsard.top.keys import keys
+from acsard.top.keys import keys, until_told
 from acsard.top.roster import table
 from acsard.top.teleop import Look, Teleop, lines
 from acsard.top.view import MODES, screen
@@ -73,20 +72,11 @@ def _hold(shows: Callable[[Console, list[bool]], bool]) -> None:
     """Have a screen until a signal, or until it is over; `shows` gives True for ^Z."""
     _be_lenient()
     console, suspend = Console(), []
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # leave as by Ctrl-C
     signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
-    try:
+    with until_told():
         while shows(console, suspend):
             suspend.clear()
             os.kill(os.getpid(), signal.SIGSTOP)  # ^Z: the terminal is as it was; fg goes on
-    except KeyboardInterrupt:
-        pass
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
-        # The terminal has been closed: nobody to tell.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:

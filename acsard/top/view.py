@@ -9,7 +9,9 @@ from __future__ import annotations
 from rich.console import Group
 from rich.text import Text
 
-from acsard.top.sections import WIDEST, link, motion, sources, timing
+from acsard.top import sections as beside
+from acsard.top import stacked
+from acsard.top.sections import WIDEST
 from acsard.top.seen import Seen
 from acsard.top.text import ago, clean, ends
 
@@ -34,10 +36,15 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state
-        sections = [motion(state, width), link(seen, state, width), timing(state, width)]
+        parts = stacked if width < stacked.BELOW else beside
+        sections = [
+            parts.motion(state, width),
+            parts.link(seen, state, width),
+            parts.timing(state, width),
+        ]
         used = len(head) + sum(map(len, sections)) + 1
         room = MOST_SOURCES if height is None else max(1, min(MOST_SOURCES, height - used))
-        sections.insert(1, sources(state, room, width))
+        sections.insert(1, parts.sources(state, room, width))
     used = len(head) + sum(map(len, sections))
     airy = height is None or height - used >= len(sections) - 1
     body = [line for part in sections for line in ([Text(), *part] if airy else part)]
@@ -63,13 +70,16 @@ def _header(seen: Seen, width: int) -> Text:
 
 
 def _mode(seen: Seen, width: int) -> list[Text]:
-    """The mode as a badge, the reason beside it; two lines, so that a long one moves nothing."""
+    """The mode as a badge, the reason beside it; two lines, so that a long one moves nothing,
+    but where it is narrow as many as it takes."""
     state = seen.state
     if state is None:
         return [Text("waiting for the first state", "yellow")]
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODES.get(state.mode, "reverse"))
     words = clean(state.reason.removeprefix(f"{state.mode}: "))
     first, second = _split(words, width - badge.cell_len - 2)
+    if width < stacked.BELOW:
+        return [badge, *stacked.folded(words, width, 2)]
     gap = " " * (badge.cell_len + 2)
     return [Text.assemble(badge, "  ", (first, "bold")), Text.assemble(gap, (second, "bold"))]
 

@@ -577,6 +577,7 @@ def test_two_senders_never_arm_each_other_whatever_their_clocks(way: Way, ahead:
 # h. what neutral is
 
 RATES_HZ = (3.8, 5.0, 10.0, 50.0)
+KINDS = ("steady", "stalls", "cuts", "another")
 
 
 def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
@@ -612,8 +613,18 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [1, slow(6), long(100, 1800)])
-@pytest.mark.parametrize("kind", ["steady", "stalls", "cuts", "another"])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        ("steady", 1),
+        ("stalls", 1),
+        *(pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS),
+        *(
+            pytest.param(kind, 100, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
+            for kind in KINDS
+        ),
+    ],
+)
 def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> None:
     dice, found = random.Random(9), Counter[str]()
     # A cut that loses all is a pause as far as one can tell who does not number what it sends.
@@ -625,9 +636,10 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
     assert not +found
 
 
-def test_another_s_zeros_while_a_bridged_sender_is_stalled_do_not_set_it_off() -> None:
+@pytest.mark.parametrize("count", [4, slow(12)])
+def test_another_s_zeros_while_a_bridged_sender_is_stalled_do_not_set_it_off(count: int) -> None:
     dice, found = random.Random(10), 0
-    for trial in range(12):
+    for trial in range(count):
         world = quiet_bus(World())
         world.run(0.3)
         speaker, hz = Speaker(world, "bridge"), RATES_HZ[trial % 4]

@@ -180,7 +180,7 @@ def once_round(bus: Bus) -> None:
     until(lambda: abs(math.remainder(yaw(), 2 * math.pi)) < 0.15, RIDES_S, "once round")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
@@ -256,7 +256,7 @@ def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
             assert "no word from the daemon" in terminal.screen
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path: Path) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()

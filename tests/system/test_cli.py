@@ -36,6 +36,7 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
+from tests.system.typed import typed
 
 VERBS = (
     "run",
@@ -57,9 +58,7 @@ VERBS = (
 
 def tool(shared: Daemon, *words: str) -> Finished:
     """A tool that knows where the shared daemon is, run to its end."""
-    ended = finish(acsard(*words, "--config", str(shared.config)), shared.config.parent)
-    assert "Traceback" not in ended.err, ended.err
-    return ended
+    return typed(*words, "--config", str(shared.config))
 
 
 # help
@@ -74,8 +73,8 @@ def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_has_a_help_that_says_what_it_does(tmp_path: Path, verb: str) -> None:
-    ended = finish(acsard(verb, "--help"), tmp_path)
+def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
+    ended = typed(verb, "--help")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith(f"usage: acsard {verb}")
     assert "--config" in ended.out
@@ -87,8 +86,8 @@ def test_version(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"]])
-def test_a_mistyped_command_ends_with_2(tmp_path: Path, words: list[str]) -> None:
-    ended = finish(acsard(*words), tmp_path)
+def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
+    ended = typed(*words)
     assert (ended.code, ended.out) == (2, "")
     assert "usage: acsard" in ended.err
 
@@ -119,8 +118,8 @@ def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
 # topics and check need no daemon
 
 
-def test_topics_lists_every_key_with_its_meaning(tmp_path: Path) -> None:
-    ended = finish(acsard("topics"), tmp_path)
+def test_topics_lists_every_key_with_its_meaning(shared: Daemon) -> None:
+    ended = tool(shared, "topics")
     assert (ended.code, ended.err) == (0, "")
     head, *rows = ended.out.splitlines()
     assert head.split() == ["KEY", "TYPE", "RATE", "MEANING"]
@@ -140,7 +139,7 @@ def test_check_prints_a_toml_document_that_checks_again(tmp_path: Path) -> None:
     assert ended.out.startswith("# effective configuration from built-in defaults")
     assert tomllib.loads(ended.out)["drive"]["wheel_radius"] == 0.05
     (tmp_path / "again.toml").write_text(ended.out)
-    again = finish(acsard("check", "--config", "again.toml"), tmp_path)
+    again = typed("check", "--config", str(tmp_path / "again.toml"))
     assert again.code == 0
     assert again.out.splitlines()[1:] == ended.out.splitlines()[1:]
 
@@ -267,10 +266,10 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
 
 @pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
 def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
-    tmp_path: Path, words: list[str]
+    shared: Daemon, words: list[str]
 ) -> None:
     endpoint, begun = free_endpoint(), time.monotonic()
-    ended = finish(acsard(*words, "--connect", endpoint), tmp_path)
+    ended = tool(shared, *words, "--connect", endpoint)
     assert (ended.code, ended.out) == (69, "")
     (told,) = ended.err.splitlines()
     assert endpoint in told
@@ -287,12 +286,50 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
 
 @pytest.mark.parametrize("robot_id", ["a/b*", "", "**", "robot 1"])
 def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
-    tmp_path: Path, robot_id: str
+    shared: Daemon, robot_id: str
 ) -> None:
     for words in (["call", "clear"], ["echo", "odom"], ["hz", "odom"]):
-        ended = finish(acsard(*words, f"--id={robot_id}"), tmp_path)
+        ended = tool(shared, *words, f"--id={robot_id}")
         assert (ended.code, ended.out) == (2, "")
         assert f"{robot_id!r} is not a robot's id" in ended.err
+
+
+@pytest.mark.parametrize("verb", ["top", "hz", "whoami", "set", "drive", "odom", "calibrate"])
+@pytest.mark.parametrize("ids", ["*", "robot1,robot2"])
+def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
+    words = {"hz": ["odom"]}.get(verb, [])
+    ended = tool(shared, verb, *words, "--id", ids)
+    assert (ended.code, ended.out) == (2, "")
+    assert f"`acsard {verb}` is for one" in ended.err
+    assert "acsard fleet" in ended.err
+
+
+# words that nothing is called
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["get", "inof"], "info"),
+        (["echo", "oddom", "--timeout", "0.01"], "odom"),
+        (["hz", "diagnostic", "-n", "1"], "diagnostics"),
+        (["set", "linear_speed", "0.5"], "limits.linear_speed"),
+        (["call", "stpo"], "stop"),
+        (["dirve"], "drive"),
+    ],
+)
+def test_a_misspelt_key_service_setting_or_verb_is_asked_about(
+    shared: Daemon, bus: Bus, words: list[str], meant: str
+) -> None:
+    ended = tool(shared, *words)
+    assert f"did you mean {meant}?" in ended.out + ended.err
+    assert ended.code != 0 or words[0] == "hz"
+
+
+def test_a_key_like_no_other_is_told_where_they_are_listed(shared: Daemon) -> None:
+    ended = tool(shared, "get", "nonsense")
+    assert (ended.code, ended.out) == (69, "")
+    assert "`acsard topics`" in ended.err
 
 
 # call
@@ -353,16 +390,14 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
     file.write_text(f"{text}\n[rates]\nstate = 10.0  # often\n", encoding="utf-8")
     words = ("set", "rates.state", "5", "log.level", "debug", "--config", str(file))
     try:
-        ended = finish(acsard(*words), tmp_path)
+        ended = typed(*words)
         assert (ended.code, ended.out) == (
             0,
             'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); until the next start',
         )
         assert bus.get("config")["rates"]["state"] == 5.0
         assert "state = 10.0  # often" in file.read_text(encoding="utf-8")
-        ended = finish(
-            acsard("set", "rates.state", "4", "--write", "--config", str(file)), tmp_path
-        )
+        ended = typed("set", "rates.state", "4", "--write", "--config", str(file))
         assert (ended.code, ended.out) == (
             0, f"rates.state = 4.0 (was 5.0); written to {file}",
         )  # fmt: skip
@@ -480,12 +515,22 @@ os.execv(sys.executable, [sys.executable, "-m", "acsard", *sys.argv[1:]])
 """Makes its standard input the controlling terminal, as a shell does, so that ^C is a signal."""
 
 
+UNDER_A_SHELL = """\
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+words = ["bash", "--norc", "-ic", '"$@"; true', "bash", sys.executable, "-m", "acsard"]
+os.execvp("bash", [*words, *sys.argv[1:]])
+"""
+"""The same, as a job of a shell."""
+
+
 class Terminal:
     """A person at a terminal: presses keys, reads the screen."""
 
     def __init__(self) -> None:
         self.screen = ""
         self._master, self.slave = pty.openpty()
+        self._open = True
         self._leave = threading.Event()
         self._reader = threading.Thread(target=self._read)
 
@@ -494,6 +539,12 @@ class Terminal:
         return self
 
     def __exit__(self, *error: object) -> None:
+        if self._open:
+            self.close()
+
+    def close(self) -> None:
+        """The window is closed."""
+        self._open = False
         self._leave.set()
         self._reader.join()
         os.close(self._master)
@@ -548,6 +599,39 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
             yield terminal, program
 
 
+@contextmanager
+def at_terminal(
+    daemon: Daemon, verb: str, term: str, columns: int = 80, how: str = ON_TERMINAL
+) -> Iterator[tuple[Terminal, Program]]:
+    """A verb at a terminal of its own, of that kind and width and 24 lines."""
+    with Terminal() as terminal:
+        size = struct.pack("HHHH", 24, columns, 0, 0)
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
+        env = environment(TERM=term)
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            env.pop(name, None)
+        with Program(
+            [sys.executable, "-c", how, verb, "--config", str(daemon.config)],
+            daemon.config.parent,
+            env,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as program:
+            yield terminal, program
+
+
+@contextmanager
+def without_a_screen(
+    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+) -> Iterator[tuple[Terminal, Program]]:
+    """`acsard drive` at a terminal that can have no screen."""
+    with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
+        until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
+        yield terminal, program
+
+
 def screens(terminal: Terminal) -> list[str]:
     """All whole screens so far, without their colours."""
     frames = terminal.screen.split("\x1b[H")[1:-1]
@@ -557,24 +641,9 @@ def screens(terminal: Terminal) -> list[str]:
 @contextmanager
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """`acsard drive` at a terminal of that width that can have a screen."""
-    with Terminal() as terminal:
-        size = struct.pack("HHHH", 24, columns, 0, 0)
-        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
-        env = environment(TERM="xterm-256color")
-        for name in ("COLUMNS", "LINES", "NO_COLOR"):
-            env.pop(name, None)
-        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
-        with Program(
-            words,
-            shared.config.parent,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
-            yield terminal, program
+    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
+        until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
+        yield terminal, program
 
 
 @pytest.mark.parametrize("columns", [40, 80])
@@ -617,27 +686,44 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
 
 
 @pytest.mark.slow
-def test_without_a_screen_there_is_a_line_a_second_and_the_help(shared: Daemon, bus: Bus) -> None:
-    with Terminal() as terminal:
-        words = [sys.executable, "-c", ON_TERMINAL, "drive", "--config", str(shared.config)]
-        with Program(
-            words,
-            shared.config.parent,
-            environment(TERM="dumb"),
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ):
-            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
-            begun = time.monotonic()
-            with held(terminal, "i"):
-                until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some lines")
-            took = time.monotonic() - begun
+def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
+    shared: Daemon, bus: Bus
+) -> None:
+    with without_a_screen(shared, columns=50) as (terminal, _):
+        begun = time.monotonic()
+        with held(terminal, "i"):
+            until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some news")
+        took = time.monotonic() - begun
     lines = terminal.screen.splitlines()
     assert any("u  i  o" in line for line in lines)
     assert terminal.screen.count("driving: ") <= 2 * took + 2
-    assert "yaw" in lines[-1]
+    assert max(map(len, lines)) <= 50
+    bus.at_rest()
+
+
+def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon, bus: Bus) -> None:
+    with without_a_screen(shared) as (terminal, program):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+        terminal.press("\x03")
+        assert program.ended(5.0) == 0
+        until(lambda: "left: the robot stands; " in terminal.screen, 2.0, "the last word")
+    assert "forward +0.00 m/s" in terminal.screen.partition("left: ")[2]
+
+
+def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silence(
+    shared: Daemon, bus: Bus
+) -> None:
+    # It hears that twice: by its keys, or by its shell, and once more while it says its zeros.
+    with (
+        bus.follow("cmd/teleop") as commands,
+        without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
+    ):
+        with held(terminal, "i"):
+            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+        closed = time.monotonic()
+        terminal.close()
+        commands.find(lambda value: value["twist"]["linear"]["x"] == 0, 1.0, "a zero", after=closed)
     bus.at_rest()
 
 

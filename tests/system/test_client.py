@@ -202,7 +202,8 @@ def test_get_of_a_key_that_is_not_there_says_so(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot, pytest.raises(NoAnswerError) as error:
         robot.get("odometry")
     assert isinstance(error.value, TimeoutError)
-    assert "acsard topics" in str(error.value)
+    assert "did you mean odom?" in str(error.value)
+    assert 'robot.id "acsar"' in str(error.value)
 
 
 def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(

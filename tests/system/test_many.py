@@ -27,12 +27,12 @@ from tests.system.harness import (
     acsard,
     client_config,
     environment,
-    finish,
     free_endpoint,
     until,
 )
 from tests.system.identities import free_tls_endpoint
 from tests.system.test_cli import ON_TERMINAL, Terminal, screens
+from tests.system.typed import typed
 
 ONE, TWO = "robot1", "robot2"
 
@@ -47,9 +47,7 @@ class Robots:
         return acsard(*words, "--connect", self.endpoint, "--id", who)
 
     def tool(self, *words: str, who: str = "*") -> Finished:
-        ended = finish(self.words(*words, who=who), self.where)
-        assert "Traceback" not in ended.err, ended.err
-        return ended
+        return typed(*words, "--connect", self.endpoint, "--id", who)
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import re
 import signal
-import struct
-import subprocess
-import sys
-import termios
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import Bus, Daemon, Program, acsard, environment, finish, until
-from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.test_cli import Terminal, at_terminal
 
 SIZE = 80, 24
 
@@ -27,23 +22,8 @@ FRAME = "\x1b[H"
 @contextmanager
 def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
     """`acsard top` at a terminal of 80x24 of its own."""
-    env = environment(TERM="xterm-256color")
-    for name in ("COLUMNS", "LINES", "NO_COLOR"):
-        env.pop(name, None)
-    command = [sys.executable, "-c", ON_TERMINAL, "top", "--config", str(daemon.config)]
-    with Terminal() as terminal:
-        columns, rows = SIZE
-        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
-        with Program(
-            command,
-            daemon.config.parent,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            yield terminal, program
+    with at_terminal(daemon, "top", "xterm-256color", SIZE[0]) as found:
+        yield found
 
 
 def shown(terminal: Terminal) -> list[str]:

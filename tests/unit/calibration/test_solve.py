@@ -29,7 +29,7 @@ WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
 FEW, MANY = 4, 20
 
 each_way = pytest.mark.parametrize("way", WAYS)
-so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.soak)])
 
 
 @cache

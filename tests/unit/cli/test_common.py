@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import common
-from acsard.cli.common import PLACES, find, load, require_asked, require_followed, robot_address
+from acsard.cli.common import (
+    PLACES,
+    find,
+    load,
+    require_asked,
+    require_followed,
+    robot_address,
+    warn_of_unknown,
+)
 from acsard.config.settings import Config
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
@@ -175,6 +183,18 @@ def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
     with pytest.raises(ExitError) as caught:
         robot_address(argparse.Namespace(config=str(file), connect=None, id=None, tls=None))
     assert caught.value.code is Exit.BAD_CONFIG
+
+
+def test_a_key_that_nobody_has_is_warned_of_but_not_a_stranger_s_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for key in ("odom", "cmd/stranger", "json/odom", "wheel_cmd/x", "schema/Twist"):
+        warn_of_unknown(key)
+    assert capsys.readouterr().err == ""
+    warn_of_unknown("oddom\x1b[2J")
+    err = capsys.readouterr().err
+    assert "did you mean odom?" in err
+    assert err.strip().isprintable()
 
 
 # keys of another kind than was thought

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import pytest
 from acsard.cli import VERBS, main
 from acsard.cli.completion import SHELLS
 from acsard.host.exits import Exit
+from tests.system.harness import Program, environment, until
+from tests.system.test_cli import Terminal
+from tests.system.typed import typed
 
 ASK = """\
 source {script}
@@ -19,6 +23,47 @@ COMP_WORDS=({words}); COMP_CWORD=$(( ${{#COMP_WORDS[@]}} - 1 ))
 {function} acsard "${{COMP_WORDS[COMP_CWORD]}}" "${{COMP_WORDS[COMP_CWORD-1]}}"
 printf '%s\\n' "${{COMPREPLY[@]}}"
 """
+
+
+SECOND = "acsard set log.level war"
+
+VALUES = [
+    ("acsard get sta", {"state"}),
+    ("acsard get schema/Od", {"schema/Odometry"}),
+    ("acsard echo wheel_s", {"wheel_states"}),
+    ("acsard echo wheel_cmd/n", {"wheel_cmd/nav"}),
+    ("acsard hz json/odo", {"json/odom"}),
+    ("acsard call se", {"set_pose"}),
+    ("acsard set limits.linear_s", {"limits.linear_speed", "limits.linear_stop_deceleration"}),
+    (SECOND, {"warning"}),
+    ("acsard drive --source tele", {"teleop"}),
+    ("acsard sim --fault bit", {"bit_errors"}),
+]
+"""What is typed, and all that may follow."""
+
+
+def require(shell: str) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} here")
+
+
+def offers(*words: str) -> list[str]:
+    """What a shell prints, of each line the word without its description."""
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30.0)
+    assert done.returncode == 0, done
+    return [line.split("\t")[0] for line in done.stdout.splitlines() if line]
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The script of each shell."""
+    made = {}
+    for shell in SHELLS:
+        ended = typed("completion", shell)
+        assert ended.code == 0
+        made[shell] = tmp_path_factory.mktemp(shell) / "_acsard"
+        made[shell].write_text(ended.out)
+    return made
 
 
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -33,20 +78,80 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
         ("acsard call cl", {"clear"}),
         ("acsard lan init --wr", {"--write"}),
         ("acsard service uninstall --pu", {"--purge"}),
+        *VALUES,
     ],
 )
-def test_bash_offers_verbs_options_and_choices(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, offered: set[str]
+def test_bash_offers_verbs_options_and_values(
+    scripts: dict[str, Path], words: str, offered: set[str]
 ) -> None:
-    script = tmp_path / "acsard"
-    text = printed(capsys, "completion", "bash")
-    script.write_text(text)
+    script = scripts["bash"]
     (function,) = {
-        line.split("-F ")[1].split()[0] for line in text.splitlines() if line.startswith("complete")
+        line.split("-F ")[1].split()[0]
+        for line in script.read_text().splitlines()
+        if line.startswith("complete")
     }
     ask = ASK.format(script=script, words=words, function=function)
-    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, timeout=30.0)
-    assert set(done.stdout.split()) == offered, done
+    assert set(offers("bash", "-c", ask)) == offered
+
+
+@pytest.mark.parametrize(("words", "offered"), VALUES)
+def test_fish_offers_the_same_values(
+    scripts: dict[str, Path], words: str, offered: set[str]
+) -> None:
+    require("fish")
+    told = offers("fish", "--no-config", "-c", f"source {scripts['fish']}; complete -C '{words}'")
+    assert set(told) >= offered
+    assert all(one.startswith(words.split()[-1]) for one in told)
+
+
+@pytest.mark.slow
+def test_zsh_completes_the_same_values_with_tab(scripts: dict[str, Path], tmp_path: Path) -> None:
+    require("zsh")
+    begin = (
+        "PS1='> '; unsetopt zle_bracketed_paste; autoload -Uz compinit; compinit -u -D; "
+        f"source {scripts['zsh']}; compdef _shtab_acsard acsard; echo rea'dy'"
+    )
+    with (
+        Terminal() as terminal,
+        Program(
+            ["zsh", "-f", "-i"],
+            tmp_path,
+            environment(TERM="dumb"),
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=terminal.slave,
+            start_new_session=True,
+        ),
+    ):
+        terminal.press(begin + "\r")
+        until(lambda: "ready" in terminal.screen, 10.0, "zsh")
+        for words, offered in VALUES:
+            # Behind a first word of many the library's zsh offers files.
+            if len(offered) == 1 and words != SECOND:
+                whole = " ".join([*words.split()[:-1], *offered])
+                terminal.press(f"{words}\t")
+                until(lambda: whole in terminal.screen, 10.0, whole)  # noqa: B023
+                terminal.press("\x15")
+
+
+@pytest.mark.parametrize("shell", ["bash", "fish"])
+def test_recordings_are_offered_by_number_beside_the_files(
+    scripts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: str
+) -> None:
+    require(shell)
+    program = tmp_path / "bin/acsard"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\necho '000041-start.mcap  2026-01-01  9 s'\necho nothing else\n")
+    program.chmod(0o755)
+    (tmp_path / "42.mcap").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    script, words = scripts[shell], "acsard log show 4"
+    ask = {
+        "bash": ("-c", ASK.format(script=script, words=words, function="_shtab_acsard")),
+        "fish": ("--no-config", "-c", f"source {script}; complete -C '{words}'"),
+    }[shell]
+    assert set(offers(shell, *ask)) == {"41", "42.mcap"}
 
 
 @pytest.mark.parametrize("shell", SHELLS)

@@ -155,26 +155,25 @@ def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
 # without a screen
 
 
-def lines_of(states: list[tuple[float, RobotState]]) -> list[str]:
-    """What is printed when these are there at these times, s."""
+def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
+    """Those that are printed when these are there at these times, s."""
     news = News()
-    told = (news.tell(replace(SEEN, state=state), now) for now, state in states)
-    return [line for line in told if line]
+    return [state for now, state in states if news.tell(replace(SEEN, state=state), now)]
 
 
 def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
     moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
-    assert len(lines_of(moving)) == 10
+    assert len(told(moving)) == 10
     resting = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
-    assert len(lines_of(resting)) == 1
+    assert len(told(resting)) == 1
 
 
 def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second() -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
-    told = lines_of([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
-    assert [line.partition(":")[0] for line in told] == ["driving", "stopped", "driving"]
+    found = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
+    assert [state.mode for state in found] == ["driving", "stopped", "driving"]
     flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
-    assert len(lines_of(flickering)) <= 20
+    assert len(told(flickering)) <= 20
 
 
 def test_without_the_library_of_the_screen_the_rest_is_there() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.config.parsing import effective, from_builtins, parse
@@ -41,7 +41,6 @@ def test_what_is_printed_again_is_the_same_text() -> None:
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1))
-@settings(max_examples=200)
 def test_any_text_survives_printing(port: str) -> None:
     config = Config(mcu=McuConfig(port=port[:256]))
     assert parse(printed(config).encode()) == config

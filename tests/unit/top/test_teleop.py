@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.drive.modes import Mode
-from acsard.top.teleop import HELP, NARROWEST, Teleop, line, lines
+from acsard.top.teleop import HELP, Teleop, lines, news, parting
 from tests.unit.top.screens import STATE
 
 SEEN = Teleop("acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, STATE, 0.1)
@@ -18,11 +18,16 @@ LONG = (
     "if that was set; the microcontroller's lines come 0.50 s apart; if it reports by its own "
     "clock, set mcu.reply_period = 0.50, and look at the cable"
 )
-WIDTHS = (NARROWEST, 57, 80, 118, 160)
+WIDTHS = (40, 57, 80, 118, 160)
 
 
 def of(**what: object) -> Teleop:
     return replace(SEEN, state=replace(STATE, **what))
+
+
+def told(lines: list[str]) -> str:
+    """As it is read."""
+    return " ".join(" ".join(lines).split())
 
 
 def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
@@ -58,13 +63,13 @@ def test_keys_that_do_not_drive_are_told() -> None:
     why = "app, of the same priority, came first: until it is silent"
     seen = replace(SEEN, objection=why)
     assert why in " ".join(" ".join(texts(seen, 40)).split())
-    assert why in line(seen)
+    assert why in told(news(seen, 40))
 
 
 def test_a_silence_is_told_with_its_length() -> None:
     for seen in (replace(SEEN, age=7.0), replace(SEEN, state=None, age=7.0)):
         assert "no word from the daemon for 7 s" in " ".join(texts(seen, 80))
-        assert "no word from the daemon for 7 s" in line(seen)
+        assert "no word from the daemon for 7 s" in told(news(seen, 80))
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
@@ -72,7 +77,25 @@ def test_a_silence_is_told_with_its_length() -> None:
 def test_the_mode_is_said_once(mode: Mode) -> None:
     seen = of(mode=mode.value, reason=f"{mode.value}: because")
     assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
-    assert line(seen).startswith(f"{mode.value}: because; ")
+    assert news(seen, 80)[0].startswith(f"{mode.value}: because; ")
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int) -> None:
+    said = news(of(mode="waiting", reason=LONG, x=1.5), width)
+    assert max(map(len, said)) <= width
+    assert LONG in told(said)
+    assert sum("x   +1.500 m" in one for one in said) == 1
+    assert sum("turn -0.60 rad/s" in one for one in said) == 1
+
+
+def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
+    still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
+    assert told(parting(of(**still), 80)).startswith("left: the robot stands; driving: commanded")
+    for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
+        assert told(parting(moving, 80)).startswith("left: the robot still moves; driving: ")
+    assert "yaw +57.3°" in told(parting(of(**still), 40))
+    assert told(parting(replace(SEEN, age=7.0), 80)).startswith("left: no word from the daemon")
 
 
 @given(
@@ -83,6 +106,8 @@ def test_the_mode_is_said_once(mode: Mode) -> None:
 )
 def test_it_holds_whatever_comes(text: str, number: float, width: int, height: int) -> None:
     seen = of(mode=text[:9], reason=text, x=number, linear=number, yaw=0.0)
-    shown = texts(replace(seen, robot_id=text, objection=text), width, height)
+    seen = replace(seen, robot_id=text, objection=text)
+    shown = texts(seen, width, height)
     assert len(shown) <= height
+    shown += [*news(seen, width), *parting(seen, width)]
     assert all(len(one) <= width and one.isprintable() for one in shown)

@@ -18,7 +18,7 @@ from tests.unit.calibration.test_solve import off
 FEW, MANY = 1, 20
 
 each_way = pytest.mark.parametrize("way", KINDS)
-so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.soak)])
 
 
 @cache

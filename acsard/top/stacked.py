@@ -1,0 +1,131 @@
+"""The parts of the screen where it is narrow: the same figures, below each other; pure.
+
+What goes on is set in. The figures since the start come last: on a screen of few lines, they go.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from textwrap import wrap
+
+from rich.cells import cell_len
+from rich.text import Text
+
+from acsard.messages.schema import RobotState
+from acsard.runtime.figures import NAMES
+from acsard.top.sections import (
+    certificate,
+    drives,
+    hidden,
+    missed,
+    overrun,
+    rates,
+    refused,
+    speeds,
+    spread,
+    title,
+    waits,
+    wheel,
+)
+from acsard.top.seen import Seen
+from acsard.top.text import ago, clean, count, rule, signed
+
+BELOW = 80
+"""Cells of width from which on things stand beside each other."""
+
+BAR = 4
+
+
+def motion(state: RobotState, width: int) -> list[Text]:
+    """Pose and twist, then the wheels as they sit on the robot."""
+    told = [
+        f"x {signed(state.x, 3, 8)} m",
+        f"y {signed(state.y, 3, 8)} m",
+        f"yaw {signed(math.degrees(state.yaw), 1, 6)}°",
+        f"forward {signed(state.linear, 3, 7)} m/s",
+        f"turn {signed(state.angular, 3, 7)} rad/s",
+    ]
+    lines = [rule(width, [(0, "pose and twist")]), *flow([Text(one) for one in told], width, 0)]
+    lines.append(Text("wheels rad/s", "cyan"))
+    (right, left, rear_left, rear_right), scale = speeds(state)
+    for axle, one, other in (("front", left, right), ("rear", rear_left, rear_right)):
+        line = Text(f"  {axle:<6}", "dim").append_text(wheel(one, scale, BAR)).append(" ")
+        lines.append(line.append_text(wheel(other, scale, BAR)))
+    return lines
+
+
+def sources(state: RobotState, room: int, width: int) -> list[Text]:
+    """Priority and age of each source, and below what it waits for, in about `room` lines."""
+    lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "heard")])]
+    left = list(state.sources)
+    while left:
+        one = left[0]
+        mark = "▶ " if drives(one, state) else "  "
+        name = Text(clean(one.name))
+        name.truncate(13, overflow="ellipsis", pad=True)
+        said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {ago(one.age)}")]
+        said += folded(waits(one, state), width, 4)
+        if len(lines) > 1 and len(lines) + len(said) > room:
+            break
+        lines += [*said]
+        left.pop(0)
+    if left:
+        lines.append(Text(hidden(left), "dim"))
+    return lines if state.sources else [*lines, Text("  none", "dim")]
+
+
+def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
+    """The serial line, the commands, and all that was refused."""
+    before = seen.before or state
+    lines = [rule(width, [(0, title(seen, state))])]
+    if state.certificate:
+        lines += flow([certificate(state)], width, 2)
+    counted = rates(state, before)
+    told = [Text(f"{what} {counted(name)}") for what, name in LINES]
+    superseded = state.counters.get("lines_superseded", 0)
+    told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
+    lines += flow([one for one in told if one], width, 0)
+    if state.gyro != "off":
+        lines += folded(f"gyro {clean(state.gyro)}", width, 2)
+    kinds = refused(state, before)
+    for kind, parts in kinds:
+        lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
+    if not kinds:
+        lines.append(Text("rejected nothing"))
+    return [*lines, *folded(f"last one {clean(state.refused) or '-'}", width, 2)]
+
+
+LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "commands"))
+
+
+def timing(state: RobotState, width: int) -> list[Text]:
+    """The daemon's figures of itself."""
+    heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
+    lines = [rule(width, [(0, "timing")])]
+    for since, last in (("last minute", True), ("since start", False)):
+        lines.append(Text(f"{since:<16}{heads}", "dim"))
+        for name in NAMES:
+            one = state.figures.get(name)
+            figures = None if one is None else one.last_minute if last else one.since_start
+            lines.append(Text(f"{name:<16}").append_text(spread(figures)))
+    return lines
+
+
+def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
+    """As many in a line as fit."""
+    lines: list[Text] = []
+    for part in parts:
+        if lines and lines[-1].cell_len + 2 + part.cell_len <= width:
+            lines[-1].append("  ").append_text(part)
+        else:
+            lines.append(Text(" " * (inset if lines else 0)).append_text(part))
+    return lines
+
+
+def folded(text: str, width: int, inset: int) -> list[Text]:
+    """A sentence broken between words, all but a sentence's label set in."""
+    first = "" if text.startswith(("gyro ", "last one ")) else " " * inset
+    wide = max((cell_len(one) for one in text), default=1)  # a sign may take two cells
+    room, rest = max(inset + 1, width // max(1, wide)), " " * inset
+    return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]
