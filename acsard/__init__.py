@@ -40,6 +40,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     client.py      S  drive and follow a robot from Python
     driving.py     S  one drive of the client, and what `state` says becomes of it
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
+    web/           S  `acsard web`: the robot's page, a process of its own; a viewer per browser
     doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
     cli/           S  one verb per file
 

@@ -39,6 +39,7 @@ from acsard.cli import (
     sim,
     top,
     topics,
+    web,
     whoami,
 )
 from acsard.cli import set as setting
@@ -59,6 +60,7 @@ VERBS = (
     top,
     fleet,
     drive,
+    web,
     call,
     whoami,
     setting,

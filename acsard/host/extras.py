@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote, urlsplit
 
-Extra = Literal["lan", "mcu", "top", "shell"]
+Extra = Literal["lan", "mcu", "top", "shell", "web"]
 
 
 def install(extra: Extra) -> str:

@@ -1,0 +1,251 @@
+"""The page's server from start to end: addresses, the way to the daemon, and the way out."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import ssl
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from aiohttp import web
+from msgspec import Struct
+
+from acsard.bus.address import Address
+from acsard.bus.certificates import CERTIFICATE, KEY, names_in, require_usable
+from acsard.bus.session import client_session
+from acsard.client import Client
+from acsard.config.settings import Config
+from acsard.host.addresses import own_addresses
+from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.host.parent import end_with_parent
+from acsard.web.app import Page
+from acsard.web.calls import Calls
+from acsard.web.counts import Counts
+from acsard.web.files import PAGE
+from acsard.web.fleet import Fleet
+from acsard.web.gate import Gate
+from acsard.web.hand import SOURCE, Hand
+from acsard.web.robots import About, Robots
+from acsard.web.tokens import Vault
+from acsard.web.who import is_loopback
+
+TRIES = 20
+"""Ports after a taken one that are tried."""
+
+BEAT_S, TIDY_S = 0.5, 1.0
+
+HANDSHAKE_S = 10.0
+
+IDLE_S = 20.0
+"""A connection between two requests."""
+
+LEAVE_S = 0.3
+"""For the zeros of who drove."""
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long one thread may keep the interpreter from another: a command or a stop waits for it."""
+
+
+class Listen(Struct, frozen=True):
+    """Where to listen: HTTP for this machine, HTTPS for all else."""
+
+    host: str
+    port: int
+
+    @property
+    def here(self) -> bool:
+        """Only this machine reaches it."""
+        return self.host == "localhost" or is_loopback(self.host)
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser; a wildcard by the name of this machine."""
+        host = self.host
+        if host in ("0.0.0.0", "::"):
+            host = f"{socket.gethostname().partition('.')[0]}.local"
+        host = f"[{host}]" if ":" in host else host
+        return f"http{'' if self.here else 's'}://{host}:{self.port}/"
+
+
+class Wanted(Struct, frozen=True):
+    """What is served, where and how."""
+
+    config: Config
+    address: Address
+    listen: tuple[Listen, ...]
+    tls: str
+    """The directory of the robot's certificate, for who comes from elsewhere."""
+    state: Path
+    """The directory of the tokens."""
+    next_port: bool = False
+    """Take a later port where one is taken."""
+    held: bool = False
+    """End with standard input."""
+    page: Path = PAGE
+
+
+def listens(text: str) -> Listen:
+    """An address like 127.0.0.1:8080 or [::1]:8080; raises `UsageError`."""
+    host, _, port = text.rpartition(":")
+    host = host.strip("[]")
+    if not host or not port.isascii() or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise UsageError(f"{text} is no address; write it like 127.0.0.1:8080 or 0.0.0.0:8443")
+    return Listen(host, int(port))
+
+
+def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
+    """The addresses to write on an invitation, the likeliest first; none without HTTPS.
+
+    An IP address before a name: not every phone asks by mDNS.
+    """
+    found: list[str] = []
+    for one in listen:
+        if one.here:
+            continue
+        hosts = [one.host]
+        if one.host in ("0.0.0.0", "::"):
+            certified = set(names_in(tls)) if tls else set()
+            own = [at for at in own_addresses() if at in certified and ":" not in at]
+            hosts = [*own, f"{socket.gethostname().partition('.')[0]}.local"]
+        found += [Listen(host, one.port).url for host in hosts]
+    return found
+
+
+async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> None:
+    """Until a signal; `announce` is told once where it is. Raises `MendableError`s."""
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    leaving = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, leaving.set)
+    if wanted.held:
+        end_with_parent(signal.SIGTERM)
+    counts = Counts()
+    secure, names = _certified(wanted)
+    robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
+    hand = Hand(lambda: robots.client, counts)
+    calls, fleet = Calls(robots), Fleet(robots)
+    vault, gate = Vault(wanted.state), Gate(counts)
+    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, wanted.page)
+    runner = web.AppRunner(
+        page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
+        shutdown_timeout=LEAVE_S,
+    )  # fmt: skip
+    async with AsyncExitStack() as stack:
+        await runner.setup()
+        stack.push_async_callback(runner.cleanup)
+        places = [_bound(one, wanted.next_port) for one in wanted.listen]
+        for one, bound in places:
+            server = await asyncio.get_running_loop().create_server(
+                gate.guarded(runner.server),  # type: ignore[arg-type]
+                sock=bound,
+                ssl=None if one.here else secure,
+                ssl_handshake_timeout=None if one.here else HANDSHAKE_S,
+                backlog=128,
+            )
+            stack.callback(server.close)
+        announce([one.url for one, _ in places])
+        await _until(leaving, robots, page, wanted)
+        page.end_all("the page's server ends")
+        await asyncio.sleep(0)
+        await asyncio.to_thread(hand.flush, LEAVE_S)
+
+
+async def _until(leaving: asyncio.Event, robots: Robots, page: Page, wanted: Wanted) -> None:
+    """Work until told to leave, or until something ends that must not."""
+    work = [
+        asyncio.create_task(leaving.wait()),
+        asyncio.create_task(robots.run()),
+        asyncio.create_task(_tidy(page)),
+    ]
+    if wanted.held:
+        work.append(asyncio.create_task(_held(leaving)))
+    try:
+        done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()  # raises what ended it
+    finally:
+        for task in work:
+            task.cancel()
+
+
+async def _tidy(page: Page) -> None:
+    while True:
+        await asyncio.sleep(TIDY_S)
+        page.end_revoked()
+
+
+async def _held(leaving: asyncio.Event) -> None:
+    """Say on standard input, a socket, that we are alive; leave when it ends."""
+    holder = sys.stdin.fileno()
+    os.set_blocking(holder, False)
+    while not leaving.is_set():
+        try:
+            os.write(holder, b".")
+            if os.read(holder, 64) == b"":
+                leaving.set()
+        except BlockingIOError:
+            pass
+        except OSError:
+            leaving.set()
+        await asyncio.sleep(BEAT_S)
+
+
+def _connected(address: Address) -> Client:
+    """The way to the daemon; blocks."""
+    session = client_session(address.endpoint, address.tls)
+    return Client(session, address.robot_id, SOURCE, address.tls)
+
+
+def _about(wanted: Wanted) -> About:
+    config = wanted.config
+    return About(
+        "",
+        config.mcu.simulated,
+        config.limits.linear_speed,
+        config.limits.angular_speed,
+        config.rates.state,
+        config.record.directory,
+    )
+
+
+def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
+    """What to show from elsewhere, and the names there; raises a `MendableError`."""
+    away = [one for one in wanted.listen if not one.here]
+    if not away:
+        return None, frozenset()
+    if not wanted.tls:
+        raise CertificateError(
+            f"{away[0].host}:{away[0].port} is beyond this machine, which takes a certificate: "
+            "`acsard lan init --write acsard.toml` makes one (bus.tls, or --tls DIRECTORY)"
+        )
+    require_usable(wanted.tls)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(f"{wanted.tls}/{CERTIFICATE}", f"{wanted.tls}/{KEY}", password="")
+    own = socket.gethostname().lower()
+    names = {own, f"{own.partition('.')[0]}.local", *map(str.lower, names_in(wanted.tls))}
+    return context, frozenset(one for one in names if one != "localhost" and not is_loopback(one))
+
+
+def _bound(one: Listen, next_port: bool) -> tuple[Listen, socket.socket]:
+    """A socket there, or at one of the next ports; raises `InUseError`."""
+    ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
+    trouble: OSError | None = None
+    for port in ports:
+        try:
+            found = socket.getaddrinfo(one.host, port, type=socket.SOCK_STREAM)[0]
+            bound = socket.create_server(found[4][:2], family=found[0], backlog=128)
+        except OSError as error:
+            trouble = error
+            continue
+        bound.setblocking(False)
+        return Listen(one.host, port), bound
+    raise InUseError(
+        f"cannot listen on {one.host}:{one.port}: {trouble}; stop what has it, or choose another "
+        "by --address (web.address)"
+    ) from None
