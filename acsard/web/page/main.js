@@ -7,7 +7,7 @@ import { PathMap } from "./map.js";
 import { Plot } from "./plot.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { signed, yaw } from "./words.js";
+import { said as words, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const VIEWS = ["drive", "status", "events", "set", "robots"];
@@ -15,7 +15,7 @@ const LATCHED = ["stopped", "fault"];
 
 const link = new Link();
 const map = new PathMap($("map"));
-const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", why));
+const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
 const settings = new Settings($("settings"), set);
 const plots = {
   speed: new Plot($("plot-speed"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.1, high: 0.3 }),
@@ -38,13 +38,16 @@ function open(name) {
   }
   drive.shown = view === "drive";
   if (!drive.shown) drive.release();
-  if (view === "status") link.subscribe("diagnostics", 1), link.subscribe("wheel_states", 10);
-  else link.unsubscribe("diagnostics"), link.unsubscribe("wheel_states");
-  if (view === "robots") link.subscribe("fleet", 2);
-  else link.unsubscribe("fleet");
+  followed("diagnostics", 1, view === "status");
+  followed("fleet", 2, view === "robots");
   if (view === "events") listed();
   if (view === "set") configured();
   map.redraw();
+}
+
+function followed(key, rate, wanted) {
+  if (wanted) link.subscribe(key, rate);
+  else link.unsubscribe(key);
 }
 
 async function stop() {
@@ -55,7 +58,7 @@ async function stop() {
 
 async function asked(verb) {
   const told = await link.call(verb);
-  views.text("told", told.ok ? "" : told.text);
+  views.text("told", told.ok ? "" : words(told.text));
   said(told);
 }
 
@@ -66,7 +69,7 @@ async function set(payload) {
 
 function said(told) {
   $("set-told").classList.toggle("error", !told.ok);
-  views.text("set-told", told.text);
+  views.text("set-told", words(told.text));
 }
 
 async function got(path) {
@@ -107,7 +110,7 @@ function stated({ detail }) {
   $("clear").hidden = !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
-  views.text("where", `x ${signed(state.x, 2)} m  y ${signed(state.y, 2)} m  ${signed((state.yaw * 180) / Math.PI, 0)}°`);
+  views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
   const wish = wished ?? { linear: 0, angular: 0 };
   views.text("speed", `${signed(state.linear, 2)} of ${signed(wish.linear, 2)} m/s`);
   views.text("turn", `${signed(state.angular, 2)} of ${signed(wish.angular, 2)} rad/s`);
@@ -163,7 +166,7 @@ link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"),
 link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
 link.addEventListener("path", ({ detail }) => map.trail(detail.path));
 link.addEventListener("fleet", ({ detail }) => views.cards($("cards"), detail.fleet));
-link.addEventListener("refused", ({ detail }) => views.text("told", objection(state, SOURCE, hello?.sender) || detail.reason));
+link.addEventListener("refused", ({ detail }) => views.text("told", words(objection(state, SOURCE, hello?.sender)) || detail.reason));
 link.addEventListener("gone", ({ detail }) => views.text("reason", detail.gone));
 link.addEventListener("down", ({ detail }) => {
   drive.release("let go: the connection is gone");
@@ -201,6 +204,7 @@ open("drive");
 link.subscribe("state", 10);
 link.subscribe("odom", 20);
 link.subscribe("cmd_vel_out", 10);
+link.subscribe("wheel_states", 5);
 link.subscribe("events", 5);
 setInterval(looked, 100);
 await invited();

@@ -1,6 +1,6 @@
 // What the other views show: rows made of what the bus says. Text goes in as text, never as HTML.
 
-import { age, ago, clock, reason, signed } from "./words.js";
+import { age, ago, clock, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
@@ -44,9 +44,8 @@ export function counters(list, state) {
 export function happened(list, told) {
   const rows = [...told.events].reverse().map((one) => {
     const by = one.by ? ` — ${one.by}` : "";
-    const times = one.count > 1 ? ` (${one.count} times)` : "";
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${one.text}${times}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${said(one.text)}${by}`);
   });
   list.replaceChildren(...rows);
 }

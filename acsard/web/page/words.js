@@ -33,5 +33,10 @@ export function yaw(q) {
 /** A reason without the mode that stands above it already. */
 export function reason(state) {
   const before = `${state.mode}: `;
-  return state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason;
+  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason);
+}
+
+/** What a program is told to call is a button here. */
+export function said(text) {
+  return text.replace("call srv/clear", "press Clear").replace("srv/clear releases", "Clear releases").replace("call srv/activate", "Set has Switch on");
 }
