@@ -6,6 +6,7 @@ Every request passes `_admit` first. What it hands on has a `Who`, but for the p
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.hand import Hand
 from acsard.web.limits import CONNECTIONS, CONNECTIONS_OF_ONE, Places, Tries
+from acsard.web.programs import Programs, TroubleError
 from acsard.web.robots import Robots
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
@@ -35,6 +37,9 @@ COOKIE = "__Host-acsard"
 
 OPEN = ("/", "/token", "/favicon.ico")
 """For everybody: a page has to be there before it can say who shows it."""
+
+HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
+"""What a browser writes into `Host`; it is written back into a header."""
 
 SEND_BUFFER = 65536
 """Of the kernel, for one client: what lies in it is old when it arrives."""
@@ -70,7 +75,7 @@ class Page:
         """`names` are those by which the robot is reached from elsewhere, lower case."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
-        self._files = Files(page)
+        self._files, self._programs = Files(page), Programs(robots, calls, counts)
         self._tries = Tries()
         self._places = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
         self._viewers: set[Viewer] = set()
@@ -83,6 +88,13 @@ class Page:
                 web.get("/page/{name}", self._file),
                 web.get("/ws", self._socket),
                 web.post("/token", self._token),
+                web.get("/api", self._api),
+                web.get("/api/recordings", self._recordings),
+                web.get("/api/recordings/{name}", self._recording),
+                web.get("/api/whoami", self._whoami),
+                web.post("/api/srv/{verb}", self._service),
+                web.get("/api/{key:.+}", self._value),
+                web.get("/metrics", self._metrics),
             ]
         )
 
@@ -125,6 +137,8 @@ class Page:
             request[WHO] = who
         try:
             return await handler(request)
+        except TroubleError as trouble:
+            return problem(trouble.status, str(trouble))
         except web.HTTPException as error:
             if error.status < 400:
                 raise
@@ -189,8 +203,7 @@ class Page:
         return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
-        who, peer = request[WHO], request.remote or ""
-        assert who is not None
+        who, peer = _who(request), request.remote or ""
         if not self._places.enter(peer):
             return self.refused(
                 Refusal("too_many", f"{CONNECTIONS} pages at most, {CONNECTIONS_OF_ONE} of one")
@@ -214,6 +227,37 @@ class Page:
             self._places.leave(peer)
         return served
 
+    # for programs
+
+    async def _api(self, request: web.Request) -> web.StreamResponse:
+        return self._programs.described()
+
+    async def _metrics(self, request: web.Request) -> web.StreamResponse:
+        return self._programs.metrics(self.viewers)
+
+    async def _whoami(self, request: web.Request) -> web.StreamResponse:
+        who = _who(request)
+        return web.json_response({"role": who.role, "name": who.name})
+
+    async def _value(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.value(_who(request), request.match_info["key"])
+
+    async def _service(self, request: web.Request) -> web.StreamResponse:
+        body = await request.read()
+        return await self._programs.call(_who(request), request.match_info["verb"], body)
+
+    async def _recordings(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.listed()
+
+    async def _recording(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.recording(_who(request), request.match_info["name"])
+
+
+def _who(request: web.Request) -> Who:
+    who = request[WHO]
+    assert who is not None, "it is not open to all"
+    return who
+
 
 def problem(status: int, text: str) -> web.Response:
     """What was wrong, in words."""
@@ -228,7 +272,7 @@ def _asked(request: web.Request) -> Asked:
     return Asked(
         request.remote or "",
         request.secure,
-        hosts[0] if len(hosts) == 1 else "",
+        hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
         request.headers.get("Origin"),
         request.headers.get("Sec-Fetch-Site"),
     )

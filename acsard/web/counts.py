@@ -7,18 +7,16 @@ from collections import Counter
 
 from acsard.web.who import Reason
 
-Count = str
-
 
 class Counts:
     """Counters by name; from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._counts: Counter[Count] = Counter()
-        self._refused: Counter[Reason] = Counter()
+        self._counts: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
 
-    def add(self, name: Count, more: int = 1) -> None:
+    def add(self, name: str, more: int = 1) -> None:
         """So many more."""
         with self._lock:
             self._counts[name] += more
@@ -28,12 +26,12 @@ class Counts:
         with self._lock:
             self._refused[reason] += 1
 
-    def all(self) -> dict[Count, int]:
+    def all(self) -> dict[str, int]:
         """Up to now."""
         with self._lock:
             return dict(self._counts)
 
-    def refused(self) -> dict[Reason, int]:
+    def refused(self) -> dict[str, int]:
         """The refusals up to now, by reason."""
         with self._lock:
             return dict(self._refused)

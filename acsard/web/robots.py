@@ -126,11 +126,14 @@ class Robots:
             await asyncio.sleep(LOOK_S)
 
     def _take(self, states: Stream, now_ns: int) -> None:
+        before = self.state
         try:
             state = self.state = self._states.decode(*(states.raw() or ("", b"")))
         except DecodeError:
             self._counts.add("unreadable")
             return
+        if before is not None and state.counters.get("lines", 0) < before.counters.get("lines", 0):
+            self._trails = {name: Trail() for name in self._trails}  # another daemon
         self._trails["path"].add(now_ns, state.x, state.y)
 
     def _take_truth(self, truth: Stream, now_ns: int) -> None:

@@ -121,8 +121,8 @@ class Streams:
 def as_json(encoding: str, payload: bytes) -> bytes:
     """A message as JSON; null for what cannot be read."""
     try:
-        if detect(encoding, payload) == "json":
-            return bytes(msgspec.Raw(payload)) if msgspec.json.decode(payload) else b"null"
-        return msgspec.json.encode(msgspec.msgpack.decode(payload))
+        known = detect(encoding, payload) == "json"
+        told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)
+        return payload if known else msgspec.json.encode(told)
     except (DecodeError, msgspec.MsgspecError, ValueError, RecursionError, TypeError):
         return b"null"
