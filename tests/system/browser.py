@@ -44,6 +44,7 @@ class Browser:
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self._number = 0
         self._answers: dict[int, asyncio.Future[Any]] = {}
+        self._down: tuple[tuple[float, float], ...] = ()
         self.process: subprocess.Popen[bytes] | None = None
         self.said: list[str] = []
         """What the page wrote to its console, and errors."""
@@ -63,10 +64,13 @@ class Browser:
 
     def end(self, how: int = signal.SIGKILL) -> None:
         """Kill it, with all its processes."""
-        if self.process is not None:
-            os.killpg(self.process.pid, how)
-            if how == signal.SIGKILL:
-                self.process.wait(10.0)
+        if self.process is None:
+            return
+        if how == signal.SIGKILL and hasattr(self, "_session"):
+            self._wait(self._session.close())
+        os.killpg(self.process.pid, how)
+        if how == signal.SIGKILL:
+            self.process.wait(10.0)
 
     async def _connect(self, port: int) -> None:
         self._session = aiohttp.ClientSession()
@@ -122,9 +126,7 @@ class Browser:
 
     def js(self, text: str) -> Any:
         """What this expression is worth in the page; a promise is waited for."""
-        told = self.ask(
-            "Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True
-        )
+        told = self.ask("Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
@@ -140,13 +142,20 @@ class Browser:
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """`kind` is Start, Move, End or Cancel; the fingers that are down then."""
+        self._down = points
         where = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(points)]
         self.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=where)
 
     def tap(self, name: str) -> None:
-        """A finger on the element."""
-        self.touch("Start", self.middle(name))
-        self.touch("End")
+        """One more finger, on the element and up again."""
+        down = self._down
+        self.touch("Start", *down, self.middle(name))
+        self.touch("Move" if down else "End", *down)  # who is missing has left the glass
+
+    def lift(self) -> None:
+        """All fingers, if there are any."""
+        if self._down:
+            self.touch("End")
 
     def key(self, kind: str, code: str, key: str) -> None:
         """`kind` is Down or Up."""

@@ -21,6 +21,7 @@ export class Drive {
   #pointer = null;
   #padHeld = false;
   state = null;
+  heard = -Infinity; // when that was true, by performance.now()
   sender = "";
   limits = { linear: 0, angular: 0 };
   limit = 0.2;
@@ -62,7 +63,7 @@ export class Drive {
 
   #look() {
     this.#hand.wish(...twist(...this.#push, this.limit, this.limits));
-    const { send, ended } = this.#hand.look(performance.now(), this.state, SOURCE, this.sender);
+    const { send, ended } = this.#hand.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
     if (send) this.#send(send);
     if (ended === undefined) return;
     this.#by = this.#pointer = null;

@@ -8,7 +8,8 @@ export const PERIOD = 50;
 export const OPENING = 20;
 export const PATIENCE = 2000; // for the robot to follow
 export const GRACE = 500; // for it to follow again
-export const FROZEN = 250; // between two looks: the page stood still, and the finger may be gone
+export const HICCUP = 250; // between two looks: the robot has braked meanwhile, so it opens anew
+export const FROZEN = 1000; // the page stood still, and the finger may be long gone
 
 const NEVER = ["inactive", "stopped", "fault", "leaving"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
@@ -19,7 +20,7 @@ export function objection(state, source, sender) {
   const ours = state.sources.find((one) => one.name === source);
   if (NEVER.includes(state.mode) || state.mode === "waiting") return state.reason;
   if (!ours) return `${source} is not one of the robot's sources`;
-  if (state.source !== source) return ours.waits_for === "a command" ? "not heard yet" : ours.waits_for || state.reason;
+  if (state.source !== source) return ours.waits_for === "a command" ? "not heard yet" : ours.waits_for || state.reason || "not followed";
   if (state.mode !== "driving") return state.reason;
   if (state.sender && state.sender !== sender) return `somebody else drives as ${source}: ${state.sender}`;
   return "";
@@ -39,9 +40,8 @@ export class Hand {
 
   press(now) {
     if (this.held) return;
-    this.phase = "opening";
-    this.#begun = this.#looked = this.#fine = now;
-    this.#sent = -Infinity;
+    this.#open(now);
+    this.#looked = now;
     this.#wish = ZERO;
   }
 
@@ -56,14 +56,23 @@ export class Hand {
     return ZERO;
   }
 
-  /** What to send now, and why the hold has ended if it has: {send, ended}. */
-  look(now, state, source, sender) {
+  #open(now) {
+    this.phase = "opening";
+    this.#begun = this.#fine = now;
+    this.#sent = -Infinity;
+  }
+
+  /** What to send now, and why the hold has ended if it has: {send, ended}. `heard` is when
+   *  `state` was true. */
+  look(now, state, heard, source, sender) {
     if (!this.held) return {};
     if (now - this.#looked > FROZEN) return { send: this.release(), ended: "the page stood still: press again" };
+    if (now - this.#looked > HICCUP) this.#open(now);
     this.#looked = now;
     const why = objection(state, source, sender);
     if (state && NEVER.includes(state.mode)) return { send: this.release(), ended: why };
-    if (!why) {
+    // What was true before it opened says nothing of how this goes.
+    if (!why && heard > this.#begun) {
       this.#fine = now;
       this.phase = "driving";
     }

@@ -105,7 +105,7 @@ function looked() {
 
 function stated({ detail }) {
   state = drive.state = detail.value;
-  heard = performance.now() - detail.age;
+  heard = drive.heard = performance.now() - detail.age;
   views.banner(state);
   $("clear").hidden = !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
