@@ -54,6 +54,9 @@ STATUS: dict[Reason, int] = {
 }
 """403 for all others."""
 
+REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
+"""What aiohttp refuses by itself; anything else is malformed."""
+
 WHO: web.RequestKey[Who | None] = web.RequestKey("who", object)  # type: ignore[arg-type]
 
 
@@ -142,8 +145,7 @@ class Page:
         except web.HTTPException as error:
             if error.status < 400:
                 raise
-            if error.status == 404:
-                self._counts.refuse("path")
+            self._counts.refuse(REASONS.get(error.status, "malformed"))
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     def _known(self, peer: str, shown: str) -> Who | Refusal:
@@ -264,7 +266,10 @@ def problem(status: int, text: str) -> web.Response:
     return web.json_response({"error": text}, status=status)
 
 
-_WORDS = {404: "there is no such thing here; GET /api lists what there is"}
+_WORDS = {
+    404: "there is no such thing here; GET /api lists what there is",
+    413: f"over {MAX_BYTES} bytes",
+}
 
 
 def _asked(request: web.Request) -> Asked:

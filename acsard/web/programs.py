@@ -57,6 +57,7 @@ class Programs:
         """The last value of a key."""
         row = row_of(key) if openapi.PLAIN.match(key) else None
         if row is None or not openapi.asked(row):
+            self._counts.refuse("path")
             raise TroubleError(404, f"{key!r} is no key to ask for; GET /api lists them")
         if not who.may(least := least_role(key)):
             self._counts.refuse("role")

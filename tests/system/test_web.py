@@ -1,0 +1,154 @@
+"""The robot's page: who comes sees, drives and stops, and who goes drives no more."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from tests.system.browser import Page, hands, run
+from tests.system.harness import PATIENCE_S, Bus, Daemon
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    where = tmp_path_factory.mktemp("daemon")
+    with Daemon(where, config={"record": {"directory": str(where / "record")}}) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with Page(daemon, tmp_path_factory.mktemp("page")) as page:
+        yield page
+
+
+@pytest.fixture
+def bus(daemon: Daemon) -> Iterator[Bus]:
+    """The robot stands and may be driven."""
+    with Bus(daemon.endpoint) as bus:
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus
+
+
+def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            hello = (await ours.find(lambda said: "hello" in said))["hello"]
+            assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
+            assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
+            assert hello["simulated"] is True
+            assert "path" in await ours.find(lambda said: "path" in said)
+            await ours.say(ping=12.5)
+            assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5
+            await ours.say(subscribe="odom", rate=50)
+            odom = await ours.find(lambda said: said.get("key") == "odom")
+            assert odom["value"]["child_frame_id"] == "base_link"
+            assert 0 <= odom["age"] < 1000 * PATIENCE_S
+            await ours.say(subscribe="fleet")
+            await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
+
+    run(story)
+
+
+def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
+    page: Page, bus: Bus
+) -> None:
+    commands: list[Any] = []
+
+    async def story() -> None:
+        with bus.follow("cmd/teleop") as heard:
+            async with hands(page) as ours:
+                await ours.say(subscribe="state", rate=50)
+                await ours.until_driving(0.3)
+            bus.at_rest()
+            commands.extend(seen.value for seen in heard.seen)
+
+    run(story)
+    assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
+    assert commands[-1]["linear"]["x"] == 0
+
+
+def test_nobody_obeys_a_stamp_twice_or_one_from_before(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            await ours.drive(0.0)
+            before = bus.at_rest()
+            for _ in range(100):
+                await ours.drive(0.5, late_ms=5000.0)
+            refused = await ours.find(lambda said: said.get("refused") == "cmd")
+            assert "stamp" in refused["reason"]
+            await asyncio.sleep(0.3)
+            after = bus.state()
+            assert after["counters"]["commands"] == before["counters"]["commands"]
+            assert abs(after["x"] - before["x"]) < 0.005
+
+    run(story)
+    assert page.refused()["replayed"] >= 100
+
+
+def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            for n in range(450):
+                await ours.say(ping=n)
+            assert (await ours.call("stop"))["ok"]
+
+    run(story)
+    assert bus.state()["mode"] == "stopped"
+
+
+def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/state") as answer:
+                assert (await answer.json())["mode"] == "ready"
+            async with session.post("/api/srv/stop") as answer:
+                assert (answer.status, (await answer.json())["success"]) == (200, True)
+            async with session.post("/api/srv/clear") as answer:
+                assert answer.status == 200
+            wish = {"settings": {"limits.linear_speed": 99.0}}
+            async with session.post("/api/srv/set", json=wish) as answer:
+                assert (answer.status, (await answer.json())["success"]) == (409, False)
+            async with session.get("/api") as answer:
+                assert (await answer.json())["openapi"] == "3.1.0"
+                for name in ("Content-Security-Policy", "X-Content-Type-Options"):
+                    assert answer.headers[name]
+
+    run(story)
+
+
+def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/recordings") as answer:
+                rows = await answer.json()
+            (name,) = [row["name"] for row in rows]
+            async with session.get(f"/api/recordings/{name}") as answer:
+                assert (await answer.read()).startswith(b"\x89MCAP")
+
+    run(story)
+
+
+def test_the_page_killed_while_it_drives_costs_the_drive_and_nothing_else(
+    daemon: Daemon, bus: Bus, tmp_path: Path
+) -> None:
+    with Page(daemon, tmp_path) as page:
+
+        async def story() -> None:
+            async with hands(page) as ours:
+                await ours.say(subscribe="state", rate=50)
+                await ours.until_driving(0.3)
+                page.signal(signal.SIGKILL)
+
+        run(story)
+    state = bus.at_rest()
+    assert state["mode"] == "ready"
