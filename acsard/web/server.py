@@ -39,6 +39,9 @@ TRIES = 20
 
 BEAT_S, TIDY_S = 0.5, 1.0
 
+NICE = 5
+"""Behind the daemon that has started us."""
+
 HANDSHAKE_S = 10.0
 
 IDLE_S = 20.0
@@ -141,6 +144,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
     if wanted.held:
         end_with_parent(signal.SIGTERM)
+        os.nice(NICE)
     counts = Counts()
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
@@ -200,16 +204,28 @@ async def _held(leaving: asyncio.Event) -> None:
     """Say on standard input, a socket, that we are alive; leave when it ends."""
     holder = sys.stdin.fileno()
     os.set_blocking(holder, False)
-    while not leaving.is_set():
+
+    def look() -> None:
         try:
-            os.write(holder, b".")
-            if os.read(holder, 64) == b"":
-                leaving.set()
-        except BlockingIOError:
-            pass
+            ended = os.read(holder, 64) == b""
         except OSError:
+            ended = True
+        if ended:
             leaving.set()
-        await asyncio.sleep(BEAT_S)
+
+    loop = asyncio.get_running_loop()
+    loop.add_reader(holder, look)
+    try:
+        while True:
+            try:
+                os.write(holder, b".")
+            except BlockingIOError:
+                pass  # who holds us does not listen now
+            except OSError:
+                leaving.set()
+            await asyncio.sleep(BEAT_S)
+    finally:
+        loop.remove_reader(holder)
 
 
 def _connected(address: Address) -> Client:

@@ -67,7 +67,7 @@ class Page(Program):
     def refused(self) -> dict[str, float]:
         """What was refused so far, by reason."""
         found = {}
-        for line in asyncio.run(_text(f"{self.here}/metrics")).splitlines():
+        for line in asyncio.run(text(f"{self.here}/metrics")).splitlines():
             if line.startswith("acsard_page_refused_total{"):
                 found[line.partition('reason="')[2].partition('"')[0]] = float(line.split()[-1])
         return found
@@ -86,7 +86,8 @@ class _Here(aiohttp.abc.AbstractResolver):
         """Nothing is held."""
 
 
-async def _text(url: str) -> str:
+async def text(url: str) -> str:
+    """What is there."""
     async with aiohttp.ClientSession() as session, session.get(url) as answer:
         assert answer.status == 200
         return await answer.text()

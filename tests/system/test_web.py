@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import pty
+import re
+import select
 import signal
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +16,20 @@ from typing import Any
 import aiohttp
 import pytest
 
-from tests.system.browser import Page, hands, run
-from tests.system.harness import PATIENCE_S, Bus, Daemon
+from tests.system.browser import Page, hands, run, text
+from tests.system.harness import (
+    PATIENCE_S,
+    START_S,
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    children,
+    environment,
+    free_endpoint,
+    until,
+    write_config,
+)
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +169,69 @@ def test_the_page_killed_while_it_drives_costs_the_drive_and_nothing_else(
         run(story)
     state = bus.at_rest()
     assert state["mode"] == "ready"
+
+
+class Terminal(Program):
+    """`acsard run` in the foreground of a terminal."""
+
+    def __init__(self, where: Path, *words: str) -> None:
+        self.endpoint = free_endpoint()
+        self.master, self._slave = pty.openpty()
+        run = acsard("run", "--listen", self.endpoint, *words)
+        super().__init__(run, where, environment(), stdout=self._slave, stderr=self._slave)
+        self.seen = ""
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        os.close(self._slave)
+        os.close(self.master)
+
+    def shows(self, pattern: str) -> re.Match[str]:
+        """Waits for it on the screen."""
+
+        def look() -> re.Match[str] | None:
+            while select.select([self.master], [], [], 0.0)[0]:
+                self.seen += os.read(self.master, 4096).decode(errors="replace")
+            return re.search(pattern, self.seen)
+
+        return until(look, START_S, f"{pattern} on the screen: {self.seen}")
+
+    def page(self) -> list[int]:
+        """The processes of its page."""
+        return children(self.pid, "acsard web")
+
+
+@pytest.mark.slow
+def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_ends(
+    tmp_path: Path,
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        config = write_config(
+            tmp_path / "a.toml", {"web": {"address": [f"http://127.0.0.1:{port}"]}}
+        )
+        with Terminal(tmp_path, "--config", str(config)) as daemon:
+            url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
+            assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
+            (first,) = daemon.page()
+            with Bus(daemon.endpoint) as bus:
+                before = bus.state()["counters"]
+                os.kill(first, signal.SIGKILL)
+                daemon.shows("page_ended")
+                (second,) = until(daemon.page, START_S, "another page")
+                assert second != first
+                assert bus.state()["counters"].get("link_lost", 0) == before.get("link_lost", 0)
+            daemon.signal(signal.SIGKILL)
+            until(lambda: not Path(f"/proc/{second}").exists(), START_S, "the page ends too")
+
+
+@pytest.mark.slow
+def test_a_daemon_that_nobody_looks_at_or_that_may_not_serves_no_page(tmp_path: Path) -> None:
+    config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
+    with Terminal(tmp_path, "--config", str(config)) as told, Daemon(tmp_path) as piped:
+        told.shows("link_up")
+        until(lambda: "link_up" in piped.stderr, START_S, "link up")
+        assert told.page() == []
+        assert children(piped.pid, "acsard web") == []
