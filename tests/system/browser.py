@@ -154,11 +154,11 @@ async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]
         yield Hands(opened)
 
 
-def run(story: Callable[[], Awaitable[None]]) -> None:
+def run(story: Callable[[], Awaitable[None]], within: float = 3 * PATIENCE_S) -> None:
     """What happens, with a deadline."""
-    asyncio.run(_within(story))
+    asyncio.run(_within(story, within))
 
 
-async def _within(story: Callable[[], Awaitable[None]]) -> None:
-    async with asyncio.timeout(3 * PATIENCE_S):
+async def _within(story: Callable[[], Awaitable[None]], within: float) -> None:
+    async with asyncio.timeout(within):
         await story()
