@@ -9,6 +9,7 @@ import re
 import select
 import signal
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import pytest
 from tests.system.browser import Page, hands, run, text
 from tests.system.harness import (
     PATIENCE_S,
+    ROOT,
     START_S,
     Bus,
     Daemon,
@@ -26,6 +28,7 @@ from tests.system.harness import (
     acsard,
     children,
     environment,
+    finish,
     free_endpoint,
     until,
     write_config,
@@ -169,6 +172,42 @@ def test_the_page_killed_while_it_drives_costs_the_drive_and_nothing_else(
         run(story)
     state = bus.at_rest()
     assert state["mode"] == "ready"
+
+
+def test_what_lay_in_a_frozen_server_moves_nothing_when_it_goes_on(page: Page, bus: Bus) -> None:
+    """Its commands have the stamps of when they were meant: they are old, and nobody's any more."""
+
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            page.signal(signal.SIGSTOP)
+            try:
+                await ours.hold(0.3, 1.0)
+                await asyncio.sleep(0.5)  # longer than any command counts
+                before = bus.at_rest()
+            finally:
+                page.signal(signal.SIGCONT)
+            await ours.say(ping=3)
+            await ours.find(lambda said: said.get("pong") == 3)
+            after = bus.state()
+            assert abs(after["x"] - before["x"]) < 0.005
+            assert after["counters"]["commands"] == before["counters"]["commands"]
+
+    run(story)
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_drives_as_pasted(page: Page, bus: Bus) -> None:
+    text = (ROOT / "deploy/web/README.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.S | re.M)
+    assert "http://127.0.0.1:8080" in code
+    before = bus.state()["x"]
+    code = code.replace("http://127.0.0.1:8080", page.here)
+    done = finish([sys.executable, "-c", code], ROOT)
+    assert (done.code, done.err) == (0, "")
+    assert "driving" in done.out
+    assert bus.at_rest()["x"] > before + 0.2
 
 
 class Terminal(Program):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import socket
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from typing import Any
 
 import aiohttp
@@ -192,6 +194,21 @@ def test_what_is_no_message_is_told_once_a_second_and_a_flood_ends(page: Page, b
     run(story)
 
 
+def test_an_invitation_is_a_link_and_a_code_and_lets_in(page: Page) -> None:
+    told = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
+    assert "guest is operator until" in told
+    assert any(char in told for char in "▀▄█")  # the code
+    (link,) = re.findall(r"https://\S+:\d+/#token=(\S+)", told)
+
+    async def story() -> None:
+        async with hands(page, link) as ours:
+            hello = (await ours.find(lambda said: "hello" in said))["hello"]
+            assert hello["role"] == "operator"
+
+    run(story)
+    assert re.search(r"^guest +operator ", page.tokens("--tokens"), re.M)
+
+
 def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(page: Page) -> None:
     token = page.invite("operator", "lent")
 
@@ -218,3 +235,41 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
     run(story)
     assert "lent" not in page.tokens("--tokens")
     assert token not in page.stdout + page.stderr
+
+
+def test_a_thousand_connections_leave_the_one_who_drives_his_page(page: Page, bus: Bus) -> None:
+    place = page.here.removeprefix("http://").split(":")
+
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+            idle: list[socket.socket] = []
+            for _ in range(1000):
+                one = socket.socket()
+                one.setblocking(False)
+                one.connect_ex((place[0], int(place[1])))
+                idle.append(one)
+                await asyncio.sleep(0)
+            await ours.say(ping=7)
+            await ours.find(lambda said: said.get("pong") == 7)
+            await ours.state(lambda s: s["mode"] == "driving")
+            holding.cancel()
+            for one in idle:
+                one.close()
+
+    run(story)
+    assert page.refused()["crowded"] > 100
+
+
+def test_an_address_has_room_for_twenty_pages(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession() as session, AsyncExitStack() as stack:
+            for _ in range(20):
+                await stack.enter_async_context(session.ws_connect(f"{page.here}/ws"))
+            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+                await session.ws_connect(f"{page.here}/ws")
+            assert caught.value.status == 503
+
+    run(story)
