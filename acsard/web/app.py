@@ -153,13 +153,13 @@ class Page:
         now_ns = clock.mono_ns()
         if not shown:
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
+        who = self._vault.who(shown)
+        if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
+            return who
         if self._tries.spent(peer, now_ns):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
-        who = self._vault.who(shown)
-        if who is None:
-            self._tries.failed(peer, now_ns)
-            return Refusal("bad_token", "this token has ended, was revoked, or never was one")
-        return who
+        self._tries.failed(peer, now_ns)
+        return Refusal("bad_token", "this token has ended, was revoked, or never was one")
 
     def refused(self, why: Refusal) -> web.Response:
         """The answer to who may not, counted."""

@@ -260,7 +260,7 @@ def test_a_thousand_connections_leave_the_one_who_drives_his_page(page: Page, bu
                 one.close()
 
     run(story)
-    assert page.refused()["crowded"] > 100
+    assert page.refused()["crowded"] > 0
 
 
 def test_an_address_has_room_for_twenty_pages(page: Page, bus: Bus) -> None:
