@@ -50,7 +50,8 @@ def at(block: Block) -> str:
 
 def test_there_is_a_page_beside_each_thing_it_describes() -> None:
     beside = {
-        f"deploy/{part}/README.md" for part in ("clients", "firmware", "ros2", "systemd", "zenoh")
+        f"deploy/{part}/README.md"
+        for part in ("clients", "firmware", "ros2", "systemd", "web", "zenoh")
     }
     assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
 
@@ -207,8 +208,8 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_python_is_on_the_page_whose_examples_are_run() -> None:
-    """`tests/system/test_client.py` runs them, and says which there are."""
-    assert {block.page for block in blocks("python")} == {"README.md"}
+    """`tests/system/test_client.py` and `test_web.py` run them, and say which there are."""
+    assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
 # links and files

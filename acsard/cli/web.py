@@ -37,9 +37,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--address",
         action="append",
-        metavar="HOST:PORT",
-        help="where to listen, may be repeated, in place of all of web.address; 0.0.0.0:8443 is "
-        "for other machines",
+        metavar="URL",
+        help="where to listen, may be repeated, in place of all of web.address; "
+        "https://0.0.0.0:8443 is for other machines",
     )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(
@@ -119,8 +119,8 @@ def _invite(args: argparse.Namespace, config: Config) -> int:
     urls = invitations(_listen(args, config), tls)
     if not urls:
         raise UsageError(
-            "nobody could come with it: web.address has none beyond this machine; add "
-            '"0.0.0.0:8443" there (or --address), with a certificate of `acsard lan init`'
+            "nobody could come with it: web.address has no https://; add "
+            '"https://0.0.0.0:8443" there (or --address), and `acsard lan init` for a certificate'
         )
     vault = Vault(place())
     text, token = vault.invite(args.invite, args.name or args.invite, args.days)

@@ -58,8 +58,8 @@ RosNamespace = Annotated[
 WebAddress = Annotated[
     str,
     Meta(
-        pattern=r"^(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253}):[0-9]{1,5}\Z",
-        extra={"unit": "an address and a port", "example": "127.0.0.1:8080"},
+        pattern=r"^https?://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253}):[0-9]{1,5}\Z",
+        extra={"unit": "http(s)://, an address, a port", "example": "http://127.0.0.1:8080"},
     ),
 ]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
@@ -294,7 +294,7 @@ class RecordConfig(Struct, frozen=True):
 class WebConfig(Struct, frozen=True):
     page: bool = True
     address: Annotated[tuple[WebAddress, ...], Meta(min_length=1, max_length=8)] = (
-        "127.0.0.1:8080",
+        "http://127.0.0.1:8080",
     )
 
 

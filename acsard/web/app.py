@@ -54,6 +54,9 @@ STATUS: dict[Reason, int] = {
 }
 """403 for all others."""
 
+REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
+"""What aiohttp refuses by itself; anything else is malformed."""
+
 WHO: web.RequestKey[Who | None] = web.RequestKey("who", object)  # type: ignore[arg-type]
 
 
@@ -92,6 +95,7 @@ class Page:
                 web.get("/api/recordings", self._recordings),
                 web.get("/api/recordings/{name}", self._recording),
                 web.get("/api/whoami", self._whoami),
+                web.get("/api/settings", self._settings),
                 web.post("/api/srv/{verb}", self._service),
                 web.get("/api/{key:.+}", self._value),
                 web.get("/metrics", self._metrics),
@@ -142,8 +146,7 @@ class Page:
         except web.HTTPException as error:
             if error.status < 400:
                 raise
-            if error.status == 404:
-                self._counts.refuse("path")
+            self._counts.refuse(REASONS.get(error.status, "malformed"))
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     def _known(self, peer: str, shown: str) -> Who | Refusal:
@@ -151,13 +154,13 @@ class Page:
         now_ns = clock.mono_ns()
         if not shown:
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
+        who = self._vault.who(shown)
+        if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
+            return who
         if self._tries.spent(peer, now_ns):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
-        who = self._vault.who(shown)
-        if who is None:
-            self._tries.failed(peer, now_ns)
-            return Refusal("bad_token", "this token has ended, was revoked, or never was one")
-        return who
+        self._tries.failed(peer, now_ns)
+        return Refusal("bad_token", "this token has ended, was revoked, or never was one")
 
     def refused(self, why: Refusal) -> web.Response:
         """The answer to who may not, counted."""
@@ -239,6 +242,9 @@ class Page:
         who = _who(request)
         return web.json_response({"role": who.role, "name": who.name})
 
+    async def _settings(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.settings(_who(request))
+
     async def _value(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.value(_who(request), request.match_info["key"])
 
@@ -264,7 +270,10 @@ def problem(status: int, text: str) -> web.Response:
     return web.json_response({"error": text}, status=status)
 
 
-_WORDS = {404: "there is no such thing here; GET /api lists what there is"}
+_WORDS = {
+    404: "there is no such thing here; GET /api lists what there is",
+    413: f"over {MAX_BYTES} bytes",
+}
 
 
 def _asked(request: web.Request) -> Asked:

@@ -25,12 +25,13 @@ class Gate:
 
     def __init__(self, counts: Counts) -> None:
         self.counts = counts
-        self.places = Places(SOCKETS, SOCKETS_OF_ONE)
         self._doors: dict[asyncio.BaseTransport, _Door] = {}
 
     def guarded(self, inner: Factory) -> Factory:
-        """The same protocols, behind this gate."""
-        return lambda: _Door(self, inner)
+        """The same protocols, behind this gate: with places of their own for each address of ours,
+        so that strangers never shut out who is at the machine."""
+        places = Places(SOCKETS, SOCKETS_OF_ONE)
+        return lambda: _Door(self, places, inner)
 
     def spoke(self, transport: asyncio.BaseTransport | None) -> None:
         """A request has come on it."""
@@ -47,8 +48,8 @@ class Gate:
 class _Door(asyncio.Protocol):
     """One connection: the inner protocol sees it only when there is room."""
 
-    def __init__(self, gate: Gate, inner: Factory) -> None:
-        self._gate, self._make = gate, inner
+    def __init__(self, gate: Gate, places: Places, inner: Factory) -> None:
+        self._gate, self._places, self._make = gate, places, inner
         self._inner: asyncio.Protocol | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._peer = ""
@@ -57,7 +58,7 @@ class _Door(asyncio.Protocol):
         peer = transport.get_extra_info("peername")
         self._peer = str(peer[0]) if peer else ""
         self._transport = transport
-        if not self._gate.places.enter(self._peer):
+        if not self._places.enter(self._peer):
             self._gate.counts.refuse("crowded")
             transport.abort()  # type: ignore[attr-defined]
             return
@@ -97,6 +98,6 @@ class _Door(asyncio.Protocol):
         self.hurry(False)
         if self._inner is None:
             return
-        self._gate.places.leave(self._peer)
+        self._places.leave(self._peer)
         self._gate.closed(self._transport)
         self._inner.connection_lost(error)

@@ -15,7 +15,7 @@ from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError
 from acsard.messages.topics import row_of
 from acsard.values import AcsardError
-from acsard.web import metrics, openapi, recordings
+from acsard.web import metrics, openapi, recordings, settings
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
 from acsard.web.robots import Robots
@@ -53,10 +53,18 @@ class Programs:
         )
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 
+    async def settings(self, who: Who) -> web.Response:
+        """What may be set, with its values now."""
+        told = await self.value(who, "config")
+        assert isinstance(told.body, bytes)
+        rows = settings.rows(msgspec.json.decode(told.body))
+        return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
+
     async def value(self, who: Who, key: str) -> web.Response:
         """The last value of a key."""
         row = row_of(key) if openapi.PLAIN.match(key) else None
         if row is None or not openapi.asked(row):
+            self._counts.refuse("path")
             raise TroubleError(404, f"{key!r} is no key to ask for; GET /api lists them")
         if not who.may(least := least_role(key)):
             self._counts.refuse("role")

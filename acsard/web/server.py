@@ -39,6 +39,9 @@ TRIES = 20
 
 BEAT_S, TIDY_S = 0.5, 1.0
 
+NICE = 5
+"""Behind the daemon that has started us."""
+
 HANDSHAKE_S = 10.0
 
 IDLE_S = 20.0
@@ -52,24 +55,27 @@ SWITCH_INTERVAL_S = 0.0005
 
 
 class Listen(Struct, frozen=True):
-    """Where to listen: HTTP for this machine, HTTPS for all else."""
+    """Where to listen, and how."""
 
+    secure: bool
+    """HTTPS."""
     host: str
     port: int
 
     @property
-    def here(self) -> bool:
-        """Only this machine reaches it."""
-        return self.host == "localhost" or is_loopback(self.host)
+    def everywhere(self) -> bool:
+        """At all addresses of this machine."""
+        return self.host in ("0.0.0.0", "::")
 
     @property
     def url(self) -> str:
-        """What to open in a browser; a wildcard by the name of this machine."""
-        host = self.host
-        if host in ("0.0.0.0", "::"):
-            host = f"{socket.gethostname().partition('.')[0]}.local"
+        """What to open in a browser; where it is everywhere by the name of this machine."""
+        return self.url_at(own_name() if self.everywhere else self.host)
+
+    def url_at(self, host: str) -> str:
+        """The same by another name."""
         host = f"[{host}]" if ":" in host else host
-        return f"http{'' if self.here else 's'}://{host}:{self.port}/"
+        return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
 
 
 class Wanted(Struct, frozen=True):
@@ -89,13 +95,27 @@ class Wanted(Struct, frozen=True):
     page: Path = PAGE
 
 
+def own_name() -> str:
+    """What others find this machine by, by mDNS."""
+    return f"{socket.gethostname().partition('.')[0].lower()}.local"
+
+
 def listens(text: str) -> Listen:
-    """An address like 127.0.0.1:8080 or [::1]:8080; raises `UsageError`."""
-    host, _, port = text.rpartition(":")
-    host = host.strip("[]")
-    if not host or not port.isascii() or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise UsageError(f"{text} is no address; write it like 127.0.0.1:8080 or 0.0.0.0:8443")
-    return Listen(host, int(port))
+    """An address like http://127.0.0.1:8080; raises `UsageError`.
+
+    Without TLS nobody but this machine is listened to.
+    """
+    scheme, _, place = text.removesuffix("/").partition("://")
+    host, _, port = place.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    number = int(port) if port.isascii() and port.isdecimal() else 0
+    if scheme not in ("http", "https") or not host or not 0 < number < 65536:
+        raise UsageError(
+            f"{text} is no address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
+        )
+    if scheme == "http" and not (host == "localhost" or is_loopback(host)):
+        raise UsageError(f"{text}: beyond this machine only https, with the robot's certificate")
+    return Listen(scheme == "https", host, number)
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
@@ -105,14 +125,14 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     """
     found: list[str] = []
     for one in listen:
-        if one.here:
+        if not one.secure:
             continue
         hosts = [one.host]
-        if one.host in ("0.0.0.0", "::"):
+        if one.everywhere:
             certified = set(names_in(tls)) if tls else set()
             own = [at for at in own_addresses() if at in certified and ":" not in at]
-            hosts = [*own, f"{socket.gethostname().partition('.')[0]}.local"]
-        found += [Listen(host, one.port).url for host in hosts]
+            hosts = [*own, own_name()]
+        found += [one.url_at(host) for host in hosts]
     return found
 
 
@@ -124,6 +144,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
     if wanted.held:
         end_with_parent(signal.SIGTERM)
+        os.nice(NICE)
     counts = Counts()
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
@@ -143,8 +164,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
             server = await asyncio.get_running_loop().create_server(
                 gate.guarded(runner.server),  # type: ignore[arg-type]
                 sock=bound,
-                ssl=None if one.here else secure,
-                ssl_handshake_timeout=None if one.here else HANDSHAKE_S,
+                ssl=secure if one.secure else None,
+                ssl_handshake_timeout=HANDSHAKE_S if one.secure else None,
                 backlog=128,
             )
             stack.callback(server.close)
@@ -183,16 +204,28 @@ async def _held(leaving: asyncio.Event) -> None:
     """Say on standard input, a socket, that we are alive; leave when it ends."""
     holder = sys.stdin.fileno()
     os.set_blocking(holder, False)
-    while not leaving.is_set():
+
+    def look() -> None:
         try:
-            os.write(holder, b".")
-            if os.read(holder, 64) == b"":
-                leaving.set()
-        except BlockingIOError:
-            pass
+            ended = os.read(holder, 64) == b""
         except OSError:
+            ended = True
+        if ended:
             leaving.set()
-        await asyncio.sleep(BEAT_S)
+
+    loop = asyncio.get_running_loop()
+    loop.add_reader(holder, look)
+    try:
+        while True:
+            try:
+                os.write(holder, b".")
+            except BlockingIOError:
+                pass  # who holds us does not listen now
+            except OSError:
+                leaving.set()
+            await asyncio.sleep(BEAT_S)
+    finally:
+        loop.remove_reader(holder)
 
 
 def _connected(address: Address) -> Client:
@@ -215,20 +248,19 @@ def _about(wanted: Wanted) -> About:
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
     """What to show from elsewhere, and the names there; raises a `MendableError`."""
-    away = [one for one in wanted.listen if not one.here]
+    away = [one for one in wanted.listen if one.secure]
     if not away:
         return None, frozenset()
     if not wanted.tls:
         raise CertificateError(
-            f"{away[0].host}:{away[0].port} is beyond this machine, which takes a certificate: "
-            "`acsard lan init --write acsard.toml` makes one (bus.tls, or --tls DIRECTORY)"
+            f"{away[0].url} takes a certificate: `acsard lan init` makes one; then set bus.tls, or "
+            "--tls DIRECTORY"
         )
     require_usable(wanted.tls)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.load_cert_chain(f"{wanted.tls}/{CERTIFICATE}", f"{wanted.tls}/{KEY}", password="")
-    own = socket.gethostname().lower()
-    names = {own, f"{own.partition('.')[0]}.local", *map(str.lower, names_in(wanted.tls))}
+    names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(wanted.tls))}
     return context, frozenset(one for one in names if one != "localhost" and not is_loopback(one))
 
 
@@ -244,8 +276,8 @@ def _bound(one: Listen, next_port: bool) -> tuple[Listen, socket.socket]:
             trouble = error
             continue
         bound.setblocking(False)
-        return Listen(one.host, port), bound
+        return Listen(one.secure, one.host, port), bound
     raise InUseError(
-        f"cannot listen on {one.host}:{one.port}: {trouble}; stop what has it, or choose another "
+        f"cannot listen at {one.url}: {trouble}; stop what has it, or choose another "
         "by --address (web.address)"
     ) from None

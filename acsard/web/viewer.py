@@ -52,6 +52,12 @@ UNREAD_FRAMES = 200
 
 KEYS_AT_ONCE, CALLS_AT_ONCE = 32, 8
 
+FRAMES_HZ = 300.0
+"""Of all keys of one connection together: nobody who looks takes the time of who drives."""
+
+DROVE_NS = NS_PER_S
+"""Whose last command is older drives no more."""
+
 FLEET, FLEET_S = "fleet", 1.0
 
 LOOK_S = 0.25
@@ -189,9 +195,10 @@ class Viewer:
     def _release(self) -> None:
         """One zero of one who drove, meant now by his own clock; nobody sends him any more."""
         last, self._last = self._last, None
-        if last is None or not last.moves:
-            return
         now_ns = clock.mono_ns()
+        # One who fell silent before has been let go of: a zero now would only be in others' way.
+        if last is None or not last.moves or now_ns - last.given_ns > DROVE_NS:
+            return
         stamp_ns = last.stamp_ns + now_ns - last.given_ns
         self._sequence += 1
         self._hand.give(Order(self.sender, 0.0, 0.0, stamp_ns, self._sequence, now_ns))
@@ -232,6 +239,10 @@ class Viewer:
             self._refuse("subscribe", "malformed", f"{key!r} is none of {', '.join(sorted(KEYS))}")
             return
         known = self._following.get((robot, key))
+        others = sum(1.0 / one.period for one in self._following.values() if one is not known)
+        if others + frame.rate > FRAMES_HZ:
+            self._refuse("subscribe", "too_many", f"{FRAMES_HZ:g} messages a second in all")
+            return
         if known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._news.set()

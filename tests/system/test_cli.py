@@ -48,6 +48,7 @@ VERBS = (
     "top",
     "fleet",
     "drive",
+    "web",
     "call",
     "whoami",
     "set",
