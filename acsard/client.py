@@ -140,13 +140,14 @@ class Client:
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
-        return self._call(service, fields)
+        return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings until the next start: `{"limits.linear_speed": 0.8}`; all or none."""
-        return self._call("set", {"settings": settings})
+        return self.request("set", {"settings": settings})
 
-    def _call(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
+    def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
+        """The same for any service, with its payload as it is."""
         payload = msgspec.json.encode(fields) if fields else None
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 

@@ -170,7 +170,7 @@ EventName = Literal[
     "gyro", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "no_router",
     "missed_periods", "recording",
-    "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
+    "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended", "page_ended",
     "router_open", "router_crowded", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
     "mode", "commander", "kept_waiting", "first_contact", "command_refused", "fault",

@@ -1,8 +1,8 @@
 """`python -m tests.lock`: writes `deploy/systemd/requirements.lock` anew, with today's versions.
 
-It asks pip what an install of acsard with the extra `lan` takes from the package index, also to
-build it, for each Python we support on x86_64 and aarch64, and pins it with the hashes of those
-wheels. All get the same versions. `--check` tells what would change and writes nothing.
+It asks pip what an install of acsard with the extras `lan` and `web` takes from the package index,
+also to build it, for each Python we support on x86_64 and aarch64, and pins it with the hashes of
+those wheels. All get the same versions. `--check` tells what would change and writes nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
 
-EXTRAS = ("lan",)
+EXTRAS = ("lan", "web")
 
 PYTHONS = ("3.11", "3.12", "3.13")
 

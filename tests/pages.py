@@ -110,6 +110,7 @@ FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
 LOG = "tests/unit/cli/test_log.py"
 SERVICE = "tests/systemd/test_service.py"
+WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
 CLIENTS = "tests/system/test_languages.py"
@@ -151,6 +152,10 @@ TYPED = Elsewhere(
     CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says"
 )
 
+_AWAY = "--tls tls --address https://0.0.0.0:8443"
+INVITED = Elsewhere(WEB, "test_an_invitation_is_a_link_and_a_code_and_lets_in")
+COOKIE = Elsewhere(WEB, "test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked")
+
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
 _LAUNCH_FILE = "deploy/ros2/acsar.launch.py"
 _ROUTER = "--id robot1 --connect tls/router.local:7447 --tls"
@@ -159,7 +164,7 @@ _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'
 
 COMMANDS: dict[str, How] = {
     # README.md
-    "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/acsard run": FIRST,
+    "python3 -m venv .venv && .venv/bin/pip install '.[web]' && .venv/bin/acsard run": FIRST,
     "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(
         "-e '.[test]'"
     ),
@@ -261,6 +266,15 @@ COMMANDS: dict[str, How] = {
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,
+    # deploy/web
+    "acsard lan init --directory tls": Elsewhere(
+        "tests/unit/cli/test_lan.py",
+        "test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role",
+    ),
+    f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
+    "acsard web --tls tls --address http://127.0.0.1:8080 --address https://0.0.0.0:8443": INVITED,
+    "acsard web --tokens": COOKIE,
+    "acsard web --revoke phone": COOKIE,
     # deploy/ros2
     "source /opt/ros/jazzy/setup.bash": NO_ROS,
     "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp": Run(),

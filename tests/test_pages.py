@@ -49,7 +49,7 @@ def at(block: Block) -> str:
 
 
 def test_there_is_a_page_beside_each_thing_it_describes() -> None:
-    parts = ("clients", "firmware", "foxglove", "ros2", "systemd", "zenoh")
+    parts = ("clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
     beside = {f"deploy/{part}/README.md" for part in parts}
     assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
 
@@ -206,8 +206,8 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_python_is_on_the_page_whose_examples_are_run() -> None:
-    """`tests/system/test_client.py` runs them, and says which there are."""
-    assert {block.page for block in blocks("python")} == {"README.md"}
+    """`tests/system/test_client.py` and `test_web.py` run them, and say which there are."""
+    assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
 # links and files

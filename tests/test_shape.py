@@ -54,6 +54,12 @@ PURE_AMONG_SHELLS = (
     "top.teleop",
     "top.text",
     "top.view",
+    "web.frames",
+    "web.limits",
+    "web.metrics",
+    "web.openapi",
+    "web.trail",
+    "web.who",
 )
 """Pure modules in rooms that do I/O."""
 

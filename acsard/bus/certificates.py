@@ -50,7 +50,20 @@ def require_usable(directory: str) -> None:
 
 
 def common_name(directory: str) -> str:
-    """The name in the certificate in `directory`, "" where it cannot be told.
+    """The name in the certificate in `directory`, "" where it cannot be told."""
+    subject: Any = _shown(directory).get("subject", ())
+    names = [value for part in subject for kind, value in part if kind == "commonName"]
+    return str(names[-1]) if names else ""
+
+
+def names_in(directory: str) -> list[str]:
+    """The host names and addresses that the certificate in `directory` is for."""
+    alternative: Any = _shown(directory).get("subjectAltName", ())
+    return [str(name) for _, name in alternative]
+
+
+def _shown(directory: str) -> dict[str, Any]:
+    """What is in the certificate in `directory`; empty where it cannot be told.
 
     Read by showing it to ourselves: the standard library tells a name only of who has connected.
     """
@@ -69,10 +82,8 @@ def common_name(directory: str) -> str:
             with suppress(ssl.SSLWantReadError):
                 side.do_handshake()
     except (OSError, ValueError):  # an SSLError is an OSError
-        return ""
-    subject: Any = (other.getpeercert() or {}).get("subject", ())
-    names = [value for part in subject for kind, value in part if kind == "commonName"]
-    return str(names[-1]) if names else ""
+        return {}
+    return dict(other.getpeercert() or {})
 
 
 def ends_ns(directory: str) -> int | None:

@@ -40,6 +40,7 @@ from acsard.cli import (
     sim,
     top,
     topics,
+    web,
     whoami,
 )
 from acsard.cli import set as setting
@@ -62,6 +63,7 @@ VERBS = (
     fleet,
     foxglove,
     drive,
+    web,
     call,
     whoami,
     setting,

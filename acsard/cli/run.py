@@ -6,6 +6,8 @@ import argparse
 import os
 import shlex
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 
 from msgspec.structs import replace
 
@@ -115,11 +117,29 @@ def main(args: argparse.Namespace) -> int:
     if sys.stderr is not None:  # None when it was closed before the start
         faulthandler.enable()
     try:
-        asyncio.run(daemon.run(config, log, announce, None if args.no_door else door))
+        asyncio.run(
+            daemon.run(config, log, announce, None if args.no_door else door, page(config, where))
+        )
     finally:
         log.close()
         screen.close(0.2)
     return 0
+
+
+def page(config: Config, where: str) -> list[str] | None:
+    """The words for an `acsard web`, where a person looks on and the extra is there."""
+    looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
+    there = find_spec("aiohttp") and find_spec("segno")
+    if not (config.web.page and looked_at and there):
+        return None
+    from acsard.bus.session import reachable
+
+    words = ["web", "--id", config.robot.id]
+    if Path(where).is_file():
+        words += ["--config", where]
+    if config.bus.plain:
+        words += ["--connect", reachable(config.bus.plain[0])]
+    return words
 
 
 def _bus(config: Config) -> str:

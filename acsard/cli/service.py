@@ -71,7 +71,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
     from acsard.host import service
 
     _ready(args)
-    files = [*service.files(), *map(service.lan_drop_in, (service.UNIT, service.DOOR))]
+    files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
     steps = service.uninstalling(
         files,
         service.present(files),
@@ -94,7 +94,8 @@ def main_status(args: argparse.Namespace) -> int:
     state = service.state(service.UNIT)
     print(state or "systemd does not answer on this machine")
     if state:
-        print(f"\n{service.DOOR}:\n{service.state(service.DOOR)}")
+        for unit in service.ALL[1:]:
+            print(f"\n{unit}:\n{service.state(unit)}")
     return 0 if "ActiveState=active" in state else 1
 
 

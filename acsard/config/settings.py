@@ -55,6 +55,13 @@ RosNamespace = Annotated[
         extra={"unit": "ROS names with / between them, or empty", "example": "robot1"},
     ),
 ]
+WebAddress = Annotated[
+    str,
+    Meta(
+        pattern=r"^https?://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253}):[0-9]{1,5}\Z",
+        extra={"unit": "http(s)://, an address, a port", "example": "http://127.0.0.1:8080"},
+    ),
+]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
 Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
 Angle = Annotated[float, Meta(ge=-6.2832, le=6.2832, extra={"unit": "rad"})]
@@ -284,6 +291,13 @@ class RecordConfig(Struct, frozen=True):
     days: Annotated[float, Meta(ge=0.01, le=3650.0, extra={"unit": "days"})] = 14.0
 
 
+class WebConfig(Struct, frozen=True):
+    page: bool = True
+    address: Annotated[tuple[WebAddress, ...], Meta(min_length=1, max_length=8)] = (
+        "http://127.0.0.1:8080",
+    )
+
+
 class SimConfig(Struct, frozen=True):
     motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
     encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
@@ -317,6 +331,7 @@ class Config(Struct, frozen=True):
     ros: RosConfig = RosConfig()
     log: LogConfig = LogConfig()
     record: RecordConfig = RecordConfig()
+    web: WebConfig = WebConfig()
     sim: SimConfig = SimConfig()
 
     @property

@@ -18,7 +18,9 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.placement import HOME
 from acsard.host.steps import File, Keep, Remove, RemoveAll, Run, Step, Write, called
 
-UNIT, DOOR, STOP = "acsard.service", "acsard-door.service", "acsard-stop"
+UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
+ALL = (UNIT, DOOR, PAGE)
+STOP = "acsard-stop"
 UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
 LAN = "lan.conf"
@@ -42,16 +44,16 @@ AGAIN = ("tty", "usb-serial", "misc")
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
-    Run(("systemctl", "enable", "--now", UNIT, DOOR)),
+    Run(("systemctl", "enable", "--now", *ALL)),
 )
-GONE = (*RELOAD, Run(("systemctl", "reset-failed", UNIT, DOOR), may_fail=True))
+GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
 
 
 def files() -> list[File]:
     """Every file of the service, as this installation writes it."""
     reference = _reference().read_text(encoding="utf-8")
     return [
-        *(_unit(name) for name in (UNIT, DOOR)),
+        *(_unit(name) for name in ALL),
         File(Path("/opt/acsard/bin") / STOP, (_source() / "systemd" / STOP).read_bytes(), 0o755),
         File(
             Path("/etc/udev/rules.d/70-acsar.rules"),
@@ -125,7 +127,7 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
 
 def own_places() -> list[Path]:
     """Directories that may hold more of the service than was installed."""
-    return [UNITS / f"{DOOR}.d", UNITS / f"{UNIT}.d", ETC]
+    return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
@@ -172,7 +174,7 @@ def uninstalling(
         kept = Keep(where, "what it has recorded; --purge removes it")
         # systemd knows where it truly is; it must still know the unit.
         steps.insert(0, Run(("systemctl", "clean", "--what=state", UNIT)) if purge else kept)
-    units = [name for name in (DOOR, UNIT) if any(file.path.name == name for file in there)]
+    units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]
 

@@ -11,7 +11,7 @@ from msgspec import Struct
 from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.exits import Exit, ExitError
 
-OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d")
+OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
 
 RUN_S = 60.0

@@ -31,7 +31,7 @@ from acsard.record.recorder import Recorder
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
-from acsard.runtime.doorkeeper import keep_door
+from acsard.runtime.doorkeeper import DOOR, PAGE, Kind, keep_door
 from acsard.runtime.simulated import Simulated
 from acsard.runtime.ticker import Ticker
 from acsard.runtime.wakeup import Next, Wakeup
@@ -49,11 +49,16 @@ Announce = Callable[[str, str], None]
 
 
 async def run(
-    config: Config, log: Log, announce: Announce, door: Sequence[str] | None = None
+    config: Config,
+    log: Log,
+    announce: Announce,
+    door: Sequence[str] | None = None,
+    page: Sequence[str] | None = None,
 ) -> None:
     """Run until a signal; raises a `MendableError` when it cannot start.
 
-    `door` are the words for an `acsard door` of ours, None where it is a service of its own.
+    `door` are the words for an `acsard door` of ours, None where it is a service of its own; `page`
+    those for an `acsard web`.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -66,7 +71,7 @@ async def run(
     if refused:
         log.info("real_time", text=refused)
     try:
-        await _run(config, log, announce, departure, wake, manager, door)
+        await _run(config, log, announce, departure, wake, manager, door, page)
     except asyncio.CancelledError:
         if departure.begun_ns is None:
             raise
@@ -82,6 +87,7 @@ async def _run(
     wake: Wakeup,
     manager: Systemd,
     door: Sequence[str] | None,
+    page: Sequence[str] | None,
 ) -> None:
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
@@ -124,7 +130,9 @@ async def _run(
         departure.started()
         helpers = [port.keep_open(), _repeat_latched(bus, control)]
         if door is not None and config.bus.outside:
-            helpers.append(_keep_door(door, events.append))
+            helpers.append(_keep(door, events.append, DOOR))
+        if page is not None:
+            helpers.append(_keep(page, events.append, PAGE))
         async with _beside(helpers):
             await _control(config, control, departure, wake, manager)
 
@@ -216,8 +224,8 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
         task.cancel()
 
 
-async def _keep_door(door: Sequence[str], log: Callable[[Event], None]) -> None:
-    await keep_door(door, log)
+async def _keep(words: Sequence[str], log: Callable[[Event], None], kind: Kind) -> None:
+    await keep_door(words, log, kind)
 
 
 async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:

@@ -1,4 +1,4 @@
-"""Keeps the door to the network, or a fleet's router, open: a process of its own, again and again.
+"""Keeps the door to the network, a fleet's router or the page open: a process of its own each.
 
 It says all the time that it is alive; one that does not (stopped, or hung as a whole) is ended. As
 a service the door is a unit of its own (`acsard-door.service`), where systemd does that, with
@@ -47,12 +47,22 @@ class Kind(Struct, frozen=True):
     ended: EventName
     final: frozenset[int] = frozenset()
     """Exit codes after which it is not tried again."""
+    again_s: float = AGAIN_S
+    """Before it is opened anew."""
 
 
 DOOR = Kind("the door to the network", "door_ended")
 """Tried for ever: the robot drives on, and its files may be mended meanwhile."""
 
 ROUTER = Kind("the router", "router_ended", frozenset({Exit.USAGE, Exit.BAD_CONFIG}))
+
+PAGE = Kind(
+    "the robot's page",
+    "page_ended",
+    frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
+    LATER_S,
+)
+"""A page that fails again and again takes no time from the robot; it says itself why it ends."""
 
 
 async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Kind = DOOR) -> int:
@@ -75,7 +85,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Ki
         finally:
             door.let_go()
         log(Event(kind.ended, f"{kind.name} {why}; it is opened anew", "warning"))
-        await asyncio.sleep(AGAIN_S if code <= Exit.FAILURE else LATER_S)
+        await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LATER_S)
 
 
 class _Door:

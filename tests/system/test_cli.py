@@ -50,6 +50,7 @@ VERBS = (
     "fleet",
     "foxglove",
     "drive",
+    "web",
     "call",
     "whoami",
     "set",

@@ -24,7 +24,7 @@ SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
 
 PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
 
-UNIT, DOOR = "acsard.service", "acsard-door.service"
+UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
 
 HOME = "/opt/acsard"
 
@@ -197,17 +197,17 @@ class Container:
         """What `acsard service install` would write, without starting it."""
         deploy = ROOT / "deploy" / "systemd"
         self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
-        for unit in (UNIT, DOOR):
+        for unit in (UNIT, DOOR, PAGE):
             self.write(f"{UNITS}/{unit}", (deploy / unit).read_text())
         self.run("systemctl", "daemon-reload")
 
     def reset(self) -> None:
         """As after the installation."""
-        self.run("systemctl", "stop", DOOR, UNIT)
-        for unit in (UNIT, DOOR):
+        self.run("systemctl", "stop", PAGE, DOOR, UNIT)
+        for unit in (UNIT, DOOR, PAGE):
             shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
         self.run("systemctl", "daemon-reload")
-        self.run("systemctl", "reset-failed", UNIT, DOOR)
+        self.run("systemctl", "reset-failed", UNIT, DOOR, PAGE)
         self.write(CONFIG, USUAL)
 
     def drop_in(self, name: str, text: str, unit: str = UNIT) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import ROOT, until
-from tests.systemd.container import CONFIG, DOOR, PORT, UNIT, USUAL, ZERO, Board, Container
+from tests.systemd.container import CONFIG, DOOR, PAGE, PORT, UNIT, USUAL, ZERO, Board, Container
 
 pytestmark = pytest.mark.systemd
 
@@ -25,13 +25,13 @@ ACSARD = "/opt/acsard/venv/bin/acsard"
 TLS = "/etc/acsard/tls"
 
 
-@pytest.mark.parametrize("unit", [UNIT, DOOR])
+@pytest.mark.parametrize("unit", [UNIT, DOOR, PAGE])
 def test_systemd_finds_nothing_wrong_with_a_unit(container: Container, unit: str) -> None:
     checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{unit}")
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
-@pytest.mark.parametrize("unit", [UNIT, DOOR])
+@pytest.mark.parametrize("unit", [UNIT, DOOR, PAGE])
 def test_its_exposure_is_small(container: Container, unit: str) -> None:
     words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{unit}"]
     text = container.run("systemd-analyze", *words).out.splitlines()[-1]

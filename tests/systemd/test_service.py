@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import until
-from tests.systemd.container import DOOR, UNIT, Container, UnavailableError
+from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError
 
 pytestmark = pytest.mark.systemd
 
@@ -32,7 +32,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 def bare(alone: Container) -> Iterator[Container]:
     """The program alone, as after pip."""
     clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard/bin /etc/acsard"
-    alone.run("systemctl", "stop", DOOR, UNIT)
+    alone.run("systemctl", "stop", PAGE, DOOR, UNIT)
     alone.run("sh", "-c", clean)
     alone.run("systemctl", "daemon-reload")
     yield alone
@@ -61,11 +61,12 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
     assert written(done.out) == [
         f"/etc/systemd/system/{UNIT}",
         f"/etc/systemd/system/{DOOR}",
+        f"/etc/systemd/system/{PAGE}",
         "/opt/acsard/bin/acsard-stop",
         "/etc/udev/rules.d/70-acsar.rules",
         CONFIGURATION,
     ]
-    assert f"run     systemctl enable --now {UNIT} {DOOR}" in done.out
+    assert f"run     systemctl enable --now {UNIT} {DOOR} {PAGE}" in done.out
 
 
 def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> None:
@@ -76,12 +77,44 @@ def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> N
     until(lambda: "/dev/acsar" in bare.show("StatusText"), 5.0, "it waits for the board")
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
-    assert (status.code, status.out.count("as installed")) == (0, 5)
+    assert (status.code, status.out.count("as installed")) == (0, 6)
     gone = bare.run(ACSARD, "service", "uninstall")
     assert gone.code == 0, gone.out + gone.err
     assert listing(bare) == before
     assert bare.show("LoadState") == "not-found"
     assert bare.run(ACSARD, "service", "status").code == 1
+
+
+def asks(container: Container, path: str, *more: str) -> str:
+    """What the page answers to who is in there, in Python for want of curl; `more` makes a POST."""
+    return container.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}", *more).out
+
+
+ASK = """\
+import sys
+from urllib.request import Request, urlopen
+
+print(urlopen(Request(sys.argv[1], *(b"" for _ in sys.argv[2:]))).read().decode())
+"""
+
+
+def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Container) -> None:
+    bare.write(CONFIGURATION, "")  # the simulator
+    assert bare.run(ACSARD, "service", "install").code == 0
+    until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
+    assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
+    assert bare.show("MemoryMax", PAGE) == str(160 << 20)
+    daemon, first = bare.main_pid(), bare.main_pid(PAGE)
+    bare.run("systemctl", "kill", "--signal=SIGKILL", PAGE)
+    until(lambda: bare.show("NRestarts", PAGE) == "1", 10.0, "it is started again")
+    until(lambda: "maintainer" in asks(bare, "/api/whoami"), 20.0, "it answers again")
+    assert bare.main_pid(PAGE) != first
+    assert bare.main_pid() == daemon
+    told = bare.run(ACSARD, "web", "--invite", "viewer", "--address", "https://0.0.0.0:8443")
+    assert told.code == 0, told.err
+    kept = bare.run("stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json").out.split()
+    owner = bare.run("stat", "-L", "-c", "%u", "/var/lib/acsard-web").out.strip()
+    assert kept == ["600", owner]
 
 
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:

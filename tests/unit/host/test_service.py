@@ -11,6 +11,7 @@ from acsard.host.service import (
     DOOR,
     GONE,
     INSTALLED,
+    PAGE,
     RECORDINGS,
     STOP,
     UNIT,
@@ -30,12 +31,20 @@ STOP_FILE = File(ETC / STOP, b"stop", 0o755)
 RULES = File(ETC / "rules", b"rules")
 OWN = File(ETC / "acsard.toml", b"first", kept=True)
 DOOR_FILE = File(ETC / DOOR, b"door")
-ALL = [UNIT_FILE, DOOR_FILE, STOP_FILE, RULES, OWN]
+PAGE_FILE = File(ETC / PAGE, b"page")
+ALL = [UNIT_FILE, DOOR_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
 
 
 def there(**other: bytes | None) -> Found:
     """All files as installed, but for these."""
-    names = {"unit": UNIT_FILE, "door": DOOR_FILE, "stop": STOP_FILE, "rules": RULES, "own": OWN}
+    names = {
+        "unit": UNIT_FILE,
+        "door": DOOR_FILE,
+        "page": PAGE_FILE,
+        "stop": STOP_FILE,
+        "rules": RULES,
+        "own": OWN,
+    }
     changes = {names[name].path: content for name, content in other.items()}
     return {file.path: file.content for file in ALL} | changes
 
@@ -66,13 +75,13 @@ def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None
 
 def test_all_that_is_as_installed_is_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
-    leaving = Run(("systemctl", "disable", "--now", DOOR, UNIT))
+    leaving = Run(("systemctl", "disable", "--now", PAGE, DOOR, UNIT))
     assert uninstalling(ALL, there(), force=False) == [leaving, *removed, *GONE]
 
 
 def test_a_unit_that_is_not_there_is_not_disabled() -> None:
-    """As after an upgrade from a version without a door."""
-    leaving, *_ = uninstalling(ALL, there(door=None), force=False)
+    """As after an upgrade from a version without a door or a page."""
+    leaving, *_ = uninstalling(ALL, there(door=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
 
@@ -99,8 +108,8 @@ def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, door, _, _, configuration = files()
-    assert (unit.path.name, door.path.name) == (UNIT, DOOR)
+    unit, door, page, _, _, configuration = files()
+    assert (unit.path.name, door.path.name, page.path.name) == (UNIT, DOOR, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
     assert set(present([unit])) == {unit.path}
 

@@ -1,0 +1,170 @@
+"""`acsard web`: the robot's page, for browsers and programs; and who may come to it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from acsard.cli.common import add_bus, load
+from acsard.host.errors import UsageError
+from acsard.host.exits import Exit, ExitError
+from acsard.host.extras import install
+from acsard.values import ROLES
+
+if TYPE_CHECKING:
+    from acsard.config.settings import Config
+    from acsard.web.server import Listen
+
+MOST_DAYS = 3650
+
+NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb."""
+    parser = verbs.add_parser(
+        "web",
+        help="the robot's page: see it, stop it, drive it in a browser",
+        description="Serve the robot's page until Ctrl-C, beside a running daemon, which starts it "
+        "by itself in a terminal. At the machine everybody may do all; elsewhere by HTTPS, with "
+        f"the robot's certificate and a token. An extra: {install('web')}.",
+    )
+    add_bus(parser)
+    parser.add_argument(
+        "--address",
+        action="append",
+        metavar="URL",
+        help="where to listen, may be repeated, in place of all of web.address; "
+        "https://0.0.0.0:8443 is for other machines",
+    )
+    doing = parser.add_mutually_exclusive_group()
+    doing.add_argument(
+        "--invite", choices=ROLES, help="print an address with a new token, and its QR code"
+    )
+    doing.add_argument("--tokens", action="store_true", help="list the tokens")
+    doing.add_argument("--revoke", metavar="NAME", help="end a token; its pages close at once")
+    parser.add_argument("--name", type=_name, help="of the token: whose it is (default: the role)")
+    parser.add_argument(
+        "--days", type=_days, default=30, metavar="N", help="until the token ends (default 30)"
+    )
+    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Serve, or see to the tokens."""
+    try:
+        import aiohttp  # noqa: F401
+        import segno  # noqa: F401
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
+        ) from None
+    _, config = load(args.config)
+    if args.invite:
+        return _invite(args, config)
+    if args.tokens:
+        return _list()
+    if args.revoke:
+        return _revoke(args.revoke)
+    return _serve(args, config)
+
+
+def _serve(args: argparse.Namespace, config: Config) -> int:
+    import asyncio
+
+    from acsard.bus.address import address_of
+    from acsard.bus.session import log_from_environment
+    from acsard.web import server, tokens
+
+    def announce(urls: Sequence[str]) -> None:
+        asked = [one.url for one in listen]
+        for url, wished in zip(urls, asked, strict=True):
+            taken = "" if url == wished else f"  ({wished} is taken)"
+            print(f"  page    {url}{taken}", flush=True)
+
+    listen = _listen(args, config)
+    log_from_environment()
+    wanted = server.Wanted(
+        config,
+        address_of(config, args.connect, args.id, args.tls),
+        listen,
+        args.tls or config.bus.tls,
+        tokens.place(),
+        next_port=args.held,
+        held=args.held,
+    )
+    asyncio.run(server.serve(wanted, announce))
+    return int(Exit.OK)
+
+
+def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
+    from acsard.web.server import listens
+
+    return tuple(listens(text) for text in args.address or config.web.address)
+
+
+def _invite(args: argparse.Namespace, config: Config) -> int:
+    """A new token, shown once."""
+    import segno
+
+    from acsard.web.server import invitations
+    from acsard.web.tokens import Vault, place
+
+    tls = args.tls or config.bus.tls
+    urls = invitations(_listen(args, config), tls)
+    if not urls:
+        raise UsageError(
+            "nobody could come with it: web.address has no https://; add "
+            '"https://0.0.0.0:8443" there (or --address), and `acsard lan init` for a certificate'
+        )
+    vault = Vault(place())
+    text, token = vault.invite(args.invite, args.name or args.invite, args.days)
+    print(f"{token.name} is {token.role} until {_clock(token.ends)}; the link is shown only now:\n")
+    for url in urls:
+        print(f"  {url}#token={text}")
+    print()
+    segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
+    print(f"\nended sooner by: acsard web --revoke {token.name}")
+    return int(Exit.OK)
+
+
+def _list() -> int:
+    from acsard.web.tokens import Vault, place
+
+    vault = Vault(place())
+    tokens = vault.all()
+    for one in tokens:
+        ended = "  (ended)" if one.ends <= time.time() else ""
+        print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}{ended}")
+    if not tokens:
+        print(f"no tokens in {vault.path}")
+    return int(Exit.OK)
+
+
+def _revoke(name: str) -> int:
+    from acsard.web.tokens import Vault, place
+
+    Vault(place()).revoke(name)
+    print(f"{name} counts no more")
+    return int(Exit.OK)
+
+
+def _clock(seconds: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds))
+
+
+def _name(text: str) -> str:
+    if not NAME.match(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no name: 1 to 32 of A-Z a-z 0-9 _ . -")
+    return text
+
+
+def _days(text: str) -> int:
+    if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= MOST_DAYS:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to {MOST_DAYS}")
+    return int(text)

@@ -1,0 +1,339 @@
+"""The page's server as an aiohttp application: who may come in, what he gets, by which headers.
+
+Every request passes `_admit` first. What it hands on has a `Who`, but for the page's own files and
+`/token`, which are for everybody who asks for the robot by its name.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from aiohttp import web
+
+from acsard.host import clock
+from acsard.web.calls import Calls
+from acsard.web.counts import Counts
+from acsard.web.files import PAGE, Files
+from acsard.web.fleet import Fleet
+from acsard.web.frames import MAX_BYTES
+from acsard.web.gate import Gate
+from acsard.web.hand import Hand
+from acsard.web.limits import CONNECTIONS, CONNECTIONS_OF_ONE, Places, Tries
+from acsard.web.programs import Programs, TroubleError
+from acsard.web.robots import Robots
+from acsard.web.tokens import Vault
+from acsard.web.viewer import HEARTBEAT_S, Viewer
+from acsard.web.who import MAINTAINER, Asked, Reason, Refusal, Who, foreign, place
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+COOKIE = "__Host-acsard"
+"""By its name browsers take it only with Secure, of this host, for all paths."""
+
+OPEN = ("/", "/token", "/favicon.ico")
+"""For everybody: a page has to be there before it can say who shows it."""
+
+HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
+"""What a browser writes into `Host`; it is written back into a header."""
+
+SEND_BUFFER = 65536
+"""Of the kernel, for one client: what lies in it is old when it arrives."""
+
+STATUS: dict[Reason, int] = {
+    "no_token": 401,
+    "bad_token": 401,
+    "too_fast": 429,
+    "too_many": 503,
+    "path": 404,
+    "malformed": 400,
+}
+"""403 for all others."""
+
+REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
+"""What aiohttp refuses by itself; anything else is malformed."""
+
+WHO: web.RequestKey[Who | None] = web.RequestKey("who", object)  # type: ignore[arg-type]
+
+
+class Page:
+    """All that the handlers share."""
+
+    def __init__(
+        self,
+        robots: Robots,
+        hand: Hand,
+        calls: Calls,
+        fleet: Fleet,
+        counts: Counts,
+        vault: Vault,
+        names: frozenset[str],
+        gate: Gate,
+        page: Path = PAGE,
+    ) -> None:
+        """`names` are those by which the robot is reached from elsewhere, lower case."""
+        self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
+        self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
+        self._files, self._programs = Files(page), Programs(robots, calls, counts)
+        self._tries = Tries()
+        self._places = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._viewers: set[Viewer] = set()
+        self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
+        self.app.on_response_prepare.append(_headers)
+        self.app.add_routes(
+            [
+                web.get("/", self._index),
+                web.get("/favicon.ico", self._icon),
+                web.get("/page/{name}", self._file),
+                web.get("/ws", self._socket),
+                web.post("/token", self._token),
+                web.get("/api", self._api),
+                web.get("/api/recordings", self._recordings),
+                web.get("/api/recordings/{name}", self._recording),
+                web.get("/api/whoami", self._whoami),
+                web.get("/api/settings", self._settings),
+                web.post("/api/srv/{verb}", self._service),
+                web.get("/api/{key:.+}", self._value),
+                web.get("/metrics", self._metrics),
+            ]
+        )
+
+    @property
+    def viewers(self) -> int:
+        """Connected now."""
+        return len(self._viewers)
+
+    def end_all(self, why: str) -> None:
+        """Everybody goes; who drove stops."""
+        for viewer in list(self._viewers):
+            viewer.end(why)
+
+    def end_revoked(self) -> None:
+        """Those go whose token counts no more."""
+        for viewer in list(self._viewers):
+            if viewer.who.token and not self._vault.counts(viewer.who.token):
+                viewer.end("your token has ended")
+
+    # who
+
+    @web.middleware
+    async def _admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        self._gate.spoke(request.transport)
+        asked = _asked(request)
+        spot = place(asked, self._names | {_own_address(request)})
+        if isinstance(spot, Refusal):
+            return self.refused(spot)
+        acts = request.method not in ("GET", "HEAD") or request.path == "/ws"
+        if acts or request.path.startswith(("/api", "/metrics")):
+            strange = foreign(asked)
+            if strange is not None:
+                return self.refused(strange)
+        if request.path in OPEN or request.path.startswith("/page/"):
+            request[WHO] = MAINTAINER if spot == "here" else None
+        else:
+            who = MAINTAINER if spot == "here" else self._known(asked.peer, _shown(request))
+            if isinstance(who, Refusal):
+                return self.refused(who)
+            request[WHO] = who
+        try:
+            return await handler(request)
+        except TroubleError as trouble:
+            return problem(trouble.status, str(trouble))
+        except web.HTTPException as error:
+            if error.status < 400:
+                raise
+            self._counts.refuse(REASONS.get(error.status, "malformed"))
+            return problem(error.status, _WORDS.get(error.status, error.reason))
+
+    def _known(self, peer: str, shown: str) -> Who | Refusal:
+        """Whose token this is."""
+        now_ns = clock.mono_ns()
+        if not shown:
+            return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
+        who = self._vault.who(shown)
+        if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
+            return who
+        if self._tries.spent(peer, now_ns):
+            return Refusal("too_fast", "too many wrong tokens: wait a minute")
+        self._tries.failed(peer, now_ns)
+        return Refusal("bad_token", "this token has ended, was revoked, or never was one")
+
+    def refused(self, why: Refusal) -> web.Response:
+        """The answer to who may not, counted."""
+        self._counts.refuse(why.reason)
+        return problem(STATUS.get(why.reason, 403), why.text)
+
+    async def _token(self, request: web.Request) -> web.StreamResponse:
+        """A token becomes a cookie, which no script can read."""
+        text = await _posted(request)
+        if not request.secure:
+            return self.refused(Refusal("plain", "here you need no token"))
+        who = self._known(request.remote or "", text)
+        if isinstance(who, Refusal):
+            return self.refused(who)
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(
+            COOKIE, text, max_age=self._vault.left_s(who.token), path="/",
+            secure=True, httponly=True, samesite="Strict",
+        )  # fmt: skip
+        return response
+
+    # the page
+
+    async def _index(self, request: web.Request) -> web.StreamResponse:
+        return self._send(request, "index.html")
+
+    async def _icon(self, request: web.Request) -> web.StreamResponse:
+        return self._send(request, "icon.svg")
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        return self._send(request, request.match_info["name"])
+
+    def _send(self, request: web.Request, name: str) -> web.StreamResponse:
+        file = self._files.get(name)
+        if file is None:
+            raise web.HTTPNotFound
+        headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+        if request.headers.get("If-None-Match") == file.tag:
+            return web.Response(status=304, headers=headers)
+        body = file.body
+        if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
+            body, headers["Content-Encoding"] = file.packed, "gzip"
+        return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        who, peer = _who(request), request.remote or ""
+        if not self._places.enter(peer):
+            return self.refused(
+                Refusal("too_many", f"{CONNECTIONS} pages at most, {CONNECTIONS_OF_ONE} of one")
+            )
+        try:
+            served = web.WebSocketResponse(
+                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
+            )
+            await served.prepare(request)
+            _keep_little(request)
+            viewer = Viewer(
+                served, request, who, self._robots, self._hand, self._calls, self._fleet,
+                self._counts,
+            )  # fmt: skip
+            self._viewers.add(viewer)
+            try:
+                await viewer.run()
+            finally:
+                self._viewers.discard(viewer)
+        finally:
+            self._places.leave(peer)
+        return served
+
+    # for programs
+
+    async def _api(self, request: web.Request) -> web.StreamResponse:
+        return self._programs.described()
+
+    async def _metrics(self, request: web.Request) -> web.StreamResponse:
+        return self._programs.metrics(self.viewers)
+
+    async def _whoami(self, request: web.Request) -> web.StreamResponse:
+        who = _who(request)
+        return web.json_response({"role": who.role, "name": who.name})
+
+    async def _settings(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.settings(_who(request))
+
+    async def _value(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.value(_who(request), request.match_info["key"])
+
+    async def _service(self, request: web.Request) -> web.StreamResponse:
+        body = await request.read()
+        return await self._programs.call(_who(request), request.match_info["verb"], body)
+
+    async def _recordings(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.listed()
+
+    async def _recording(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.recording(_who(request), request.match_info["name"])
+
+
+def _who(request: web.Request) -> Who:
+    who = request[WHO]
+    assert who is not None, "it is not open to all"
+    return who
+
+
+def problem(status: int, text: str) -> web.Response:
+    """What was wrong, in words."""
+    return web.json_response({"error": text}, status=status)
+
+
+_WORDS = {
+    404: "there is no such thing here; GET /api lists what there is",
+    413: f"over {MAX_BYTES} bytes",
+}
+
+
+def _asked(request: web.Request) -> Asked:
+    hosts = request.headers.getall("Host", [])
+    return Asked(
+        request.remote or "",
+        request.secure,
+        hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
+        request.headers.get("Origin"),
+        request.headers.get("Sec-Fetch-Site"),
+    )
+
+
+def _own_address(request: web.Request) -> str:
+    """The address of ours that the client has reached: no name that somebody points here."""
+    at = None if request.transport is None else request.transport.get_extra_info("sockname")
+    return str(at[0]).lower() if at else ""
+
+
+def _shown(request: web.Request) -> str:
+    """The token in the cookie of a browser, or in the header of a program."""
+    kind, _, text = request.headers.get("Authorization", "").partition(" ")
+    return text.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
+
+
+async def _posted(request: web.Request) -> str:
+    """The token in a form or in JSON; "" where there is none."""
+    body = await request.read()
+    if request.content_type == "application/json":
+        try:
+            given: Any = msgspec.json.decode(body, type=dict[str, str])
+        except (msgspec.MsgspecError, ValueError):
+            return ""
+    else:
+        given = await request.post()
+    text = given.get("token", "")
+    return text if isinstance(text, str) else ""
+
+
+def _keep_little(request: web.Request) -> None:
+    at = None if request.transport is None else request.transport.get_extra_info("socket")
+    if at is not None:
+        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+
+async def _headers(request: web.Request, response: web.StreamResponse) -> None:
+    host = request.headers.get("Host", "")
+    # A browser of before 2022 does not take 'self' for ws too; a Host that is none of ours is
+    # refused, and not written back.
+    connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
+    response.headers.update(
+        {
+            "Content-Security-Policy": f"default-src 'self'; connect-src 'self'{connect}; "
+            "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+    )
+    response.headers.setdefault("Cache-Control", "no-store")
+    response.headers["Server"] = "acsard"

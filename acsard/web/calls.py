@@ -1,0 +1,106 @@
+"""Services of the robot and questions to it: each in a thread of its own, so that a stop waits for
+nothing, and so many at most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from acsard.bus.access import MAY, SERVICE_ROLES
+from acsard.client import Client
+from acsard.host.errors import MendableError
+from acsard.host.threads import in_thread
+from acsard.messages.encodings import DecodeError
+from acsard.messages.schema import ServiceReply
+from acsard.messages.topics import SERVICES
+from acsard.values import AcsardError
+from acsard.web.robots import Robots
+from acsard.web.who import Who
+
+AT_ONCE, STOPS_AT_ONCE = 16, 32
+"""Of all viewers. Stops have a room of their own; more of them would all stop the same robot."""
+
+ANSWER_S = 8.0
+"""Longer than a client waits for its answer, which says why there is none."""
+
+BUSY = "busy: too many questions at once; ask again"
+
+T = TypeVar("T")
+
+
+class RefusedError(AcsardError):
+    """Not for this role, or no such service; the text says which."""
+
+    def __init__(self, text: str, role: bool) -> None:
+        super().__init__(text)
+        self.role = role
+        """He may not; else there is none."""
+
+
+class Calls:
+    """What is under way, at most so much."""
+
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
+        self._running = self._stopping = 0
+
+    async def call(self, who: Who, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
+        """Call a service in the name of `who`; raises `RefusedError`."""
+        require(who, verb)
+        client = self._robots.client
+        if client is None:
+            return ServiceReply(False, self._robots.gone)
+
+        def request() -> ServiceReply:
+            return _named(client, self._robots.id, who).request(verb, payload)
+
+        try:
+            reply = await (self._stop(request) if verb == "stop" else self._ask(request))
+        except (MendableError, DecodeError, TimeoutError) as error:
+            return ServiceReply(False, str(error) or "no answer in time")
+        if verb == "set" and reply.success:
+            self._robots.ask_anew()
+        return reply
+
+    async def get(self, robot: str, name: str) -> tuple[str, bytes]:
+        """The last value of a key as JSON: encoding and payload; raises a `MendableError`."""
+        client = self._robots.client
+        if client is None:
+            raise MendableError(self._robots.gone)
+        return await self._ask(lambda: client.like(robot).reply(f"{name}?fmt=json"))
+
+    async def _ask(self, call: Callable[[], T]) -> T:
+        if self._running >= AT_ONCE:
+            raise MendableError(BUSY)
+        self._running += 1
+        try:
+            return await in_thread(call, ANSWER_S)
+        finally:
+            self._running -= 1
+
+    async def _stop(self, call: Callable[[], ServiceReply]) -> ServiceReply:
+        if self._stopping >= STOPS_AT_ONCE:
+            return ServiceReply(True, "stops are under way")
+        self._stopping += 1
+        try:
+            return await in_thread(call, ANSWER_S)
+        finally:
+            self._stopping -= 1
+
+
+def require(who: Who, verb: str) -> None:
+    """Raises `RefusedError`."""
+    if verb not in SERVICES:
+        raise RefusedError(f"no service {verb!r}; there are {', '.join(SERVICES)}", role=False)
+    least = SERVICE_ROLES[verb]
+    if not who.may(least):
+        raise RefusedError(
+            f"{verb} is for an {least}; you are {who.role}: {MAY[who.role]}", role=True
+        )
+
+
+def _named(client: Client, robot: str, who: Who) -> Client:
+    """The daemon's log says who called."""
+    other = client.like(robot)
+    other.name = f"{who.name}@page"
+    return other

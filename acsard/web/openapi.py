@@ -1,0 +1,175 @@
+"""The page's interface for programs, described as OpenAPI 3.1; pure.
+
+From the table of topics and the schemas that `schema/<Type>` answers with: a key or a field that
+is new there is new here.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from acsard.bus.access import SERVICE_ROLES, least_role
+from acsard.messages.json_schema import SCHEMAS
+from acsard.messages.topics import SERVICES, TOPICS, Topic, service_key
+
+Described = dict[str, Any]
+
+PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
+"""A key without a wildcard."""
+
+NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
+"""Rows that have no value to be asked for here."""
+
+PAYLOADS = {"set": "Settings", "set_pose": "SetPose"}
+
+
+def asked(topic: Topic) -> bool:
+    """A row with a value that may be asked for."""
+    return topic.direction in ("out", "query") and topic.key not in NOT_ASKED
+
+
+def document(version: str) -> Described:
+    """All of it, as `GET /api` answers."""
+    paths: Described = {}
+    for topic in TOPICS:
+        if asked(topic):
+            paths[f"/api/{topic.key.replace('<Type>', '{type}')}"] = {"get": _value(topic)}
+    for verb in SERVICES:
+        paths[f"/api/{service_key(verb)}"] = {"post": _service(verb)}
+    paths |= _OTHERS
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "acsard",
+            "version": version,
+            "description": "The robot's page, for programs. At the machine nothing is asked for; "
+            "from elsewhere a token, as `Authorization: Bearer ...`. GET /ws is a WebSocket.",
+        },
+        "paths": paths,
+        "components": {
+            "schemas": dict(SCHEMAS),
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{}, {"token": []}],
+    }
+
+
+def _ref(name: str) -> Described:
+    return {"$ref": f"#/components/schemas/{name}"} if name in SCHEMAS else {}
+
+
+def _answer(what: str, schema: Described, kind: str = "application/json") -> Described:
+    return {"description": what, "content": {kind: {"schema": schema}}}
+
+
+_TROUBLE: Described = {
+    "description": "Why not, in words.",
+    "content": {
+        "application/json": {
+            "schema": {"type": "object", "properties": {"error": {"type": "string"}}}
+        }
+    },
+}
+
+
+def _value(topic: Topic) -> Described:
+    about = f"{topic.note}; for who is at least {least_role(topic.key)}"
+    told: Described = {
+        "summary": about,
+        "responses": {
+            "200": _answer("The last value.", _ref(topic.type)),
+            "default": _TROUBLE,
+        },
+    }
+    if "<Type>" in topic.key:
+        kind = {"name": "type", "in": "path", "required": True, "schema": {"type": "string"}}
+        told["parameters"] = [kind]
+    return told
+
+
+def _service(verb: Any) -> Described:
+    notes = {topic.key: topic.note for topic in TOPICS}
+    told: Described = {
+        "summary": f"{notes[service_key(verb)]}; for who is at least {SERVICE_ROLES[verb]}",
+        "responses": {
+            "200": _answer("It was done.", _ref("ServiceReply")),
+            "409": _answer("It was not, and why.", _ref("ServiceReply")),
+            "default": _TROUBLE,
+        },
+    }
+    if verb in PAYLOADS:
+        body = {"application/json": {"schema": _ref(PAYLOADS[verb])}}
+        told["requestBody"] = {"required": True, "content": body}
+    return told
+
+
+_NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}}
+
+_RECORDING: Described = {
+    "type": "object",
+    "properties": {
+        "name": {"type": "string"},
+        "begin": {"type": ["number", "null"], "description": "s since 1970"},
+        "seconds": {"type": ["number", "null"]},
+        "bytes": {"type": "integer"},
+        "events": {"type": "string", "description": "what happened, in a few words"},
+    },
+}
+
+_SETTING: Described = {
+    "type": "object",
+    "required": ["key", "value", "what", "when"],
+    "properties": {
+        "key": {"type": "string"},
+        "value": {},
+        "what": {"type": "string"},
+        "when": {"type": "string"},
+        "low": {"type": "number"},
+        "high": {"type": "number"},
+        "choices": {"type": "array", "items": {"type": "string"}},
+    },
+}
+
+_OTHERS: Described = {
+    "/api/whoami": {
+        "get": {
+            "summary": "who you are here",
+            "responses": {"200": _answer("Role and name.", {"type": "object"})},
+        }
+    },
+    "/api/settings": {
+        "get": {
+            "summary": "what srv/set takes: values, ranges, when; for a maintainer",
+            "responses": {
+                "200": _answer("A list.", {"type": "array", "items": _SETTING}),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/api/recordings": {
+        "get": {
+            "summary": "the recordings of the black box, oldest first",
+            "responses": {
+                "200": _answer("A list.", {"type": "array", "items": _RECORDING}),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/api/recordings/{name}": {
+        "get": {
+            "summary": "one of them as a file; for who is at least operator",
+            "parameters": [_NAME],
+            "responses": {
+                "200": _answer("MCAP.", {}, "application/octet-stream"),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/metrics": {
+        "get": {
+            "summary": "for Prometheus",
+            "responses": {"200": _answer("Text.", {"type": "string"}, "text/plain")},
+        }
+    },
+}

@@ -1,0 +1,283 @@
+"""The page's server from start to end: addresses, the way to the daemon, and the way out."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import ssl
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from aiohttp import web
+from msgspec import Struct
+
+from acsard.bus.address import Address
+from acsard.bus.certificates import CERTIFICATE, KEY, names_in, require_usable
+from acsard.bus.session import client_session
+from acsard.client import Client
+from acsard.config.settings import Config
+from acsard.host.addresses import own_addresses
+from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.host.parent import end_with_parent
+from acsard.web.app import Page
+from acsard.web.calls import Calls
+from acsard.web.counts import Counts
+from acsard.web.files import PAGE
+from acsard.web.fleet import Fleet
+from acsard.web.gate import Gate
+from acsard.web.hand import SOURCE, Hand
+from acsard.web.robots import About, Robots
+from acsard.web.tokens import Vault
+from acsard.web.who import is_loopback
+
+TRIES = 20
+"""Ports after a taken one that are tried."""
+
+BEAT_S, TIDY_S = 0.5, 1.0
+
+NICE = 5
+"""Behind the daemon that has started us."""
+
+HANDSHAKE_S = 10.0
+
+IDLE_S = 20.0
+"""A connection between two requests."""
+
+LEAVE_S = 0.3
+"""For the zeros of who drove."""
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long one thread may keep the interpreter from another: a command or a stop waits for it."""
+
+
+class Listen(Struct, frozen=True):
+    """Where to listen, and how."""
+
+    secure: bool
+    """HTTPS."""
+    host: str
+    port: int
+
+    @property
+    def everywhere(self) -> bool:
+        """At all addresses of this machine."""
+        return self.host in ("0.0.0.0", "::")
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser; where it is everywhere by the name of this machine."""
+        return self.url_at(own_name() if self.everywhere else self.host)
+
+    def url_at(self, host: str) -> str:
+        """The same by another name."""
+        host = f"[{host}]" if ":" in host else host
+        return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
+
+
+class Wanted(Struct, frozen=True):
+    """What is served, where and how."""
+
+    config: Config
+    address: Address
+    listen: tuple[Listen, ...]
+    tls: str
+    """The directory of the robot's certificate, for who comes from elsewhere."""
+    state: Path
+    """The directory of the tokens."""
+    next_port: bool = False
+    """Take a later port where one is taken."""
+    held: bool = False
+    """End with standard input."""
+    page: Path = PAGE
+
+
+def own_name() -> str:
+    """What others find this machine by, by mDNS."""
+    return f"{socket.gethostname().partition('.')[0].lower()}.local"
+
+
+def listens(text: str) -> Listen:
+    """An address like http://127.0.0.1:8080; raises `UsageError`.
+
+    Without TLS nobody but this machine is listened to.
+    """
+    scheme, _, place = text.removesuffix("/").partition("://")
+    host, _, port = place.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    number = int(port) if port.isascii() and port.isdecimal() else 0
+    if scheme not in ("http", "https") or not host or not 0 < number < 65536:
+        raise UsageError(
+            f"{text} is no address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
+        )
+    if scheme == "http" and not (host == "localhost" or is_loopback(host)):
+        raise UsageError(f"{text}: beyond this machine only https, with the robot's certificate")
+    return Listen(scheme == "https", host, number)
+
+
+def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
+    """The addresses to write on an invitation, the likeliest first; none without HTTPS.
+
+    An IP address before a name: not every phone asks by mDNS.
+    """
+    found: list[str] = []
+    for one in listen:
+        if not one.secure:
+            continue
+        hosts = [one.host]
+        if one.everywhere:
+            certified = set(names_in(tls)) if tls else set()
+            own = [at for at in own_addresses() if at in certified and ":" not in at]
+            hosts = [*own, own_name()]
+        found += [one.url_at(host) for host in hosts]
+    return found
+
+
+async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> None:
+    """Until a signal; `announce` is told once where it is. Raises `MendableError`s."""
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    leaving = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, leaving.set)
+    if wanted.held:
+        end_with_parent(signal.SIGTERM)
+        os.nice(NICE)
+    counts = Counts()
+    secure, names = _certified(wanted)
+    robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
+    hand = Hand(lambda: robots.client, counts)
+    calls, fleet = Calls(robots), Fleet(robots)
+    vault, gate = Vault(wanted.state), Gate(counts)
+    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, wanted.page)
+    runner = web.AppRunner(
+        page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
+        shutdown_timeout=LEAVE_S,
+    )  # fmt: skip
+    async with AsyncExitStack() as stack:
+        await runner.setup()
+        stack.push_async_callback(runner.cleanup)
+        places = [_bound(one, wanted.next_port) for one in wanted.listen]
+        for one, bound in places:
+            server = await asyncio.get_running_loop().create_server(
+                gate.guarded(runner.server),  # type: ignore[arg-type]
+                sock=bound,
+                ssl=secure if one.secure else None,
+                ssl_handshake_timeout=HANDSHAKE_S if one.secure else None,
+                backlog=128,
+            )
+            stack.callback(server.close)
+        announce([one.url for one, _ in places])
+        await _until(leaving, robots, page, wanted)
+        page.end_all("the page's server ends")
+        await asyncio.sleep(0)
+        await asyncio.to_thread(hand.flush, LEAVE_S)
+
+
+async def _until(leaving: asyncio.Event, robots: Robots, page: Page, wanted: Wanted) -> None:
+    """Work until told to leave, or until something ends that must not."""
+    work = [
+        asyncio.create_task(leaving.wait()),
+        asyncio.create_task(robots.run()),
+        asyncio.create_task(_tidy(page)),
+    ]
+    if wanted.held:
+        work.append(asyncio.create_task(_held(leaving)))
+    try:
+        done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()  # raises what ended it
+    finally:
+        for task in work:
+            task.cancel()
+
+
+async def _tidy(page: Page) -> None:
+    while True:
+        await asyncio.sleep(TIDY_S)
+        page.end_revoked()
+
+
+async def _held(leaving: asyncio.Event) -> None:
+    """Say on standard input, a socket, that we are alive; leave when it ends."""
+    holder = sys.stdin.fileno()
+    os.set_blocking(holder, False)
+
+    def look() -> None:
+        try:
+            ended = os.read(holder, 64) == b""
+        except OSError:
+            ended = True
+        if ended:
+            leaving.set()
+
+    loop = asyncio.get_running_loop()
+    loop.add_reader(holder, look)
+    try:
+        while True:
+            try:
+                os.write(holder, b".")
+            except BlockingIOError:
+                pass  # who holds us does not listen now
+            except OSError:
+                leaving.set()
+            await asyncio.sleep(BEAT_S)
+    finally:
+        loop.remove_reader(holder)
+
+
+def _connected(address: Address) -> Client:
+    """The way to the daemon; blocks."""
+    session = client_session(address.endpoint, address.tls)
+    return Client(session, address.robot_id, SOURCE, address.tls)
+
+
+def _about(wanted: Wanted) -> About:
+    config = wanted.config
+    return About(
+        "",
+        config.mcu.simulated,
+        config.limits.linear_speed,
+        config.limits.angular_speed,
+        config.rates.state,
+        config.record.directory,
+    )
+
+
+def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
+    """What to show from elsewhere, and the names there; raises a `MendableError`."""
+    away = [one for one in wanted.listen if one.secure]
+    if not away:
+        return None, frozenset()
+    if not wanted.tls:
+        raise CertificateError(
+            f"{away[0].url} takes a certificate: `acsard lan init` makes one; then set bus.tls, or "
+            "--tls DIRECTORY"
+        )
+    require_usable(wanted.tls)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(f"{wanted.tls}/{CERTIFICATE}", f"{wanted.tls}/{KEY}", password="")
+    names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(wanted.tls))}
+    return context, frozenset(one for one in names if one != "localhost" and not is_loopback(one))
+
+
+def _bound(one: Listen, next_port: bool) -> tuple[Listen, socket.socket]:
+    """A socket there, or at one of the next ports; raises `InUseError`."""
+    ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
+    trouble: OSError | None = None
+    for port in ports:
+        try:
+            found = socket.getaddrinfo(one.host, port, type=socket.SOCK_STREAM)[0]
+            bound = socket.create_server(found[4][:2], family=found[0], backlog=128)
+        except OSError as error:
+            trouble = error
+            continue
+        bound.setblocking(False)
+        return Listen(one.secure, one.host, port), bound
+    raise InUseError(
+        f"cannot listen at {one.url}: {trouble}; stop what has it, or choose another "
+        "by --address (web.address)"
+    ) from None

@@ -1,0 +1,128 @@
+"""The newest message of a key, as JSON, for as many viewers as there are.
+
+Zenoh's thread only puts it down; it is made JSON when the first viewer is due, once for all. What
+is subscribed to is the key as it is (msgpack): it costs the daemon one reader more, and no JSON.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import msgspec
+import zenoh
+
+from acsard.bus.subscription import encoded
+from acsard.client import Client
+from acsard.host import clock
+from acsard.host.threads import in_thread
+from acsard.messages.encodings import DecodeError, detect
+from acsard.messages.topics import PUBLISHED
+from acsard.web.counts import Counts
+
+KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
+"""What may be followed."""
+
+MOST = 200
+"""Keys of all robots at once."""
+
+DECLARE_S = 3.0
+
+
+class Stream:
+    """One key of one robot."""
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+        self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
+        self._text: tuple[int, bytes] = (0, b"null")
+        self.declared: Any = None
+        self.users = 0
+        self.lock = asyncio.Lock()
+
+    @property
+    def number(self) -> int:
+        """Of the newest; 0 before the first."""
+        return self._newest[0]
+
+    def take(self, sample: zenoh.Sample) -> None:
+        """One has come; what a stranger put on a wildcard is none."""
+        if str(sample.key_expr) == self._key:
+            self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
+
+    def value(self) -> tuple[int, bytes, float]:
+        """Number, JSON and age in ms of the newest."""
+        number, sample, at_ns = self._newest
+        if sample is not None and self._text[0] != number:
+            self._text = number, as_json(*encoded(sample))
+        return number, self._text[1], (clock.mono_ns() - at_ns) / 1e6
+
+    def raw(self) -> tuple[str, bytes] | None:
+        """Encoding and payload of the newest."""
+        sample = self._newest[1]
+        return None if sample is None else encoded(sample)
+
+
+class Streams:
+    """Those that somebody follows; the last to go ends one."""
+
+    def __init__(self, counts: Counts) -> None:
+        self._streams: dict[tuple[str, str], Stream] = {}
+        self._counts = counts
+
+    async def follow(self, client: Client, robot: str, key: str) -> Stream | None:
+        """The stream of this key; None where there is no room. `TimeoutError` from a locked bus."""
+        name = robot, key
+        stream = self._streams.get(name)
+        if stream is None:
+            if len(self._streams) >= MOST:
+                return None
+            stream = self._streams[name] = Stream(client.like(robot).key(key))
+        stream.users += 1
+        try:
+            async with stream.lock:
+                if stream.declared is None:
+                    stream.declared = await self._declare(client.like(robot), key, stream)
+        except BaseException:
+            await self.leave(robot, key)
+            raise
+        return stream
+
+    async def leave(self, robot: str, key: str) -> None:
+        """One follows it no more."""
+        stream = self._streams.get((robot, key))
+        if stream is None:
+            return
+        stream.users -= 1
+        if stream.users:
+            return
+        del self._streams[robot, key]
+        if stream.declared is not None:
+            try:
+                await in_thread(stream.declared.undeclare, DECLARE_S)
+            except (TimeoutError, zenoh.ZError):
+                pass  # the bus is stuck, or gone: what comes goes nowhere
+
+    async def _declare(self, client: Client, key: str, stream: Stream) -> Any:
+        def late(subscriber: Any) -> None:
+            subscriber.undeclare()
+
+        def take(sample: zenoh.Sample) -> None:
+            stream.take(sample)
+
+        def declare() -> Any:
+            # What is published seldom is there at once.
+            client.ask(key, take)
+            return client.listen(key, take)
+
+        return await in_thread(declare, DECLARE_S, late)
+
+
+def as_json(encoding: str, payload: bytes) -> bytes:
+    """A message as JSON; null for what cannot be read."""
+    try:
+        known = detect(encoding, payload) == "json"
+        told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)
+        return payload if known else msgspec.json.encode(told)
+    except (DecodeError, msgspec.MsgspecError, ValueError, RecursionError, TypeError):
+        return b"null"

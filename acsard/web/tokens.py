@@ -1,0 +1,160 @@
+"""Tokens for who comes from elsewhere: made once, kept as hashes, until they end or are revoked.
+
+A token is 32 bytes of chance, so a plain hash of it cannot be turned round.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import hmac
+import os
+import secrets
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+from acsard.host.errors import NotPermittedError, UsageError
+from acsard.values import Role
+from acsard.web.who import Who
+
+FILE, MODE = "tokens.json", 0o600
+
+SERVICE = Path("/var/lib/acsard-web")
+"""The state directory of the service."""
+
+DAY_S = 86400
+
+MOST = 200
+
+
+class Token(Struct, frozen=True):
+    """What is kept of one."""
+
+    name: str
+    role: Role
+    digest: str
+    made: int
+    """Seconds since 1970."""
+    ends: int
+    """The same."""
+
+
+class Vault:
+    """The tokens in a file that only its owner may read; read again when it has changed."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / FILE
+        self._tokens: list[Token] = []
+        self._stamp: tuple[int, int] | None = None
+
+    def who(self, text: str) -> Who | None:
+        """Whose this token is, while it counts."""
+        if not text or len(text) > 200:
+            return None
+        digest, found = _digest(text), None
+        for token in self.all():
+            if hmac.compare_digest(token.digest, digest):
+                found = token
+        if found is None or found.ends <= time.time():
+            return None
+        return Who(found.role, found.name, found.digest)
+
+    def counts(self, digest: str) -> bool:
+        """It has not ended and is not revoked."""
+        return any(one.digest == digest and one.ends > time.time() for one in self.all())
+
+    def left_s(self, digest: str) -> int:
+        """Seconds until it ends."""
+        ends = [one.ends for one in self.all() if one.digest == digest]
+        return max(0, int(max(ends, default=0) - time.time()))
+
+    def all(self) -> list[Token]:
+        """All there are, also those that have ended; none where they cannot be read."""
+        try:
+            seen = self.path.stat()
+            stamp = seen.st_mtime_ns, seen.st_ino
+            if stamp != self._stamp:
+                self._tokens = msgspec.json.decode(self.path.read_bytes(), type=list[Token])
+                self._stamp = stamp
+        except FileNotFoundError:
+            self._tokens, self._stamp = [], None
+        except (OSError, msgspec.MsgspecError):
+            # Whom we cannot look up we let in no more.
+            self._tokens, self._stamp = [], None
+        return self._tokens
+
+    def invite(self, role: Role, name: str, days: int) -> tuple[str, Token]:
+        """A new token, to be shown once, and what is kept of it; raises `UsageError`."""
+        with self._changing() as tokens:
+            now_s = int(time.time())
+            tokens[:] = [one for one in tokens if one.ends > now_s]
+            if any(one.name == name for one in tokens):
+                raise UsageError(f"there is a token {name} already: another --name, or --revoke it")
+            if len(tokens) >= MOST:
+                raise UsageError(f"there are {MOST} tokens already: --revoke some")
+            text = secrets.token_urlsafe(32)
+            token = Token(name, role, _digest(text), now_s, now_s + days * DAY_S)
+            tokens.append(token)
+        return text, token
+
+    def revoke(self, name: str) -> None:
+        """It counts no more, from now on; raises `UsageError` where there is none."""
+        with self._changing() as tokens:
+            if all(one.name != name for one in tokens):
+                known = ", ".join(one.name for one in tokens) or "none"
+                raise UsageError(f"there is no token {name}; there are: {known}")
+            tokens[:] = [one for one in tokens if one.name != name]
+
+    @contextmanager
+    def _changing(self) -> Iterator[list[Token]]:
+        """The tokens, written when all went well; nobody else changes them meanwhile."""
+        directory = self.path.parent
+        try:
+            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX)
+                tokens = list(self.all())
+                yield tokens
+                self._write(tokens)
+            finally:
+                os.close(handle)
+        except PermissionError:
+            raise NotPermittedError(f"no permission to write {self.path}: use sudo") from None
+
+    def _write(self, tokens: list[Token]) -> None:
+        directory = self.path.parent
+        handle, name = tempfile.mkstemp(dir=directory, prefix=f".{FILE}.")
+        try:
+            with os.fdopen(handle, "wb") as new:
+                new.write(msgspec.json.encode(tokens))
+                new.flush()
+                os.fchmod(new.fileno(), MODE)
+                owner = directory.stat()
+                if os.geteuid() == 0:  # the service reads it as a user of its own
+                    os.fchown(new.fileno(), owner.st_uid, owner.st_gid)
+                os.fsync(new.fileno())
+            os.replace(name, self.path)
+        except BaseException:
+            os.unlink(name)
+            raise
+
+
+def place() -> Path:
+    """Where the tokens are: the service's state directory, else the user's own."""
+    if "STATE_DIRECTORY" in os.environ:
+        return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
+    if os.geteuid() == 0 and SERVICE.is_dir():
+        return SERVICE
+    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(base) / "acsard-web"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,164 @@
+"""The robot's page as browsers and programs see it: `acsard web`, and hands that hold the stick."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import ssl
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+from acsard.values import Role
+from acsard.web.tokens import Vault
+from tests.system.harness import (
+    PATIENCE_S,
+    Daemon,
+    Program,
+    acsard,
+    environment,
+    finish,
+    free_endpoint,
+)
+
+NAME = socket.gethostname()
+
+
+class Page(Program):
+    """`acsard web` beside a daemon: by HTTP, and by HTTPS as others reach it."""
+
+    def __init__(self, daemon: Daemon, where: Path, *words: str) -> None:
+        plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
+        self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{NAME}:{secure}"
+        self.state, self.tls = where / "state", where / "tls"
+        self.env = environment(XDG_STATE_HOME=str(self.state))
+        self.told = ["--config", str(daemon.config), "--address", self.here]
+        if self.tls.is_dir():
+            self.told += ["--address", f"https://127.0.0.1:{secure}", "--tls", str(self.tls)]
+        super().__init__(acsard("web", *self.told, *words), where, self.env)
+
+    def __enter__(self) -> Page:
+        super().__enter__()
+        self.says("page ")
+        return self
+
+    def tokens(self, *words: str) -> str:
+        """What a call of it about tokens prints."""
+        done = finish(acsard("web", *self.told, *words), self.state.parent, env=self.env)
+        assert done.code == 0, done
+        return done.out
+
+    def invite(self, role: Role, name: str) -> str:
+        """A token."""
+        return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
+
+    def client(self, token: str = "") -> aiohttp.ClientSession:
+        """A program that comes from elsewhere, with or without a token."""
+        trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
+        told = {"Authorization": f"Bearer {token}"} if token else {}
+        connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0)
+        return aiohttp.ClientSession(connector=connector, headers=told)
+
+    def refused(self) -> dict[str, float]:
+        """What was refused so far, by reason."""
+        found = {}
+        for line in asyncio.run(text(f"{self.here}/metrics")).splitlines():
+            if line.startswith("acsard_page_refused_total{"):
+                found[line.partition('reason="')[2].partition('"')[0]] = float(line.split()[-1])
+        return found
+
+
+class _Here(aiohttp.abc.AbstractResolver):
+    """Every name is this machine."""
+
+    async def resolve(self, host: str, port: int = 0, family: int = 0) -> list[Any]:
+        return [
+            {"hostname": host, "host": "127.0.0.1", "port": port, "family": socket.AF_INET,
+             "proto": 0, "flags": 0}
+        ]  # fmt: skip
+
+    async def close(self) -> None:
+        """Nothing is held."""
+
+
+async def text(url: str) -> str:
+    """What is there."""
+    async with aiohttp.ClientSession() as session, session.get(url) as answer:
+        assert answer.status == 200
+        return await answer.text()
+
+
+class Hands:
+    """A page's WebSocket, as a browser uses it."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self.socket = socket
+        self.heard: list[Any] = []
+
+    async def say(self, **message: object) -> None:
+        await self.socket.send_str(json.dumps(message))
+
+    async def drive(self, linear: float, angular: float = 0.0, late_ms: float = 0.0) -> None:
+        wish = {"linear_x": linear, "angular_z": angular}
+        await self.say(cmd=wish, stamp=time.time() * 1e3 - late_ms)
+
+    async def hold(self, linear: float, seconds: float, angular: float = 0.0) -> None:
+        """A finger on the stick, at 20 Hz."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            await self.drive(linear, angular)
+            await asyncio.sleep(0.05)
+
+    async def find(self, look: Callable[[Any], Any]) -> Any:
+        """The first message that it finds true."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                message = await self.socket.receive()
+                assert message.type == aiohttp.WSMsgType.TEXT, message
+                said = json.loads(message.data)
+                self.heard.append(said)
+                if look(said):
+                    return said
+
+    async def call(self, name: str, **payload: object) -> Any:
+        await self.say(call=name, id=name, payload=payload)
+        return await self.find(lambda said: said.get("answer") == name)
+
+    async def state(self, look: Callable[[Any], Any]) -> Any:
+        """The first state that it finds true."""
+        found = await self.find(lambda said: said.get("key") == "state" and look(said["value"]))
+        return found["value"]
+
+    async def until_driving(self, linear: float) -> None:
+        """Zeros until they count, then this speed until the robot has it."""
+        holding = asyncio.create_task(self.hold(0.0, 0.6))
+        await holding
+        holding = asyncio.create_task(self.hold(linear, PATIENCE_S))
+        try:
+            await self.state(lambda s: abs(s["linear"] - linear) < 0.25 * abs(linear))
+        finally:
+            holding.cancel()
+
+
+@asynccontextmanager
+async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]:
+    """Connected: at the machine, or from elsewhere with a token."""
+    session = page.client(token) if token else aiohttp.ClientSession()
+    place = page.away if token else page.here
+    async with session, session.ws_connect(f"{place}/ws", **how) as opened:
+        yield Hands(opened)
+
+
+def run(story: Callable[[], Awaitable[None]], within: float = 3 * PATIENCE_S) -> None:
+    """What happens, with a deadline."""
+    asyncio.run(_within(story, within))
+
+
+async def _within(story: Callable[[], Awaitable[None]], within: float) -> None:
+    async with asyncio.timeout(within):
+        await story()

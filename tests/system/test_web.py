@@ -1,0 +1,276 @@
+"""The robot's page: who comes sees, drives and stops, and who goes drives no more."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import re
+import select
+import signal
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from tests.system.browser import Page, hands, run, text
+from tests.system.harness import (
+    PATIENCE_S,
+    ROOT,
+    START_S,
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    children,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+    write_config,
+)
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    where = tmp_path_factory.mktemp("daemon")
+    with Daemon(where, config={"record": {"directory": str(where / "record")}}) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with Page(daemon, tmp_path_factory.mktemp("page")) as page:
+        yield page
+
+
+@pytest.fixture
+def bus(daemon: Daemon) -> Iterator[Bus]:
+    """The robot stands and may be driven."""
+    with Bus(daemon.endpoint) as bus:
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus
+
+
+def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            hello = (await ours.find(lambda said: "hello" in said))["hello"]
+            assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
+            assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
+            assert hello["simulated"] is True
+            assert "path" in await ours.find(lambda said: "path" in said)
+            await ours.say(ping=12.5)
+            assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5
+            await ours.say(subscribe="odom", rate=50)
+            odom = await ours.find(lambda said: said.get("key") == "odom")
+            assert odom["value"]["child_frame_id"] == "base_link"
+            assert 0 <= odom["age"] < 1000 * PATIENCE_S
+            await ours.say(subscribe="fleet")
+            await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
+
+    run(story)
+
+
+def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
+    page: Page, bus: Bus
+) -> None:
+    commands: list[Any] = []
+
+    async def story() -> None:
+        with bus.follow("cmd/teleop") as heard:
+            async with hands(page) as ours:
+                await ours.say(subscribe="state", rate=50)
+                await ours.until_driving(0.3)
+            bus.at_rest()
+            commands.extend(seen.value for seen in heard.seen)
+
+    run(story)
+    assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
+    assert commands[-1]["linear"]["x"] == 0
+
+
+def test_nobody_obeys_a_stamp_twice_or_one_from_before(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            await ours.drive(0.0)
+            before = bus.at_rest()
+            for _ in range(100):
+                await ours.drive(0.5, late_ms=5000.0)
+            refused = await ours.find(lambda said: said.get("refused") == "cmd")
+            assert "stamp" in refused["reason"]
+            await asyncio.sleep(0.3)
+            after = bus.state()
+            assert after["counters"]["commands"] == before["counters"]["commands"]
+            assert abs(after["x"] - before["x"]) < 0.005
+
+    run(story)
+    assert page.refused()["replayed"] >= 100
+
+
+def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            for n in range(450):
+                await ours.say(ping=n)
+            assert (await ours.call("stop"))["ok"]
+
+    run(story)
+    assert bus.state()["mode"] == "stopped"
+
+
+def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/state") as answer:
+                assert (await answer.json())["mode"] == "ready"
+            async with session.post("/api/srv/stop") as answer:
+                assert (answer.status, (await answer.json())["success"]) == (200, True)
+            async with session.post("/api/srv/clear") as answer:
+                assert answer.status == 200
+            wish = {"settings": {"limits.linear_speed": 99.0}}
+            async with session.post("/api/srv/set", json=wish) as answer:
+                assert (answer.status, (await answer.json())["success"]) == (409, False)
+            async with session.get("/api") as answer:
+                assert (await answer.json())["openapi"] == "3.1.0"
+                for name in ("Content-Security-Policy", "X-Content-Type-Options"):
+                    assert answer.headers[name]
+
+    run(story)
+
+
+def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/recordings") as answer:
+                rows = await answer.json()
+            (name,) = [row["name"] for row in rows]
+            async with session.get(f"/api/recordings/{name}") as answer:
+                assert (await answer.read()).startswith(b"\x89MCAP")
+
+    run(story)
+
+
+def test_the_page_killed_while_it_drives_costs_the_drive_and_nothing_else(
+    daemon: Daemon, bus: Bus, tmp_path: Path
+) -> None:
+    with Page(daemon, tmp_path) as page:
+
+        async def story() -> None:
+            async with hands(page) as ours:
+                await ours.say(subscribe="state", rate=50)
+                await ours.until_driving(0.3)
+                page.signal(signal.SIGKILL)
+
+        run(story)
+    state = bus.at_rest()
+    assert state["mode"] == "ready"
+
+
+def test_what_lay_in_a_frozen_server_moves_nothing_when_it_goes_on(page: Page, bus: Bus) -> None:
+    """Its commands have the stamps of when they were meant: they are old, and nobody's any more."""
+
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            page.signal(signal.SIGSTOP)
+            try:
+                await ours.hold(0.3, 1.0)
+                await asyncio.sleep(0.5)  # longer than any command counts
+                before = bus.at_rest()
+            finally:
+                page.signal(signal.SIGCONT)
+            await ours.say(ping=3)
+            await ours.find(lambda said: said.get("pong") == 3)
+            after = bus.state()
+            assert abs(after["x"] - before["x"]) < 0.005
+            assert after["counters"]["commands"] == before["counters"]["commands"]
+
+    run(story)
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_drives_as_pasted(page: Page, bus: Bus) -> None:
+    text = (ROOT / "deploy/web/README.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.S | re.M)
+    assert "http://127.0.0.1:8080" in code
+    before = bus.state()["x"]
+    code = code.replace("http://127.0.0.1:8080", page.here)
+    done = finish([sys.executable, "-c", code], ROOT)
+    assert (done.code, done.err) == (0, "")
+    assert "driving" in done.out
+    assert bus.at_rest()["x"] > before + 0.2
+
+
+class Terminal(Program):
+    """`acsard run` in the foreground of a terminal."""
+
+    def __init__(self, where: Path, *words: str) -> None:
+        self.endpoint = free_endpoint()
+        self.master, self._slave = pty.openpty()
+        run = acsard("run", "--listen", self.endpoint, *words)
+        super().__init__(run, where, environment(), stdout=self._slave, stderr=self._slave)
+        self.seen = ""
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        os.close(self._slave)
+        os.close(self.master)
+
+    def shows(self, pattern: str) -> re.Match[str]:
+        """Waits for it on the screen."""
+
+        def look() -> re.Match[str] | None:
+            while select.select([self.master], [], [], 0.0)[0]:
+                self.seen += os.read(self.master, 4096).decode(errors="replace")
+            return re.search(pattern, self.seen)
+
+        return until(look, START_S, f"{pattern} on the screen: {self.seen}")
+
+    def page(self) -> list[int]:
+        """The processes of its page."""
+        return children(self.pid, "acsard web")
+
+
+@pytest.mark.slow
+def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_ends(
+    tmp_path: Path,
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        config = write_config(
+            tmp_path / "a.toml", {"web": {"address": [f"http://127.0.0.1:{port}"]}}
+        )
+        with Terminal(tmp_path, "--config", str(config)) as daemon:
+            url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
+            assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
+            (first,) = daemon.page()
+            with Bus(daemon.endpoint) as bus:
+                before = bus.get("info")
+                os.kill(first, signal.SIGKILL)
+                daemon.shows("page_ended")
+                (second,) = until(daemon.page, START_S, "another page")
+                assert second != first
+                assert bus.get("info") == before
+            daemon.signal(signal.SIGKILL)
+            until(lambda: not Path(f"/proc/{second}").exists(), START_S, "the page ends too")
+
+
+@pytest.mark.slow
+def test_a_daemon_that_nobody_looks_at_or_that_may_not_serves_no_page(tmp_path: Path) -> None:
+    config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
+    with Terminal(tmp_path, "--config", str(config)) as told, Daemon(tmp_path) as piped:
+        told.shows("link_up")
+        until(lambda: "link_up" in piped.stderr, START_S, "link up")
+        assert told.page() == []
+        assert children(piped.pid, "acsard web") == []

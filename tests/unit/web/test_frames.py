@@ -1,0 +1,86 @@
+"""What a page says is one frame, or refused whole with a reason."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.web.frames import Call, Command, FrameError, Ping, Subscribe, Unsubscribe, Wish, decode
+
+COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4}
+
+
+def test_each_kind_is_told_by_its_field() -> None:
+    assert decode(json.dumps(COMMAND)) == Command(Wish(0.2, -0.1), 1763700000123.4)
+    assert decode('{"subscribe": "odom"}') == Subscribe("odom", 10.0)
+    assert decode('{"unsubscribe": "odom", "robot": "b"}') == Unsubscribe("odom", "b")
+    assert decode('{"call": "stop", "id": 7}') == Call("stop", 7)
+    assert decode('{"call": "set", "payload": {"a": 1}, "id": "x"}') == Call("set", "x", {"a": 1})
+    assert decode('{"ping": 12.5}') == Ping(12.5)
+
+
+def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
+    frame = decode(json.dumps(COMMAND))
+    assert isinstance(frame, Command)
+    assert abs(frame.stamp_ns - 1763700000123_400000) < 1000
+
+
+def test_a_command_of_two_zeros_moves_nothing() -> None:
+    still = decode('{"cmd": {"linear_x": 0, "angular_z": 0}, "stamp": 1}')
+    turn = decode('{"cmd": {"linear_x": 0, "angular_z": 0.1}, "stamp": 1}')
+    assert isinstance(still, Command)
+    assert isinstance(turn, Command)
+    assert (still.moves, turn.moves) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "about"),
+    [
+        ("", "message"),
+        ("[]", "message"),
+        ("{}", "message"),
+        ('"stop"', "message"),
+        ('{"go": 1}', "message"),
+        ('{"ping": 1, "call": "stop"}', "message"),
+        ('{"cmd": {"linear_x": 0.2}, "stamp": 1}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0, "linear_y": 1}, "stamp": 1}', "cmd"),
+        ('{"cmd": {"linear_x": NaN, "angular_z": 0}, "stamp": 1}', "message"),
+        ('{"cmd": {"linear_x": 1e999, "angular_z": 0}, "stamp": 1}', "cmd"),
+        ('{"cmd": {"linear_x": "0.2", "angular_z": 0}, "stamp": 1}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 0}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": -5}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 1e300}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 1, "sender": "you"}', "cmd"),
+        ('{"subscribe": "odom", "rate": 0}', "subscribe"),
+        ('{"subscribe": "odom", "rate": 51}', "subscribe"),
+        ('{"subscribe": 1}', "subscribe"),
+        ('{"call": "stop", "payload": []}', "call"),
+        ("[" * 5000 + "]" * 5000, "message"),
+    ],
+)
+def test_what_is_none_is_refused_and_says_what_it_was_meant_for(text: str, about: str) -> None:
+    with pytest.raises(FrameError) as caught:
+        decode(text)
+    assert caught.value.about == about
+    assert str(caught.value)
+
+
+@given(st.text())
+def test_no_text_raises_anything_else(text: str) -> None:
+    try:
+        decode(text)
+    except FrameError:
+        pass
+
+
+@given(st.integers(0, len(json.dumps(COMMAND)) - 1), st.characters())
+def test_no_damaged_command_raises_anything_else(at: int, char: str) -> None:
+    text = json.dumps(COMMAND)
+    try:
+        decode(text[:at] + char + text[at + 1 :])
+    except FrameError:
+        pass

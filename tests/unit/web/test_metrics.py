@@ -1,0 +1,69 @@
+"""What Prometheus reads, read as its text format says."""
+
+from __future__ import annotations
+
+import re
+
+from acsard.messages.schema import Figure, RobotState, Spread, Time
+from acsard.web.metrics import text
+
+LINE = re.compile(r"([a-z_]+)\{(.*)\} (\S+)\Z")
+LABEL = re.compile(r'([a-z_]+)="((?:[^"\\\n]|\\["\\n])*)"(?:,|\Z)')
+
+SPREAD = Spread(10, 5.0, 20.0, 80.0)
+
+STATE = RobotState(
+    Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
+    [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {"lines": 7, "missed_periods": 2},
+    figures={"period_lateness": Figure(SPREAD, SPREAD)},
+)  # fmt: skip
+
+
+def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+    """Samples by name and labels; fails for what is not the format."""
+    found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
+    kinds: dict[str, str] = {}
+    for line in told.removesuffix("\n").split("\n"):
+        if line.startswith("# TYPE "):
+            _, _, name, kind = line.split(" ")
+            assert name not in kinds
+            assert kind in ("gauge", "counter")
+            kinds[name] = kind
+            continue
+        if line.startswith("# HELP "):
+            continue
+        match = LINE.match(line)
+        assert match, line
+        assert match[1] in kinds, line
+        assert (kinds[match[1]] == "counter") == match[1].endswith("_total")
+        labels = frozenset(LABEL.findall(match[2]))
+        assert LABEL.sub("", match[2]) == "", line
+        assert (match[1], labels) not in found
+        found[match[1], labels] = float(match[3])
+    return found
+
+
+def test_what_the_robot_says_is_there_with_its_labels() -> None:
+    got = parsed(text("acsar", STATE, True, 3, {"commands": 4}, {"host": 5}))
+    own = ("robot", "acsar")
+    assert got["acsard_up", frozenset({own})] == 1
+    assert got["acsard_mode", frozenset({own, ("mode", "driving")})] == 1
+    assert got["acsard_mode", frozenset({own, ("mode", "stopped")})] == 0
+    assert got["acsard_linear_speed_mps", frozenset({own})] == 0.25
+    assert got["acsard_robot_total", frozenset({own, ("what", "missed_periods")})] == 2
+    late = frozenset({own, ("figure", "period_lateness"), ("at", "p99")})
+    assert abs(got["acsard_figure_seconds", late] - 20e-6) < 1e-12
+    assert got["acsard_page_viewers", frozenset({own})] == 3
+    assert got["acsard_page_total", frozenset({own, ("what", "commands")})] == 4
+    assert got["acsard_page_refused_total", frozenset({own, ("reason", "host")})] == 5
+
+
+def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
+    got = parsed(text("acsar", STATE, False, 0, {}, {}))
+    assert got["acsard_up", frozenset({("robot", "acsar")})] == 0
+    assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
+
+
+def test_words_of_a_stranger_stay_within_their_label() -> None:
+    got = parsed(text("acsar", None, False, 0, {'a"b\\c\nd': 1}, {}))
+    assert len([name for name, _ in got if name == "acsard_page_total"]) == 1

@@ -1,0 +1,104 @@
+"""Who is at the machine, who comes by a name of the robot's, and whose page asks."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.web.who import MAINTAINER, Asked, Refusal, Who, foreign, host_name, is_loopback, place
+
+NAMES = frozenset({"robot.local", "192.168.1.7"})
+
+
+@pytest.mark.parametrize(
+    ("peer", "host"),
+    [
+        ("127.0.0.1", "localhost:8080"),
+        ("127.0.0.1", "127.0.0.1:8080"),
+        ("127.8.8.8", "LOCALHOST"),
+        ("::1", "[::1]:8080"),
+        ("::ffff:127.0.0.1", "127.0.0.1"),
+    ],
+)
+def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
+    assert place(Asked(peer, False, host), NAMES) == "here"
+    assert place(Asked(peer, True, host), NAMES) == "here"
+
+
+@pytest.mark.parametrize(
+    ("asked", "reason"),
+    [
+        # a name of somebody's that he points at 127.0.0.1
+        (Asked("127.0.0.1", False, "evil.example:8080"), "host"),
+        (Asked("127.0.0.1", False, ""), "host"),
+        (Asked("127.0.0.1", False, "localhost.evil.example"), "host"),
+        (Asked("127.0.0.1", False, "robot.local"), "host"),
+        (Asked("192.168.1.50", False, "robot.local"), "plain"),
+        (Asked("192.168.1.50", False, "localhost"), "plain"),
+        (Asked("192.168.1.50", True, "localhost"), "host"),
+        (Asked("192.168.1.50", True, "127.0.0.1"), "host"),
+        (Asked("192.168.1.50", True, "evil.example"), "host"),
+        (Asked("", True, ""), "host"),
+    ],
+)
+def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
+    found = place(asked, NAMES)
+    assert isinstance(found, Refusal)
+    assert found.reason == reason
+
+
+@pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
+def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
+    assert place(Asked("192.168.1.50", True, host), NAMES) == "away"
+    # also at the machine, by the name that others use: with a token as they
+    assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
+
+
+@pytest.mark.parametrize(
+    ("secure", "host", "origin", "site"),
+    [
+        (False, "localhost:8080", "http://localhost:8080", None),
+        (False, "localhost:8080", "http://localhost:8080", "same-origin"),
+        (True, "robot.local", "https://Robot.local", None),
+        (False, "localhost:8080", None, None),  # a program
+        (False, "localhost:8080", None, "none"),  # typed into the address bar
+    ],
+)
+def test_our_own_page_and_programs_may(
+    secure: bool, host: str, origin: str | None, site: str | None
+) -> None:
+    assert foreign(Asked("127.0.0.1", secure, host, origin, site)) is None
+
+
+@pytest.mark.parametrize(
+    ("origin", "site"),
+    [
+        ("http://evil.example", None),
+        ("https://localhost:8080", None),
+        ("http://localhost:8081", None),
+        ("http://localhost", None),
+        ("null", None),
+        ("", None),
+        (None, "cross-site"),
+        (None, "same-site"),
+    ],
+)
+def test_another_page_may_not(origin: str | None, site: str | None) -> None:
+    found = foreign(Asked("127.0.0.1", False, "localhost:8080", origin, site))
+    assert found is not None
+    assert found.reason == "origin"
+
+
+def test_a_role_may_what_those_below_it_may() -> None:
+    viewer, operator = Who("viewer", "tv"), Who("operator", "phone")
+    assert [viewer.may("viewer"), viewer.may("operator")] == [True, False]
+    assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
+    assert MAINTAINER.may("maintainer")
+
+
+def test_names_are_told_from_ports_and_loopback_from_names() -> None:
+    assert [host_name(h) for h in ("A:1", "[::1]:2", "1.2.3.4", "[fe80::1")] == [
+        "a", "::1", "1.2.3.4", "fe80::1",
+    ]  # fmt: skip
+    assert [is_loopback(a) for a in ("127.1.2.3", "::1", "localhost", "10.0.0.1", "")] == [
+        True, True, False, False, False,
+    ]  # fmt: skip
