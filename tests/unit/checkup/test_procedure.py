@@ -437,8 +437,8 @@ def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
                 self.mcu.reset(self.now_ns())
 
     checked = Checked(Restarts())
-    assert checked.failed == ["link"]
-    assert "restarts" in checked["link"].mend
+    assert checked.failed == ["restarts"]
+    assert "supply" in checked["restarts"].mend
 
 
 def test_an_echo_is_not_taken_for_a_robot() -> None:
