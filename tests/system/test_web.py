@@ -17,7 +17,6 @@ from typing import Any
 import aiohttp
 import pytest
 
-from tests.system.browser import Page, hands, run, text
 from tests.system.harness import (
     PATIENCE_S,
     ROOT,
@@ -33,6 +32,7 @@ from tests.system.harness import (
     until,
     write_config,
 )
+from tests.system.page_client import Page, hands, run, text
 
 
 @pytest.fixture(scope="module")
