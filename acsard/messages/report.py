@@ -6,6 +6,7 @@ Only what somebody listens to is built. All messages of one feedback line carry 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 
 from msgspec.structs import asdict
@@ -17,7 +18,9 @@ from acsard.messages.diagnostics import diagnostics
 from acsard.messages.expiry import expiry
 from acsard.messages.schema import (
     DiagnosticArray,
+    Events,
     Figure,
+    Happening,
     Header,
     JointState,
     Message,
@@ -49,6 +52,9 @@ from acsard.values import Twist as BodyTwist
 
 Look = Callable[[], Snapshot]
 
+LAST = 20
+"""Events that are kept: more than happens between two looks of who is slow."""
+
 
 class _Rate:
     """Lets something happen at most so often; 0 Hz means always."""
@@ -68,7 +74,7 @@ class _Rate:
 
 
 class Report:
-    """Builds messages from outputs; remembers only the last estimate and the last outputs."""
+    """Builds messages from outputs; remembers only the last of them, and the last events."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
@@ -79,6 +85,8 @@ class Report:
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
+        self._events: deque[Happening] = deque(maxlen=LAST)
+        self._happened = 0
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -95,9 +103,11 @@ class Report:
         One by one, feedback first: a `state` takes as long to build as ten of the others.
         """
         self._outputs = outputs
+        if outputs.events:
+            self._remember(outputs)
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
-        elif not (outputs.due or "state" in wanted or "diagnostics" in wanted):
+        elif not (outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted):
             return iter(())  # most steps of a robot that nobody watches closely
         return self._due(outputs, wanted, look)
 
@@ -117,6 +127,8 @@ class Report:
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
+        if outputs.events and "events" in wanted:
+            yield "events", self._last_events()
         for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
                 yield key, build(outputs, look())
@@ -139,6 +151,8 @@ class Report:
                 return self._state(outputs, look()) if outputs else None
             case "diagnostics":
                 return self._diagnostics(outputs, look()) if outputs else None
+            case "events":
+                return self._last_events() if self._events else None
             case _:
                 return None
 
@@ -217,6 +231,17 @@ class Report:
             sender=snapshot.sender,
             recording=snapshot.recording.trouble,
         )
+
+    def _remember(self, outputs: Outputs) -> None:
+        stamp = Time.from_ns(outputs.now.wall_ns)
+        self._events.extend(
+            Happening(stamp, one.name, one.level, one.text, one.by, one.count)
+            for one in outputs.events
+        )
+        self._happened += len(outputs.events)
+
+    def _last_events(self) -> Events:
+        return Events(self._events[-1].stamp, self._happened, list(self._events))
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
         """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""

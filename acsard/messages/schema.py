@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from acsard.drive.modes import Mode
 from acsard.mcu.link import State
 from acsard.messages.topics import Direction
-from acsard.values import NS_PER_S, GyroDoes, Plain
+from acsard.values import NS_PER_S, EventName, GyroDoes, Level, Plain
 
 # What `cdr.py` has to know: the width of an int in CDR, the length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -272,6 +272,29 @@ class DiagnosticArray(Message, frozen=True):
     status: list[DiagnosticStatus]
 
 
+class Happening(Message, frozen=True):
+    """An event as the log has it."""
+
+    stamp: Time
+    name: Annotated[str, one_of(get_args(EventName))]
+    level: Annotated[str, one_of(get_args(Level))]
+    text: str
+    by: str
+    """Who asked, sent or commands; empty when that is nobody."""
+    count: int
+    """How many times, since the last of this name."""
+
+
+class Events(Message, frozen=True):
+    """The last events, oldest first."""
+
+    stamp: Time
+    """When the last of them was."""
+    total: int
+    """How many there were since the start: who knows an earlier total knows which are new."""
+    events: list[Happening]
+
+
 class ServiceReply(Message, frozen=True):
     """Did the service do it, and what happened or what to do instead."""
 
@@ -362,6 +385,7 @@ MESSAGES: dict[str, type[Message]] = {
         RobotState,
         DoorState,
         DiagnosticArray,
+        Events,
         ServiceReply,
         SetPose,
         Settings,

@@ -89,6 +89,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
     Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
+    Topic("events", "out", "Events", "on change", "the last 20 events: what, when, by whom"),
     Topic(
         "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
     ),

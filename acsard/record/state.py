@@ -7,10 +7,12 @@ refused.
 
 from __future__ import annotations
 
+import copyreg
 import io
 import pickle
 from typing import Any, NamedTuple
 
+from acsard.drive.modes import Mode, Trigger
 from acsard.robot import Robot
 from acsard.values import AcsardError
 
@@ -20,6 +22,12 @@ ROOMS = ("acsard.values", "acsard.robot", "acsard.config.settings", "acsard.driv
 BESIDE = {("collections", "Counter"), ("collections", "deque")}
 
 PROTOCOL = 5
+
+TABLE = copyreg.dispatch_table | {
+    Mode: lambda mode: (Mode, (mode.value,)),
+    Trigger: lambda trigger: (Trigger, (trigger.value,)),
+}
+"""Python 3.11 before 3.11.4, Debian 12's own, writes members of an enum by `getattr`."""
 
 
 class StateError(AcsardError):
@@ -36,7 +44,11 @@ class State(NamedTuple):
 
 def freeze(robot: Robot, last: bytes) -> bytes:
     """The robot as it is now."""
-    return pickle.dumps((robot, last), PROTOCOL)
+    written = io.BytesIO()
+    pickler = pickle.Pickler(written, PROTOCOL)
+    pickler.dispatch_table = TABLE
+    pickler.dump((robot, last))
+    return written.getvalue()
 
 
 def thaw(data: bytes) -> State:

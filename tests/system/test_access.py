@@ -41,7 +41,7 @@ ANYBODY: Who = DRIVERS | {"viewer"}
 
 ME, OTHER = "acsard/acsar", "acsard/other"
 SOURCES = ("teleop", "app", "ros2_control", "nav")
-PLAIN = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics")
+PLAIN = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics", "events")
 VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 
 TWIST_JSON = json.dumps(ZERO).encode()
@@ -251,6 +251,11 @@ class Robot:
         """Some control periods later: whatever was sent before is long there."""
         self.comes(lambda: False)
 
+    def switched(self) -> None:
+        """Off and on, which are events."""
+        assert self.here.get("srv/deactivate")["success"]
+        assert self.here.get("srv/activate")["success"]
+
     def restored(self) -> None:
         """Released and switched on."""
         if self.here.state()["mode"] == "stopped":
@@ -387,6 +392,8 @@ class Visitor:
                 here.put("cmd/app", ZERO)
                 here.session.put("cmd_vel", CDR_TWIST)
                 here.session.put(RMW_CMD, CDR_TWIST, attachment=self._attachment(RMW_CMD))
+            if any(row.key.endswith("events") for row in rows):
+                self._robot.switched()
             done = self._robot.comes(came.is_set, self._patience(rows))
             for subscriber in subscribers:
                 subscriber.undeclare()

@@ -40,6 +40,7 @@ PUBLISHED = {
     "cmd_vel_out": "TwistStamped",
     "state": "RobotState",
     "diagnostics": "DiagnosticArray",
+    "events": "Events",
     "sim/pose": "PoseStamped",
 }
 SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set")
@@ -55,6 +56,7 @@ FIELDS = {
         "encoders", "doubt", "sender", "recording",
     },
     "diagnostics": {"header", "status"},
+    "events": {"stamp", "total", "events"},
     "sim/pose": {"header", "pose"},
 }  # fmt: skip
 
@@ -378,6 +380,8 @@ def test_every_published_key_names_its_encoding(bus: Bus) -> None:
         if key == "tf_static":
             continue  # sent every 5 s: below, when it comes
         with bus.follow(key) as messages:
+            if key == "events":
+                bus.get("srv/reset_odometry")
             seen = messages.find(lambda _: True, 3.0, key)
         assert seen.encoding == f"application/msgpack;acsard.{type_name}.v1"
         assert set(seen.value) == FIELDS[key]
@@ -386,9 +390,24 @@ def test_every_published_key_names_its_encoding(bus: Bus) -> None:
 @pytest.mark.parametrize("key", [key for key in PUBLISHED if key != "tf_static"])
 def test_every_published_key_is_there_in_json_with_the_same_fields(bus: Bus, key: str) -> None:
     with bus.follow(f"json/{key}") as messages:
+        if key == "events":
+            bus.get("srv/reset_odometry")
         seen = messages.find(lambda _: True, 3.0, f"json/{key}")
     assert seen.encoding == f"application/json;acsard.{PUBLISHED[key]}.v1"
     assert set(seen.value) == FIELDS[key]
+
+
+def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus: Bus) -> None:
+    before = bus.get("events")
+    with bus.follow("events") as messages:
+        bus.get("srv/reset_odometry")
+        seen = messages.find(lambda one: one["total"] > before["total"], 3.0, "news")
+    last = seen.value["events"][-1]
+    assert (last["name"], last["level"], last["count"]) == ("reset_odometry", "info", 1)
+    assert "x 0, y 0" in last["text"]
+    assert last["by"]
+    assert seconds(last["stamp"]) == seconds(seen.value["stamp"]) >= seconds(before["stamp"])
+    assert len(seen.value["events"]) <= 20
 
 
 def test_in_json_each_message_is_the_one_on_the_plain_key(bus: Bus) -> None:

@@ -98,7 +98,12 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
     """The first leg moves."""
     asks(terminal, program, STARTS, 1, 10.0)
     terminal.press("\n")
-    until(lambda: bus.state()["linear"] > 0.25, 10.0, "the first leg moves")
+
+    def moves() -> bool:
+        assert program.process.poll() is None, terminal.screen
+        return bool(bus.state()["linear"] > 0.25)
+
+    until(moves, 10.0, "the first leg moves")
     assert bus.state()["source"] == "app"
 
 

@@ -363,6 +363,9 @@ class Visitor:
 
         subscribers = [self._subscribed(row, on_sample) for row in rows]
         self._behind()
+        if any(row.key.endswith("events") for row in rows):
+            for verb in ("deactivate", "activate"):  # which are events
+                assert self._fleet.robots[0].get(f"srv/{verb}")["success"]
         # What was before is said again every 5 s, for those who cannot ask for it.
         mine = [row for row in rows if self._name in row.who]
         late = any(row.how == "late" for row in mine)

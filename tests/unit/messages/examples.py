@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from acsard.values import (
     Estimate,
+    Event,
     Instant,
     Measured,
     Outputs,
@@ -48,6 +49,7 @@ OUTPUTS = Outputs(
     source="app",
     command_ns=103_990_000_000,
     status_changed=False,
+    events=(Event("stop", "stopped", by="phone"),),
 )
 
 SNAPSHOT = Snapshot(

@@ -28,7 +28,9 @@ from acsard.messages.report import Report, from_rpy, from_yaw
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
+    Events,
     Figure,
+    Happening,
     JointState,
     Message,
     Odometry,
@@ -44,6 +46,7 @@ from acsard.messages.schema import (
 from acsard.messages.topics import PUBLISHED
 from acsard.values import (
     Estimate,
+    Event,
     GyroDoes,
     GyroStatus,
     Instant,
@@ -410,13 +413,31 @@ def test_feedback_is_out_before_the_summary_is_built() -> None:
 
 def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
     wanted = ALL - {"state", "diagnostics"}
-    assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 4
+    assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 5
 
 
 def test_nobody_looks_at_the_robot_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), ALL, look))
     assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
+
+
+def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> None:
+    report = Report(CONFIG, START)
+    assert report.current("events", look) is None
+    many = tuple(Event("commander", f"the {n}. takes over", by="app", count=2) for n in range(25))
+    assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), look))
+    assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, look))
+    quiet = replace(OUTPUTS, now=later(7), due=False, estimates=())
+    ((key, told),) = report.due(quiet, {"events"}, never)
+    assert isinstance(told, Events)
+    assert (key, told.total, len(told.events)) == ("events", 26, 20)
+    assert told.events[0].text == "the 6. takes over"
+    assert told.events[0].count == 2
+    assert told.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
+    assert told.events[-1] == Happening(told.stamp, "stop", "info", "stopped", "phone", 1)
+    assert told.stamp == Time.from_ns(quiet.now.wall_ns)
+    assert report.current("events", never) == told
 
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:
@@ -427,7 +448,8 @@ def test_every_sample_of_a_step_is_published_in_order() -> None:
 
 
 def test_a_step_without_feedback_publishes_no_odometry() -> None:
-    assert set(published(replace(OUTPUTS, estimates=()))) == {"cmd_vel_out", "state", "diagnostics"}
+    left = {"cmd_vel_out", "events", "state", "diagnostics"}
+    assert set(published(replace(OUTPUTS, estimates=()))) == left
 
 
 def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:

@@ -29,6 +29,7 @@ PROMISED = [
     ("cmd_vel_out", "out", "TwistStamped"),
     ("state", "out", "RobotState"),
     ("diagnostics", "out", "DiagnosticArray"),
+    ("events", "out", "Events"),
     ("sim/pose", "out", "PoseStamped"),
     ("json/<key>", "out", "JSON"),
     ("cmd/<source>", "in", "Twist or TwistStamped"),

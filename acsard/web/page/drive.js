@@ -1,0 +1,154 @@
+// Stick, keys and gamepad -> one hand. Whatever takes the finger or the eye away lets go.
+
+import { Hand, twist } from "./hand.js";
+
+export const SOURCE = "teleop";
+const LOOK = 10;
+const KEYS = {
+  ArrowUp: [0, 1], KeyW: [0, 1], ArrowDown: [0, -1], KeyS: [0, -1],
+  ArrowLeft: [-1, 0], KeyA: [-1, 0], ArrowRight: [1, 0], KeyD: [1, 0],
+};
+const SHOULDERS = [4, 5, 6, 7];
+
+export class Drive {
+  #hand = new Hand();
+  #link;
+  #told;
+  #timer = null;
+  #by = null; // "stick", "keys" or "pad": who pressed is who lets go
+  #push = [0, 0];
+  #pressed = new Set();
+  #pointer = null;
+  #padHeld = false;
+  state = null;
+  heard = -Infinity; // when that was true, by performance.now()
+  sender = "";
+  limits = { linear: 0, angular: 0 };
+  limit = 0.2;
+  allowed = false;
+  shown = true; // the view with the stick
+
+  constructor(link, stick, knob, told) {
+    this.#link = link;
+    this.#told = told;
+    this.stick = stick;
+    this.knob = knob;
+    this.#listen();
+  }
+
+  get held() {
+    return this.#hand.held;
+  }
+
+  /** Let go, whoever holds; `why` is said. */
+  release(why = "") {
+    this.#by = this.#pointer = null;
+    this.#pressed.clear();
+    this.#show(0, 0);
+    const zero = this.#hand.release();
+    if (!zero) return;
+    this.#send(zero);
+    this.#end(why);
+  }
+
+  #press(by) {
+    if (!this.allowed || !this.shown || this.#hand.held) return;
+    this.#by = by;
+    this.#told("");
+    this.#hand.press(performance.now());
+    this.stick.classList.add("held");
+    this.#timer = setInterval(() => this.#look(), LOOK);
+    this.#look();
+  }
+
+  #look() {
+    this.#hand.wish(...twist(...this.#push, this.limit, this.limits));
+    const { send, ended } = this.#hand.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
+    if (send) this.#send(send);
+    if (ended === undefined) return;
+    this.#by = this.#pointer = null;
+    this.#pressed.clear();
+    this.#show(0, 0);
+    this.#end(ended);
+  }
+
+  #end(why) {
+    clearInterval(this.#timer);
+    this.#timer = null;
+    this.stick.classList.remove("held");
+    this.#told(why);
+  }
+
+  #send(cmd) {
+    this.#link.send({ cmd, stamp: performance.timeOrigin + performance.now() });
+  }
+
+  #show(x, y) {
+    this.#push = [x, y];
+    const far = Math.max(1, Math.hypot(x, y));
+    this.knob.style.transform = `translate(${(x / far) * 97}%, ${(-y / far) * 97}%)`;
+  }
+
+  #listen() {
+    const stick = this.stick;
+    stick.addEventListener("pointerdown", (event) => this.#down(event));
+    stick.addEventListener("pointermove", (event) => event.pointerId === this.#pointer && this.#move(event));
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"])
+      stick.addEventListener(name, (event) => event.pointerId === this.#pointer && this.release());
+    stick.addEventListener("contextmenu", (event) => event.preventDefault());
+    addEventListener("keydown", (event) => this.#key(event, true));
+    addEventListener("keyup", (event) => this.#key(event, false));
+    addEventListener("blur", () => this.release("let go: the window lost the focus"));
+    addEventListener("pagehide", () => this.release());
+    document.addEventListener("freeze", () => this.release());
+    document.addEventListener("visibilitychange", () => document.hidden && this.release("let go: the page was hidden"));
+    addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("let go: the gamepad is gone"));
+    setInterval(() => this.#pad(), 50);
+  }
+
+  #down(event) {
+    if (event.button !== 0) return;
+    event.preventDefault();
+    if (this.#pointer !== null) return this.release("let go: one finger drives");
+    if (this.#by) return;
+    this.#pointer = event.pointerId;
+    this.stick.setPointerCapture(event.pointerId);
+    this.#move(event);
+    this.#press("stick");
+    if (!this.#hand.held) this.release();
+  }
+
+  #move(event) {
+    const box = this.stick.getBoundingClientRect();
+    const half = (box.width / 2) * 0.66;
+    this.#show((event.clientX - box.left - box.width / 2) / half, -(event.clientY - box.top - box.height / 2) / half);
+  }
+
+  #key(event, down) {
+    const typing = event.target.closest?.("input:not([type=range]), select, textarea");
+    if (!(event.code in KEYS) || typing || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.target.matches?.("input[type=range]")) return; // arrows set the slider
+    if (!this.shown) return;
+    event.preventDefault();
+    if (event.repeat) return;
+    if (down) this.#pressed.add(event.code);
+    else this.#pressed.delete(event.code);
+    if (this.#by && this.#by !== "keys") return;
+    const sum = [...this.#pressed].reduce(([x, y], code) => [x + KEYS[code][0], y + KEYS[code][1]], [0, 0]);
+    if (!this.#pressed.size) return this.release();
+    this.#show(...sum.map(Math.sign));
+    if (down) this.#press("keys");
+  }
+
+  #pad() {
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected);
+    const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
+    if (held && this.#by === "pad") this.#show(pad.axes[2] || pad.axes[0] || 0, -(pad.axes[1] || 0));
+    if (held && !this.#padHeld && !this.#by) {
+      this.#show(0, 0);
+      this.#press("pad");
+    }
+    if (!held && this.#by === "pad") this.release();
+    this.#padHeld = held;
+  }
+}

@@ -1,0 +1,109 @@
+// The WebSocket: opens again by itself, measures the way there and back, and says how old is what
+// is shown.
+
+const AGAIN = [300, 600, 1200, 2500, 5000];
+const SILENT = 3000; // without an answer for so long the way is cut, whatever the socket says
+
+export class Link extends EventTarget {
+  #socket = null;
+  #tries = 0;
+  #wanted = new Map();
+  #answers = new Map();
+  #number = 0;
+  #heard = 0;
+  open = false;
+  way = null; // there and back, ms
+
+  start() {
+    this.#connect();
+    setInterval(() => this.#ping(), 1000);
+    document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
+  }
+
+  /** Follow a key at most `rate` times a second, also after a new connection. */
+  subscribe(key, rate) {
+    this.#wanted.set(key, rate);
+    this.send({ subscribe: key, rate });
+  }
+
+  unsubscribe(key) {
+    if (this.#wanted.delete(key)) this.send({ unsubscribe: key });
+  }
+
+  /** True when it was handed on: nothing is kept for later, and nothing is added to a jam. */
+  send(message) {
+    if (!this.open || this.#socket.bufferedAmount > 4096) return false;
+    this.#socket.send(JSON.stringify(message));
+    return true;
+  }
+
+  /** Ask for a service; the answer, or why there is none. */
+  call(verb, payload) {
+    const id = ++this.#number;
+    return new Promise((done) => {
+      const given = setTimeout(() => this.#answer({ answer: id, ok: false, text: "no answer within 3 s" }), 3000);
+      this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
+      const message = payload === undefined ? { call: verb, id } : { call: verb, payload, id };
+      // Not by `send`: a stop goes whatever waits before it.
+      if (this.open) this.#socket.send(JSON.stringify(message));
+      else this.#answer({ answer: id, ok: false, text: "no connection to the robot" });
+    });
+  }
+
+  #connect() {
+    if (this.#socket && this.#socket.readyState <= 1) return;
+    const socket = new WebSocket(new URL("ws", location.href.replace(/^http/, "ws").replace(/#.*/, "")));
+    this.#socket = socket;
+    socket.onopen = () => {
+      this.open = true;
+      this.#tries = 0;
+      this.#heard = performance.now();
+      for (const [key, rate] of this.#wanted) this.send({ subscribe: key, rate });
+      this.#tell("up", {});
+      this.#ping();
+    };
+    socket.onmessage = (event) => this.#take(JSON.parse(event.data));
+    socket.onclose = (event) => {
+      if (this.#socket !== socket) return;
+      this.open = false;
+      this.way = null;
+      this.#tell("down", { reason: event.reason });
+      if (document.hidden) return; // again when somebody looks
+      setTimeout(() => this.#connect(), AGAIN[Math.min(this.#tries++, AGAIN.length - 1)]);
+    };
+  }
+
+  #take(message) {
+    this.#heard = performance.now();
+    if ("pong" in message) this.way = performance.now() - message.pong;
+    else if ("answer" in message) this.#answer(message);
+    else if ("key" in message) this.#tell(`key:${message.key}`, message);
+    else for (const kind of ["hello", "path", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
+  }
+
+  #answer(message) {
+    this.#answers.get(message.answer)?.(message);
+    this.#answers.delete(message.answer);
+  }
+
+  #ping() {
+    if (!this.open) return;
+    if (performance.now() - this.#heard > SILENT) {
+      // A close needs an answer too, which a cut way does not give.
+      const socket = this.#socket;
+      this.#socket = null;
+      socket.onclose = null;
+      socket.close();
+      this.open = false;
+      this.way = null;
+      this.#tell("down", { reason: "no answer" });
+      this.#connect();
+      return;
+    }
+    this.send({ ping: performance.now() });
+  }
+
+  #tell(kind, detail) {
+    this.dispatchEvent(new CustomEvent(kind, { detail }));
+  }
+}

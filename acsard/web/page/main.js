@@ -1,0 +1,211 @@
+// The page: one link, one hand, and the views.
+
+import { Drive, SOURCE } from "./drive.js";
+import { objection } from "./hand.js";
+import { Link } from "./link.js";
+import { PathMap } from "./map.js";
+import { Plot } from "./plot.js";
+import { Settings } from "./settings.js";
+import * as views from "./views.js";
+import { said as words, signed, yaw } from "./words.js";
+
+const $ = (id) => document.getElementById(id);
+const VIEWS = ["drive", "status", "events", "set", "robots"];
+const LATCHED = ["stopped", "fault"];
+
+const link = new Link();
+const map = new PathMap($("map"));
+const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const settings = new Settings($("settings"), set);
+const plots = {
+  speed: new Plot($("plot-speed"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.1, high: 0.3 }),
+  turn: new Plot($("plot-turn"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.3, high: 0.3 }),
+  wheels: new Plot($("plot-wheels"), ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` })), { low: -1, high: 3 }),
+  late: new Plot($("plot-late"), [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }], { low: 0, high: 1 }),
+};
+let view = "drive";
+let state = null;
+let heard = -Infinity; // when what `state` says was true, by performance.now()
+let hello = null;
+let wished = null;
+
+function open(name) {
+  view = VIEWS.includes(name) ? name : "drive";
+  for (const one of VIEWS) {
+    $(one).hidden = one !== view;
+    $(`tab-${one}`).setAttribute("aria-selected", String(one === view));
+    $(`tab-${one}`).tabIndex = one === view ? 0 : -1;
+  }
+  drive.shown = view === "drive";
+  if (!drive.shown) drive.release();
+  followed("diagnostics", 1, view === "status");
+  followed("fleet", 2, view === "robots");
+  if (view === "events") listed();
+  if (view === "set") configured();
+  map.redraw();
+}
+
+function followed(key, rate, wanted) {
+  if (wanted) link.subscribe(key, rate);
+  else link.unsubscribe(key);
+}
+
+async function stop() {
+  drive.release();
+  const told = await link.call("stop");
+  if (!told.ok) views.text("told", `STOP: ${told.text}`);
+}
+
+async function asked(verb) {
+  const told = await link.call(verb);
+  views.text("told", told.ok ? "" : words(told.text));
+  said(told);
+}
+
+async function set(payload) {
+  said(await link.call("set", payload));
+  configured();
+}
+
+function said(told) {
+  $("set-told").classList.toggle("error", !told.ok);
+  views.text("set-told", words(told.text));
+}
+
+async function got(path) {
+  try {
+    const answer = await fetch(path);
+    return answer.ok ? await answer.json() : null;
+  } catch {
+    return null; // no connection: the age says so
+  }
+}
+
+async function listed() {
+  const files = await got("api/recordings");
+  views.recordings($("recordings"), $("no-recordings"), files ?? []);
+}
+
+async function configured() {
+  settings.show((await got("api/settings")) ?? [], hello?.role === "maintainer");
+}
+
+function limited() {
+  drive.limit = Number($("limit").value);
+  $("most").textContent = `${drive.limit.toFixed(2)} m/s`;
+}
+
+function looked() {
+  const old = link.open ? performance.now() - heard : Infinity;
+  views.freshness(old, link.way);
+  if (old > 1000) drive.release("let go: nothing is heard of the robot");
+  if (view !== "status" || document.hidden) return;
+  for (const plot of Object.values(plots)) plot.draw(performance.now());
+}
+
+function stated({ detail }) {
+  state = drive.state = detail.value;
+  heard = drive.heard = performance.now() - detail.age;
+  views.banner(state);
+  $("clear").hidden = !LATCHED.includes(state.mode);
+  const mine = state.source === SOURCE && state.sender === hello?.sender;
+  views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
+  views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
+  const wish = wished ?? { linear: 0, angular: 0 };
+  views.text("speed", `${signed(state.linear, 2)} of ${signed(wish.linear, 2)} m/s`);
+  views.text("turn", `${signed(state.angular, 2)} of ${signed(wish.angular, 2)} rad/s`);
+  const late = state.figures.period_lateness?.last_minute;
+  plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
+  plots.speed.add(heard, null, state.linear);
+  plots.turn.add(heard, null, state.angular);
+  if (view !== "status") return;
+  views.sources($("sources"), state);
+  views.counters($("counters"), state);
+}
+
+function greeted({ detail }) {
+  hello = detail.hello;
+  $("robot").textContent = document.title = hello.robot;
+  $("simulated").hidden = !hello.simulated;
+  $("role").textContent = hello.role;
+  drive.sender = hello.sender;
+  drive.limits = hello.limits;
+  drive.allowed = hello.role !== "viewer";
+  $("stick").classList.toggle("off", !drive.allowed);
+  $("limit").max = String(hello.limits.linear);
+  limited();
+  if (!drive.allowed) views.text("told", "you may watch and stop, not drive");
+  $("clear").disabled = !drive.allowed;
+  if (hello.simulated) link.subscribe("sim/pose", 5);
+}
+
+/** Who comes by an invitation has its token behind the #: it becomes a cookie, and is wiped. */
+async function invited() {
+  const token = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!token) return;
+  history.replaceState(null, "", location.pathname);
+  const body = JSON.stringify({ token });
+  const answer = await fetch("token", { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => null);
+  if (!answer?.ok && !answer?.redirected) views.text("reason", "this invitation is not valid: ask for a new one (acsard web --invite)");
+}
+
+link.addEventListener("hello", greeted);
+link.addEventListener("key:state", stated);
+link.addEventListener("key:odom", ({ detail: { value } }) => {
+  const { position, orientation } = value.pose.pose;
+  map.pose(position.x, position.y, yaw(orientation));
+});
+link.addEventListener("key:sim/pose", ({ detail: { value } }) => map.truth(value.pose.position.x, value.pose.position.y));
+link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
+  wished = { linear: value.twist.linear.x, angular: value.twist.angular.z };
+  plots.speed.add(performance.now() - age, wished.linear, null);
+  plots.turn.add(performance.now() - age, wished.angular, null);
+});
+link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.wheels.add(performance.now() - age, ...value.velocity));
+link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
+link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
+link.addEventListener("path", ({ detail }) => map.trail(detail.path));
+link.addEventListener("fleet", ({ detail }) => views.cards($("cards"), detail.fleet));
+link.addEventListener("refused", ({ detail }) => views.text("told", words(objection(state, SOURCE, hello?.sender)) || detail.reason));
+link.addEventListener("gone", ({ detail }) => views.text("reason", detail.gone));
+link.addEventListener("down", ({ detail }) => {
+  drive.release("let go: the connection is gone");
+  heard = -Infinity;
+  if (detail.reason) views.text("reason", detail.reason);
+});
+
+for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));
+document.querySelector("nav").addEventListener("keydown", (event) => {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (!step || view === "drive") return; // there the arrows drive
+  open(VIEWS[(VIEWS.indexOf(view) + step + VIEWS.length) % VIEWS.length]);
+  $(`tab-${view}`).focus();
+});
+$("stop").addEventListener("pointerdown", stop);
+$("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // by Enter
+addEventListener("keydown", (event) => {
+  if (event.code !== "Space") return;
+  event.preventDefault();
+  if (!event.repeat) stop();
+}, true);
+addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
+$("clear").addEventListener("click", () => asked("clear"));
+$("activate").addEventListener("click", () => asked("activate"));
+$("deactivate").addEventListener("click", () => asked("deactivate"));
+$("reset").addEventListener("click", () => asked("reset_odometry"));
+$("nearer").addEventListener("click", () => map.zoom(1.4));
+$("farther").addEventListener("click", () => map.zoom(1 / 1.4));
+$("recentre").addEventListener("click", () => map.recentre());
+$("erase").addEventListener("click", () => map.erase());
+$("limit").addEventListener("input", limited);
+
+limited();
+open("drive");
+link.subscribe("state", 10);
+link.subscribe("odom", 20);
+link.subscribe("cmd_vel_out", 10);
+link.subscribe("wheel_states", 5);
+link.subscribe("events", 5);
+setInterval(looked, 100);
+await invited();
+link.start();

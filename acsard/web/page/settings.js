@@ -1,0 +1,50 @@
+// What may be set while the robot runs: a row for each, its range beside it.
+
+import { made } from "./views.js";
+
+export class Settings {
+  #form;
+  #call;
+
+  /** `call(payload)` sets, and says what became of it. */
+  constructor(form, call) {
+    this.#form = form;
+    this.#call = call;
+    form.addEventListener("submit", (event) => event.preventDefault());
+  }
+
+  /** Rows of {key, value, what, when, low, high, choices}. */
+  show(rows, allowed) {
+    if (this.#form.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
+    this.#form.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`, allowed)));
+  }
+
+  #row(row, id, allowed) {
+    const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
+    const label = made("label", "", row.key, made("small", "", `${row.what}${range}; ${row.when}`));
+    label.htmlFor = id;
+    const field = made(row.choices ? "select" : "input", "");
+    for (const one of row.choices ?? []) field.append(new Option(one, one));
+    field.id = id;
+    if (!row.choices) field.inputMode = typeof row.value === "number" ? "decimal" : "text";
+    field.value = Array.isArray(row.value) ? row.value.join(", ") : row.value;
+    const set = made("button", "", "Set");
+    set.setAttribute("aria-label", `Set ${row.key}`);
+    field.disabled = set.disabled = !allowed;
+    const send = () => this.#call({ settings: { [row.key]: read(field.value, row.value) } });
+    set.addEventListener("click", send);
+    field.addEventListener("keydown", (event) => event.key === "Enter" && send());
+    return made("div", "", label, field, set);
+  }
+}
+
+/** What was typed, of the kind that stands there now; what it cannot be goes as it is, and is refused. */
+export function read(typed, before) {
+  if (Array.isArray(before)) return typed.split(",").map((one) => number(one));
+  return typeof before === "number" ? number(typed) : typed;
+}
+
+function number(typed) {
+  const value = Number(typed.trim().replace("−", "-"));
+  return typed.trim() === "" || Number.isNaN(value) ? typed : value;
+}

@@ -1,0 +1,100 @@
+// What the other views show: rows made of what the bus says. Text goes in as text, never as HTML.
+
+import { age, ago, clock, reason, said, signed } from "./words.js";
+
+const LEVELS = ["", "warning", "error", "warning"];
+
+/** An element with its children; strings become text. */
+export function made(name, look, ...children) {
+  const element = document.createElement(name);
+  if (look) element.className = look;
+  element.append(...children);
+  return element;
+}
+
+export function sources(body, state) {
+  body.replaceChildren(
+    ...state.sources.map((one) => {
+      const drives = one.name === state.source;
+      const who = drives && state.sender ? `${one.name} (${state.sender})` : one.name;
+      const cells = [who, String(one.priority), one.age === null ? "none yet" : ago(one.age)];
+      const waits = drives ? "drives" : one.waits_for;
+      return made("tr", drives ? "drives" : "", ...[...cells, waits].map((text) => made("td", "", text)));
+    }),
+  );
+}
+
+export function parts(list, array) {
+  list.replaceChildren(
+    ...array.status.map((one) =>
+      made("li", LEVELS[one.level] ?? "error", made("strong", "", one.name.replace(/^acsard: /, "")), ` ${one.message}`),
+    ),
+  );
+}
+
+export function counters(list, state) {
+  const counted = Object.entries(state.counters).filter(([, count]) => count);
+  list.replaceChildren(
+    ...counted.map(([name, count]) =>
+      made("div", "", made("dt", "", name.replaceAll("_", " ")), made("dd", "", count.toLocaleString())),
+    ),
+  );
+}
+
+export function happened(list, told) {
+  const rows = [...told.events].reverse().map((one) => {
+    const by = one.by ? ` — ${one.by}` : "";
+    const head = made("strong", "", one.name.replaceAll("_", " "));
+    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${said(one.text)}${by}`);
+  });
+  list.replaceChildren(...rows);
+}
+
+export function cards(list, robots) {
+  const shown = robots.map((one) => {
+    const bad = ["fault", "stopped"].includes(one.mode) ? "error" : one.mode === "driving" || one.mode === "ready" ? "" : "warning";
+    const facts = [
+      typeof one.speed === "number" ? `${signed(one.speed, 2)} m/s` : "",
+      one.link ? `link ${one.link}` : "",
+      one.version ? `version ${one.version}` : "",
+      typeof one.age === "number" ? `heard ${ago(one.age)}` : "",
+    ];
+    return made("li", bad, made("strong", "", one.robot), ` ${one.mode ?? "silent"}`, made("div", "quiet", one.reason ?? ""),
+      made("div", "quiet", facts.filter(Boolean).join(" · ")));
+  });
+  list.replaceChildren(...(shown.length ? shown : [made("li", "warning", "no robot is heard")]));
+}
+
+export function recordings(list, none, files) {
+  none.hidden = files.length > 0;
+  list.replaceChildren(
+    ...files.map((one) => {
+      const link = made("a", "", one.name);
+      link.href = `api/recordings/${encodeURIComponent(one.name)}`;
+      link.download = one.name;
+      return made("li", "", link, made("div", "quiet", one.text ?? ""));
+    }),
+  );
+}
+
+/** Mode and why, in words, and what doubts there are. */
+export function banner(state) {
+  document.body.dataset.mode = state.mode;
+  text("mode", state.mode.toUpperCase());
+  text("reason", reason(state));
+  const doubt = document.getElementById("doubt");
+  const warned = [state.doubt, state.recording, state.certificate.startsWith("valid") ? "" : state.certificate];
+  doubt.textContent = warned.filter(Boolean).join("; ");
+  doubt.hidden = !doubt.textContent;
+}
+
+/** How old what is shown is, and the way to the robot and back. */
+export function freshness(old, way) {
+  document.body.classList.toggle("stale", old > 500);
+  text("age", old === Infinity ? "no connection" : old > 500 ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
+}
+
+export function text(id, words) {
+  const element = document.getElementById(id);
+  if (element.textContent !== words) element.textContent = words;
+}

@@ -1,0 +1,42 @@
+// Figures and times as a person reads them. Pure.
+
+export function signed(value, decimals) {
+  const text = value.toFixed(decimals);
+  return Number(text) === 0 ? (0).toFixed(decimals) : text.replace("-", "−");
+}
+
+/** A stamp {sec, nanosec} as the clock on the wall. */
+export function clock(stamp) {
+  return new Date(stamp.sec * 1000 + stamp.nanosec / 1e6).toLocaleTimeString();
+}
+
+export function milliseconds(stamp) {
+  return stamp.sec * 1000 + stamp.nanosec / 1e6;
+}
+
+export function ago(seconds) {
+  if (seconds === null || seconds === undefined) return "never";
+  if (seconds < 1) return "now";
+  if (seconds < 120) return `${Math.round(seconds)} s ago`;
+  return seconds < 7200 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
+}
+
+export function age(ms) {
+  return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
+}
+
+/** Heading of a quaternion about z, rad. */
+export function yaw(q) {
+  return 2 * Math.atan2(q.z, q.w);
+}
+
+/** A reason without the mode that stands above it already. */
+export function reason(state) {
+  const before = `${state.mode}: `;
+  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason);
+}
+
+/** What a program is told to call is a button here. */
+export function said(text) {
+  return text.replace("call srv/clear", "press Clear").replace("srv/clear releases", "Clear releases").replace("call srv/activate", "Set has Switch on");
+}

@@ -1,0 +1,416 @@
+"""The robot's page in a real browser: seen, stopped, driven, and let go in every way there is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.browser import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.bystander import lost
+from tests.system.harness import Bus, Daemon, Program, acsard, free_endpoint, until
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+]
+
+TIMEOUT_S, TICK_S = 0.25, 0.01
+"""Of source teleop; of the control loop."""
+
+VIEWS = ("drive", "status", "events", "set", "robots")
+
+
+class Page:
+    """A daemon, its page in a phone's browser, and somebody on the bus beside them."""
+
+    def __init__(self, daemon: Daemon, bus: Bus, server: Program, browser: Browser, url: str):
+        self.daemon, self.bus, self.server, self.browser, self.url = (
+            daemon, bus, server, browser, url,
+        )  # fmt: skip
+
+    def shows(self, name: str, words: str) -> None:
+        """The element with this id says so."""
+        until(lambda: words in self.browser.text(name), 5.0, f"{name} says {words!r}")
+
+    def push(self, x: float, y: float, kind: str = "Move") -> None:
+        """The finger on the stick, from its middle, px; y up."""
+        mx, my = self.browser.middle("stick")
+        self.browser.touch(kind, (mx + x, my - y))
+
+    def hold(self) -> None:
+        """A finger drives forwards."""
+        self.push(0, 0, "Start")
+        self.push(0, 90)
+        until(lambda: self.bus.state()["linear"] > 0.15, 10.0, "it drives")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as browser:
+        yield browser
+
+
+def served(daemon: Daemon, where: Path) -> tuple[Program, str]:
+    """The page's server beside this daemon, not yet started, and its address."""
+    address = free_endpoint().removeprefix("tcp/")
+    words = acsard("web", "--config", str(daemon.config), "--address", address)
+    return Program(words, where), f"http://{address}/"
+
+
+@pytest.fixture
+def page(tmp_path: Path, browser: Browser) -> Iterator[Page]:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        server, url = served(daemon, tmp_path)
+        with server:
+            until(lambda: url in server.stdout + server.stderr, 15.0, "an address")
+            page = Page(daemon, bus, server, browser, url)
+            browser.size(*PHONE)
+            browser.said.clear()
+            browser.open(url)
+            page.shows("mode", "READY")
+            until(lambda: browser.js("!document.body.classList.contains('stale')"), 5.0, "news")
+            yield page
+            browser.lift()
+            browser.open("about:blank")
+
+
+def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Page) -> None:
+    browser, bus = page.browser, page.bus
+    assert browser.js("document.getElementById('simulated').hidden") is False
+    page.hold()
+    until(lambda: bus.state()["x"] > 1.0, 20.0, "a metre")
+    assert bus.state()["source"] == "teleop"
+    page.shows("who", "you")
+    assert bus.state()["linear"] <= 0.2 + 0.03  # slow to begin with
+    page.push(-80, 0)
+    until(lambda: bus.state()["yaw"] > 0.3, 10.0, "it turns left")
+    browser.touch("End")
+    bus.at_rest()
+    page.hold()
+    browser.tap("stop")
+    until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
+    page.shows("mode", "STOPPED")
+    page.shows("reason", "press Clear")
+    # Who still holds the stick does not drive when somebody clears.
+    browser.touch("End")
+    browser.tap("clear")
+    page.shows("mode", "READY")
+    assert bus.state()["linear"] == pytest.approx(0.0, abs=0.02)
+    page.hold()
+    browser.touch("End")
+    bus.at_rest()
+    assert browser.said == []
+
+
+def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page: Page) -> None:
+    browser, bus = page.browser, page.bus
+    for view in VIEWS:
+        browser.tap(f"tab-{view}")
+        browser.key("Down", "Space", " ")
+        browser.key("Up", "Space", " ")
+        until(lambda: bus.state()["mode"] == "stopped", 5.0, f"stopped from {view}")
+        page.shows("mode", "STOPPED")
+        browser.tap("clear")
+        until(lambda: bus.state()["mode"] == "ready", 5.0, "cleared")
+        page.shows("mode", "READY")
+    browser.tap("tab-drive")
+    page.hold()
+    bus.get("srv/stop")  # by somebody else
+    page.shows("told", "press Clear")
+    bus.get("srv/clear")
+    page.shows("mode", "READY")
+    # The finger is still down.
+    sent = bus.count("commands")
+    page.push(0, 80)
+    until(lambda: page.browser.js("performance.now()") > 0, 1.0, "a round")
+    page.shows("mode", "READY")
+    assert bus.count("commands") == sent
+    browser.touch("End")
+
+
+def test_keys_drive_while_they_are_held(page: Page) -> None:
+    browser, bus = page.browser, page.bus
+    browser.key("Down", "KeyW", "w")
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    browser.key("Down", "ArrowLeft", "ArrowLeft")
+    until(lambda: bus.state()["angular"] > 0.15, 10.0, "and left")
+    browser.key("Up", "KeyW", "w")
+    until(lambda: abs(bus.state()["linear"]) < 0.02, 10.0, "only left")
+    browser.key("Up", "ArrowLeft", "ArrowLeft")
+    bus.at_rest()
+
+
+PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
+    buttons: Array.from({length: 16}, (_, n) => ({pressed: n === 5 && HELD}))}]"""
+
+
+def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Page) -> None:
+    browser, bus = page.browser, page.bus
+    pad = PAD.replace("AXES", "[0, -1, 0, 0]")
+    browser.js(pad.replace("HELD", "false") + ";1")
+    browser.js("new Promise(done => setTimeout(done, 200))")
+    assert bus.state()["source"] == ""
+    browser.js(pad.replace("HELD", "true") + ";1")
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    browser.js(pad.replace("HELD", "false") + ";1")
+    bus.at_rest()
+
+
+def released(page: Page) -> None:
+    page.browser.touch("End")
+
+
+def second_finger(page: Page) -> None:
+    x, y = page.browser.middle("stick")
+    page.browser.touch("Start", (x, y - 90), (x + 20, y + 20))
+
+
+def blurred(page: Page) -> None:
+    page.browser.js("window.dispatchEvent(new Event('blur'))")
+
+
+def hidden(page: Page) -> None:
+    page.browser.js(
+        """Object.defineProperty(document, 'hidden', {value: true, configurable: true});
+        document.dispatchEvent(new Event('visibilitychange'))"""
+    )
+
+
+def left(page: Page) -> None:
+    page.browser.open("about:blank")
+
+
+def offline(page: Page) -> None:
+    page.browser.ask(
+        "Network.emulateNetworkConditions",
+        offline=True, latency=0, downloadThroughput=0, uploadThroughput=0,
+    )  # fmt: skip
+    page.browser.js("link => 0")
+
+
+def stalled(page: Page) -> None:
+    """Script runs for longer than a page may stand still; the finger is still down after it."""
+    page.browser.js(
+        "(() => { const end = performance.now() + 1200; while (performance.now() < end); })()"
+    )
+
+
+def server_killed(page: Page) -> None:
+    page.server.process.kill()
+
+
+WAYS = (released, second_finger, blurred, hidden, left, stalled, server_killed)
+
+
+def let_go(page: Page, way: Callable[[Page], None]) -> float:
+    """Seconds from letting go to the first slower command of the daemon's."""
+    page.hold()
+    with page.bus.follow("cmd_vel_out") as applied:
+        begun = time.monotonic()
+        way(page)
+
+        def slower() -> float | None:
+            seen = list(applied.seen)
+            return next(
+                (
+                    one.at
+                    for one in seen
+                    if one.at > begun and one.value["twist"]["linear"]["x"] < 0.15
+                ),
+                None,
+            )
+
+        at = until(slower, 5.0, "it slows down")
+    page.bus.at_rest()
+    return at - begun
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
+    page: Page, way: Callable[[Page], None]
+) -> None:
+    begun = time.monotonic()
+    took = let_go(page, way)
+    print(f"{way.__name__}: {took * 1000:.0f} ms to the first slower command")
+    # The page's own stall is no news before it ends; 1.2 s of it are the test's.
+    stood = 1.2 if way is stalled else 0.0
+    # From 0.2 m/s to 0.15 takes 0.05 s of ramp.
+    assert took <= TIMEOUT_S + 2 * TICK_S + 0.05 + stood + 0.05 + lost(begun)
+    x = page.bus.state()["x"]
+    page.browser.js("new Promise(done => setTimeout(done, 300))")
+    assert page.bus.state()["x"] == pytest.approx(x, abs=1e-3)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_browser_that_is_killed_or_frozen_drives_no_more(
+    tmp_path: Path, how: signal.Signals
+) -> None:
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, browsing() as browser:
+        bus.linked()
+        server, url = served(daemon, tmp_path)
+        with server:
+            until(lambda: url in server.stdout + server.stderr, 15.0, "an address")
+            page = Page(daemon, bus, server, browser, url)
+            browser.size(*PHONE)
+            browser.open(url)
+            page.shows("mode", "READY")
+            page.hold()
+            assert browser.process is not None
+            begun = time.monotonic()
+            os.killpg(browser.process.pid, how)
+            bus.at_rest()
+            took = time.monotonic() - begun
+            # Its timeout, then 0.2 m/s at the deceleration of the limits, and the wheels' lag.
+            assert took <= TIMEOUT_S + 2 * TICK_S + 1.0 + lost(begun)
+            if how == signal.SIGSTOP:
+                until(lambda: time.monotonic() > begun + 1.5, 5.0, "longer than a page may freeze")
+                refused, x = bus.count("command_stale"), bus.state()["x"]
+                os.killpg(browser.process.pid, signal.SIGCONT)
+                browser.js("new Promise(done => setTimeout(done, 1000))")
+                # What it sent before it froze came late; and the frozen hand holds no more.
+                assert bus.state()["x"] == pytest.approx(x, abs=1e-3)
+                assert bus.count("command_stale") >= refused
+                assert not browser.js("document.getElementById('stick').classList.contains('held')")
+
+
+def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Page) -> None:
+    page.daemon.signal(signal.SIGSTOP)
+    try:
+        page.shows("age", "STALE")
+        assert page.browser.js("document.body.classList.contains('stale')")
+    finally:
+        page.daemon.signal(signal.SIGCONT)
+    page.shows("age", "live")
+    page.server.process.kill()
+    page.shows("age", "no connection")
+
+
+def test_somebody_else_who_drives_is_named(page: Page) -> None:
+    with page.bus.commanding(0.1, source="teleop"):
+        page.shows("who", "teleop")
+        assert page.browser.text("who") != "you"
+        page.push(0, 0, "Start")
+        page.push(0, 90)
+        page.shows("told", "somebody else drives")
+        page.browser.touch("End")
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+def test_stick_and_stop_fit_on_the_screen_and_nothing_is_wider_than_it(
+    page: Page, size: tuple[int, int]
+) -> None:
+    page.browser.size(*size, touch=size == PHONE)
+    for name in ("stick", "stop", "limit", "mode", "map"):
+        box = page.browser.js(
+            f"(b => [b.left, b.top, b.right, b.bottom])"
+            f"(document.getElementById({name!r}).getBoundingClientRect())"
+        )
+        assert box[0] >= 0
+        assert box[1] >= 0
+        assert box[2] <= size[0]
+        assert box[3] <= size[1], name
+    for view in VIEWS:
+        page.browser.js(f"document.getElementById('tab-{view}').click()")
+        assert page.browser.js("document.documentElement.scrollWidth") <= size[0], view
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_nothing_stands_in_the_way_of_a_screen_reader(page: Page, dark: bool) -> None:
+    page.browser.size(*PHONE, dark=dark)
+    page.browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
+    for view in VIEWS:
+        page.browser.js(f"document.getElementById('tab-{view}').click()")
+        found = page.browser.js(
+            "axe.run().then(told =>"
+            " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
+        )
+        assert [one for one in found if one[0] in ("serious", "critical")] == [], view
+
+
+def test_what_a_first_look_costs(page: Page) -> None:
+    sent = page.browser.js(
+        "performance.getEntriesByType('resource').concat(performance.getEntriesByType('navigation'))"
+        ".reduce((sum, one) => sum + one.transferSize, 0)"
+    )
+    shown = page.browser.js("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+    print(f"{sent / 1000:.0f} kB; first look after {shown:.0f} ms")
+    assert sent <= 1_500_000
+
+
+HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
+    const ours = {name: 'teleop', waits_for: ''};
+    const driving = {mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours]};
+    const ready = {...driving, mode: 'ready', source: '', sender: '', reason: 'no commands'};
+    const stopped = {...ready, mode: 'stopped', reason: 'stopped by request'};
+    const out = [];
+    const hand = new Hand();
+    const look = (now, state) => {
+        const {send, ended} = hand.look(now, state, now, 'teleop', 'me');
+        out.push([send ? send.linear_x : null, ended ?? null]);
+    };
+    SCRIPT
+    return out;
+})"""
+
+
+def by_hand(page: Page, script: str) -> list[Any]:
+    """What the pure part says, run where it runs."""
+    return list(page.browser.js(HAND.replace("SCRIPT", script)))
+
+
+def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Page) -> None:
+    script = """hand.press(0); hand.wish(0.2, 0);
+        for (const now of [0, 10, 20, 40]) look(now, ready);
+        for (let now = 50; now < 260; now += 10) look(now, driving);
+        out.push([hand.release()?.linear_x, null], [hand.release(), null]);
+        look(270, driving);"""
+    told = by_hand(page, script)
+    assert told[:4] == [[0, None], [None, None], [0, None], [0, None]]
+    sent = [one[0] for one in told[4:25]]
+    assert set(sent) == {0.2, None}
+    assert sent.count(0.2) == 4
+    assert told[25:] == [[0, None], [None, None], [None, None]]
+
+
+@pytest.mark.parametrize(
+    ("script", "why"),
+    [
+        ("hand.press(0); look(0, ready); look(1100, ready)", "the page stood still"),
+        ("hand.press(0); look(0, stopped)", "stopped by request"),
+        (
+            "hand.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
+            "nothing is heard",
+        ),
+        (
+            "hand.press(-1); look(0, driving);"
+            "for (let now = 100; now <= 600; now += 100)"
+            " look(now, {...driving, sender: 'other'})",
+            "somebody else drives",
+        ),
+    ],
+)
+def test_a_hand_that_is_not_followed_lets_go_and_says_why(
+    page: Page, script: str, why: str
+) -> None:
+    told = by_hand(page, script)
+    assert told[-1][0] == 0
+    assert why in json.dumps(told[-1][1])
+    assert all(one[1] is None for one in told[:-1])
+
+
+def test_what_strangers_write_is_text(page: Page) -> None:
+    evil = "<img src=x onerror=document.title='owned'>"
+    page.bus.put(f"cmd/{'app'}", {"linear": {"x": evil}, "angular": {"z": 0}})
+    page.browser.tap("tab-events")
+    page.shows("happened", "refused")
+    assert page.browser.js("document.querySelectorAll('#happened img').length") == 0
+    assert page.browser.js("document.title") == "acsar"
