@@ -58,7 +58,7 @@ def described(name: str, type_of: int) -> ParameterDescriptor:
 
 @cache  # names that are there: some hundred
 def _described(name: str, type_of: int) -> ParameterDescriptor:
-    kind, row = _kind(name), live(name)
+    kind, row = kind_of(name), live(name)
     words = expected(kind)
     bounds = kind.type if isinstance(kind, inspect.Metadata) else kind
     floats, whole = [], []
@@ -78,7 +78,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
     )
 
 
-def _kind(name: str) -> inspect.Type:
+def kind_of(name: str) -> inspect.Type:
     """The type of a key of `acsard.toml`, as it is checked by; a source counts by its name."""
     cls: type[Struct] = Config
     parts = iter(name.split("."))

@@ -95,6 +95,7 @@ class Page:
                 web.get("/api/recordings", self._recordings),
                 web.get("/api/recordings/{name}", self._recording),
                 web.get("/api/whoami", self._whoami),
+                web.get("/api/settings", self._settings),
                 web.post("/api/srv/{verb}", self._service),
                 web.get("/api/{key:.+}", self._value),
                 web.get("/metrics", self._metrics),
@@ -240,6 +241,9 @@ class Page:
     async def _whoami(self, request: web.Request) -> web.StreamResponse:
         who = _who(request)
         return web.json_response({"role": who.role, "name": who.name})
+
+    async def _settings(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.settings(_who(request))
 
     async def _value(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.value(_who(request), request.match_info["key"])

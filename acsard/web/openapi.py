@@ -117,11 +117,34 @@ _RECORDING: Described = {
     },
 }
 
+_SETTING: Described = {
+    "type": "object",
+    "required": ["key", "value", "what", "when"],
+    "properties": {
+        "key": {"type": "string"},
+        "value": {},
+        "what": {"type": "string"},
+        "when": {"type": "string"},
+        "low": {"type": "number"},
+        "high": {"type": "number"},
+        "choices": {"type": "array", "items": {"type": "string"}},
+    },
+}
+
 _OTHERS: Described = {
     "/api/whoami": {
         "get": {
             "summary": "who you are here",
             "responses": {"200": _answer("Role and name.", {"type": "object"})},
+        }
+    },
+    "/api/settings": {
+        "get": {
+            "summary": "what srv/set takes: values, ranges, when; for a maintainer",
+            "responses": {
+                "200": _answer("A list.", {"type": "array", "items": _SETTING}),
+                "default": _TROUBLE,
+            },
         }
     },
     "/api/recordings": {

@@ -15,7 +15,7 @@ from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError
 from acsard.messages.topics import row_of
 from acsard.values import AcsardError
-from acsard.web import metrics, openapi, recordings
+from acsard.web import metrics, openapi, recordings, settings
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
 from acsard.web.robots import Robots
@@ -52,6 +52,13 @@ class Programs:
             robots.id, robots.state, not robots.gone, viewers, counts.all(), counts.refused()
         )
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
+
+    async def settings(self, who: Who) -> web.Response:
+        """What may be set, with its values now."""
+        told = await self.value(who, "config")
+        assert isinstance(told.body, bytes)
+        rows = settings.rows(msgspec.json.decode(told.body))
+        return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
 
     async def value(self, who: Who, key: str) -> web.Response:
         """The last value of a key."""

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
+from tests.system.browser import Hands, Page, hands, run
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -23,7 +24,6 @@ from tests.system.harness import (
     resident_kb,
     until,
 )
-from tests.system.page_client import Hands, Page, hands, run
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(240)]
 

@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
-from tests.system.browser import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.browser import Page
 from tests.system.bystander import lost
-from tests.system.harness import Bus, Daemon, Program, acsard, free_endpoint, until
+from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.harness import Bus, Daemon, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -28,13 +29,11 @@ TIMEOUT_S, TICK_S = 0.25, 0.01
 VIEWS = ("drive", "status", "events", "set", "robots")
 
 
-class Page:
+class Phone:
     """A daemon, its page in a phone's browser, and somebody on the bus beside them."""
 
-    def __init__(self, daemon: Daemon, bus: Bus, server: Program, browser: Browser, url: str):
-        self.daemon, self.bus, self.server, self.browser, self.url = (
-            daemon, bus, server, browser, url,
-        )  # fmt: skip
+    def __init__(self, daemon: Daemon, bus: Bus, server: Page, browser: Browser) -> None:
+        self.daemon, self.bus, self.server, self.browser = daemon, bus, server, browser
 
     def shows(self, name: str, words: str) -> None:
         """The element with this id says so."""
@@ -58,24 +57,15 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
-def served(daemon: Daemon, where: Path) -> tuple[Program, str]:
-    """The page's server beside this daemon, not yet started, and its address."""
-    address = free_endpoint().removeprefix("tcp/")
-    words = acsard("web", "--config", str(daemon.config), "--address", address)
-    return Program(words, where), f"http://{address}/"
-
-
 @pytest.fixture
-def page(tmp_path: Path, browser: Browser) -> Iterator[Page]:
+def page(tmp_path: Path, browser: Browser) -> Iterator[Phone]:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
-        server, url = served(daemon, tmp_path)
-        with server:
-            until(lambda: url in server.stdout + server.stderr, 15.0, "an address")
-            page = Page(daemon, bus, server, browser, url)
+        with Page(daemon, tmp_path) as server:
+            page = Phone(daemon, bus, server, browser)
             browser.size(*PHONE)
             browser.said.clear()
-            browser.open(url)
+            browser.open(server.here)
             page.shows("mode", "READY")
             until(lambda: browser.js("!document.body.classList.contains('stale')"), 5.0, "news")
             yield page
@@ -83,7 +73,7 @@ def page(tmp_path: Path, browser: Browser) -> Iterator[Page]:
             browser.open("about:blank")
 
 
-def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Page) -> None:
+def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     assert browser.js("document.getElementById('simulated').hidden") is False
     page.hold()
@@ -111,7 +101,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Page) -> None:
     assert browser.said == []
 
 
-def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page: Page) -> None:
+def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     for view in VIEWS:
         browser.tap(f"tab-{view}")
@@ -137,7 +127,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.touch("End")
 
 
-def test_keys_drive_while_they_are_held(page: Page) -> None:
+def test_keys_drive_while_they_are_held(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
     until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
@@ -153,7 +143,7 @@ PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
     buttons: Array.from({length: 16}, (_, n) => ({pressed: n === 5 && HELD}))}]"""
 
 
-def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Page) -> None:
+def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     pad = PAD.replace("AXES", "[0, -1, 0, 0]")
     browser.js(pad.replace("HELD", "false") + ";1")
@@ -165,31 +155,31 @@ def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Page) -> None:
     bus.at_rest()
 
 
-def released(page: Page) -> None:
+def released(page: Phone) -> None:
     page.browser.touch("End")
 
 
-def second_finger(page: Page) -> None:
+def second_finger(page: Phone) -> None:
     x, y = page.browser.middle("stick")
     page.browser.touch("Start", (x, y - 90), (x + 20, y + 20))
 
 
-def blurred(page: Page) -> None:
+def blurred(page: Phone) -> None:
     page.browser.js("window.dispatchEvent(new Event('blur'))")
 
 
-def hidden(page: Page) -> None:
+def hidden(page: Phone) -> None:
     page.browser.js(
         """Object.defineProperty(document, 'hidden', {value: true, configurable: true});
         document.dispatchEvent(new Event('visibilitychange'))"""
     )
 
 
-def left(page: Page) -> None:
+def left(page: Phone) -> None:
     page.browser.open("about:blank")
 
 
-def offline(page: Page) -> None:
+def offline(page: Phone) -> None:
     page.browser.ask(
         "Network.emulateNetworkConditions",
         offline=True, latency=0, downloadThroughput=0, uploadThroughput=0,
@@ -197,21 +187,21 @@ def offline(page: Page) -> None:
     page.browser.js("link => 0")
 
 
-def stalled(page: Page) -> None:
+def stalled(page: Phone) -> None:
     """Script runs for longer than a page may stand still; the finger is still down after it."""
     page.browser.js(
         "(() => { const end = performance.now() + 1200; while (performance.now() < end); })()"
     )
 
 
-def server_killed(page: Page) -> None:
+def server_killed(page: Phone) -> None:
     page.server.process.kill()
 
 
 WAYS = (released, second_finger, blurred, hidden, left, stalled, server_killed)
 
 
-def let_go(page: Page, way: Callable[[Page], None]) -> float:
+def let_go(page: Phone, way: Callable[[Phone], None]) -> float:
     """Seconds from letting go to the first slower command of the daemon's."""
     page.hold()
     with page.bus.follow("cmd_vel_out") as applied:
@@ -236,7 +226,7 @@ def let_go(page: Page, way: Callable[[Page], None]) -> float:
 
 @pytest.mark.parametrize("way", WAYS)
 def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
-    page: Page, way: Callable[[Page], None]
+    page: Phone, way: Callable[[Phone], None]
 ) -> None:
     begun = time.monotonic()
     took = let_go(page, way)
@@ -256,12 +246,10 @@ def test_a_browser_that_is_killed_or_frozen_drives_no_more(
 ) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, browsing() as browser:
         bus.linked()
-        server, url = served(daemon, tmp_path)
-        with server:
-            until(lambda: url in server.stdout + server.stderr, 15.0, "an address")
-            page = Page(daemon, bus, server, browser, url)
+        with Page(daemon, tmp_path) as server:
+            page = Phone(daemon, bus, server, browser)
             browser.size(*PHONE)
-            browser.open(url)
+            browser.open(server.here)
             page.shows("mode", "READY")
             page.hold()
             assert browser.process is not None
@@ -282,7 +270,7 @@ def test_a_browser_that_is_killed_or_frozen_drives_no_more(
                 assert not browser.js("document.getElementById('stick').classList.contains('held')")
 
 
-def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Page) -> None:
+def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -> None:
     page.daemon.signal(signal.SIGSTOP)
     try:
         page.shows("age", "STALE")
@@ -294,7 +282,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Page) ->
     page.shows("age", "no connection")
 
 
-def test_somebody_else_who_drives_is_named(page: Page) -> None:
+def test_somebody_else_who_drives_is_named(page: Phone) -> None:
     with page.bus.commanding(0.1, source="teleop"):
         page.shows("who", "teleop")
         assert page.browser.text("who") != "you"
@@ -306,7 +294,7 @@ def test_somebody_else_who_drives_is_named(page: Page) -> None:
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
 def test_stick_and_stop_fit_on_the_screen_and_nothing_is_wider_than_it(
-    page: Page, size: tuple[int, int]
+    page: Phone, size: tuple[int, int]
 ) -> None:
     page.browser.size(*size, touch=size == PHONE)
     for name in ("stick", "stop", "limit", "mode", "map"):
@@ -324,7 +312,7 @@ def test_stick_and_stop_fit_on_the_screen_and_nothing_is_wider_than_it(
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_nothing_stands_in_the_way_of_a_screen_reader(page: Page, dark: bool) -> None:
+def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone, dark: bool) -> None:
     page.browser.size(*PHONE, dark=dark)
     page.browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
     for view in VIEWS:
@@ -336,7 +324,7 @@ def test_nothing_stands_in_the_way_of_a_screen_reader(page: Page, dark: bool) ->
         assert [one for one in found if one[0] in ("serious", "critical")] == [], view
 
 
-def test_what_a_first_look_costs(page: Page) -> None:
+def test_what_a_first_look_costs(page: Phone) -> None:
     sent = page.browser.js(
         "performance.getEntriesByType('resource').concat(performance.getEntriesByType('navigation'))"
         ".reduce((sum, one) => sum + one.transferSize, 0)"
@@ -362,12 +350,12 @@ HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
 })"""
 
 
-def by_hand(page: Page, script: str) -> list[Any]:
+def by_hand(page: Phone, script: str) -> list[Any]:
     """What the pure part says, run where it runs."""
     return list(page.browser.js(HAND.replace("SCRIPT", script)))
 
 
-def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Page) -> None:
+def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
     script = """hand.press(0); hand.wish(0.2, 0);
         for (const now of [0, 10, 20, 40]) look(now, ready);
         for (let now = 50; now < 260; now += 10) look(now, driving);
@@ -399,7 +387,7 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Pa
     ],
 )
 def test_a_hand_that_is_not_followed_lets_go_and_says_why(
-    page: Page, script: str, why: str
+    page: Phone, script: str, why: str
 ) -> None:
     told = by_hand(page, script)
     assert told[-1][0] == 0
@@ -407,7 +395,7 @@ def test_a_hand_that_is_not_followed_lets_go_and_says_why(
     assert all(one[1] is None for one in told[:-1])
 
 
-def test_what_strangers_write_is_text(page: Page) -> None:
+def test_what_strangers_write_is_text(page: Phone) -> None:
     evil = "<img src=x onerror=document.title='owned'>"
     page.bus.put(f"cmd/{'app'}", {"linear": {"x": evil}, "angular": {"z": 0}})
     page.browser.tap("tab-events")

@@ -17,6 +17,7 @@ from typing import Any
 import aiohttp
 import pytest
 
+from tests.system.browser import Page, hands, run, text
 from tests.system.harness import (
     PATIENCE_S,
     ROOT,
@@ -32,7 +33,6 @@ from tests.system.harness import (
     until,
     write_config,
 )
-from tests.system.page_client import Page, hands, run, text
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.browser import Hands, Page, hands, run
 from tests.system.harness import Bus, Daemon
-from tests.system.page_client import Hands, Page, hands, run
 
 Way = Callable[[Hands, Page], Awaitable[None]]
 

@@ -14,8 +14,8 @@ import pytest
 from yarl import URL
 
 from acsard.lan.authority import Authority
+from tests.system.browser import NAME, Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, Daemon, resident_kb
-from tests.system.page_client import NAME, Page, hands, run
 
 pytestmark = pytest.mark.network
 

@@ -87,7 +87,8 @@ async function listed() {
 }
 
 async function configured() {
-  settings.show((await got("api/settings")) ?? [], hello?.role === "maintainer");
+  if (hello?.role !== "maintainer") return views.text("set-told", "settings are for maintainers");
+  settings.show((await got("api/settings")) ?? []);
 }
 
 function limited() {

@@ -14,12 +14,12 @@ export class Settings {
   }
 
   /** Rows of {key, value, what, when, low, high, choices}. */
-  show(rows, allowed) {
+  show(rows) {
     if (this.#form.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
-    this.#form.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`, allowed)));
+    this.#form.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`)));
   }
 
-  #row(row, id, allowed) {
+  #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
     const label = made("label", "", row.key, made("small", "", `${row.what}${range}; ${row.when}`));
     label.htmlFor = id;
@@ -30,7 +30,6 @@ export class Settings {
     field.value = Array.isArray(row.value) ? row.value.join(", ") : row.value;
     const set = made("button", "", "Set");
     set.setAttribute("aria-label", `Set ${row.key}`);
-    field.disabled = set.disabled = !allowed;
     const send = () => this.#call({ settings: { [row.key]: read(field.value, row.value) } });
     set.addEventListener("click", send);
     field.addEventListener("keydown", (event) => event.key === "Enter" && send());

@@ -1,6 +1,6 @@
 // What the other views show: rows made of what the bus says. Text goes in as text, never as HTML.
 
-import { age, ago, clock, reason, said, signed } from "./words.js";
+import { age, ago, began, clock, lasted, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
@@ -72,7 +72,7 @@ export function recordings(list, none, files) {
       const link = made("a", "", one.name);
       link.href = `api/recordings/${encodeURIComponent(one.name)}`;
       link.download = one.name;
-      return made("li", "", link, made("div", "quiet", one.text ?? ""));
+      return made("li", "", link, made("div", "quiet", [began(one.begin), lasted(one.seconds), one.events].filter(Boolean).join(" · ")));
     }),
   );
 }

@@ -21,6 +21,16 @@ export function ago(seconds) {
   return seconds < 7200 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
 }
 
+/** Seconds since 1970 as day and time. */
+export function began(seconds) {
+  return typeof seconds === "number" ? new Date(seconds * 1000).toLocaleString() : "";
+}
+
+export function lasted(seconds) {
+  if (typeof seconds !== "number") return "";
+  return seconds < 120 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`;
+}
+
 export function age(ms) {
   return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
 }

@@ -1,0 +1,42 @@
+"""The settings that can be changed while the robot runs, as rows of a form; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from msgspec import UNSET, Struct, UnsetType, inspect
+
+from acsard.config.live import WHEN, flat, live
+from acsard.ros.descriptors import kind_of
+
+
+class Row(Struct, frozen=True, omit_defaults=True):
+    """One of them."""
+
+    key: str
+    value: Any
+    what: str
+    when: str
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+    choices: list[str] | UnsetType = UNSET
+
+
+def rows(config: Mapping[str, Any]) -> list[Row]:
+    """Those of a configuration as `config` answers it, in its order."""
+    return [_row(key, value) for key, value in flat(config) if live(key) is not None]
+
+
+def _row(key: str, value: object) -> Row:
+    told, kind = live(key), kind_of(key)
+    assert told is not None
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+    choices: list[str] | UnsetType = UNSET
+    match kind.type if isinstance(kind, inspect.Metadata) else kind:
+        case inspect.FloatType(ge=float(least), le=float(most)):
+            low, high = least, most
+        case inspect.LiteralType(values=values):
+            choices = [str(one) for one in values]
+    return Row(key, value, told.what, WHEN[told.when], low, high, choices)
