@@ -236,7 +236,7 @@ def test_every_link_leads_somewhere(page: str) -> None:
 def files_in(text: str) -> set[str]:
     """The words that are names of files or directories."""
     found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
-    kinds = (".py", ".toml", ".json5", ".c", ".md")
+    kinds = (".py", ".toml", ".json5", ".c", ".js", ".md")
     return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
 
 
