@@ -337,8 +337,10 @@ class Viewer:
     async def _send_due(self, one: Following, now: float) -> float:
         """Send it if it is time and there is news; when it is due next, by the loop's clock."""
         stream = one.stream
-        if stream is None or one.due > now:
-            return max(one.due, now + one.period)
+        if stream is None:
+            return now + one.period  # `_join` says when it is there
+        if one.due > now:
+            return one.due
         # On a grid that all share: they wake up together.
         one.due = (now // one.period + 1) * one.period
         if stream.number != one.sent:
