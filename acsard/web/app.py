@@ -6,13 +6,9 @@ Every request passes `_admit` first. What it hands on has a `Who`, but for the p
 
 from __future__ import annotations
 
-import re
-import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
-import msgspec
 from aiohttp import web
 
 from acsard.host import clock
@@ -25,24 +21,24 @@ from acsard.web.gate import Gate
 from acsard.web.hand import Hand
 from acsard.web.limits import CONNECTIONS, CONNECTIONS_OF_ONE, Places, Tries
 from acsard.web.programs import Programs, TroubleError
+from acsard.web.requests import (
+    COOKIE,
+    asked_of,
+    keep_little,
+    own_address,
+    secured,
+    token_posted,
+    token_shown,
+)
 from acsard.web.robots import Robots
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
-from acsard.web.who import MAINTAINER, Asked, Reason, Refusal, Who, foreign, place
+from acsard.web.who import MAINTAINER, Reason, Refusal, Who, foreign, place
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-COOKIE = "__Host-acsard"
-"""By its name browsers take it only with Secure, of this host, for all paths."""
-
 OPEN = ("/", "/token", "/favicon.ico")
 """For everybody: a page has to be there before it can say who shows it."""
-
-HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
-"""What a browser writes into `Host`; it is written back into a header."""
-
-SEND_BUFFER = 65536
-"""Of the kernel, for one client: what lies in it is old when it arrives."""
 
 STATUS: dict[Reason, int] = {
     "no_token": 401,
@@ -83,7 +79,7 @@ class Page:
         self._places = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
         self._viewers: set[Viewer] = set()
         self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
-        self.app.on_response_prepare.append(_headers)
+        self.app.on_response_prepare.append(secured)
         self.app.add_routes(
             [
                 web.get("/", self._index),
@@ -123,8 +119,8 @@ class Page:
     @web.middleware
     async def _admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         self._gate.spoke(request.transport)
-        asked = _asked(request)
-        spot = place(asked, self._names | {_own_address(request)})
+        asked = asked_of(request)
+        spot = place(asked, self._names | {own_address(request)})
         if isinstance(spot, Refusal):
             return self.refused(spot)
         acts = request.method not in ("GET", "HEAD") or request.path == "/ws"
@@ -135,7 +131,7 @@ class Page:
         if request.path in OPEN or request.path.startswith("/page/"):
             request[WHO] = MAINTAINER if spot == "here" else None
         else:
-            who = MAINTAINER if spot == "here" else self._known(asked.peer, _shown(request))
+            who = MAINTAINER if spot == "here" else self._known(asked.peer, token_shown(request))
             if isinstance(who, Refusal):
                 return self.refused(who)
             request[WHO] = who
@@ -169,7 +165,7 @@ class Page:
 
     async def _token(self, request: web.Request) -> web.StreamResponse:
         """A token becomes a cookie, which no script can read."""
-        text = await _posted(request)
+        text = await token_posted(request)
         if not request.secure:
             return self.refused(Refusal("plain", "here you need no token"))
         who = self._known(request.remote or "", text)
@@ -216,7 +212,7 @@ class Page:
                 max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
             )
             await served.prepare(request)
-            _keep_little(request)
+            keep_little(request)
             viewer = Viewer(
                 served, request, who, self._robots, self._hand, self._calls, self._fleet,
                 self._counts,
@@ -274,66 +270,3 @@ _WORDS = {
     404: "there is no such thing here; GET /api lists what there is",
     413: f"over {MAX_BYTES} bytes",
 }
-
-
-def _asked(request: web.Request) -> Asked:
-    hosts = request.headers.getall("Host", [])
-    return Asked(
-        request.remote or "",
-        request.secure,
-        hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
-        request.headers.get("Origin"),
-        request.headers.get("Sec-Fetch-Site"),
-    )
-
-
-def _own_address(request: web.Request) -> str:
-    """The address of ours that the client has reached: no name that somebody points here."""
-    at = None if request.transport is None else request.transport.get_extra_info("sockname")
-    return str(at[0]).lower() if at else ""
-
-
-def _shown(request: web.Request) -> str:
-    """The token in the cookie of a browser, or in the header of a program."""
-    kind, _, text = request.headers.get("Authorization", "").partition(" ")
-    return text.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
-
-
-async def _posted(request: web.Request) -> str:
-    """The token in a form or in JSON; "" where there is none."""
-    body = await request.read()
-    if request.content_type == "application/json":
-        try:
-            given: Any = msgspec.json.decode(body, type=dict[str, str])
-        except (msgspec.MsgspecError, ValueError):
-            return ""
-    else:
-        given = await request.post()
-    text = given.get("token", "")
-    return text if isinstance(text, str) else ""
-
-
-def _keep_little(request: web.Request) -> None:
-    at = None if request.transport is None else request.transport.get_extra_info("socket")
-    if at is not None:
-        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-
-
-async def _headers(request: web.Request, response: web.StreamResponse) -> None:
-    host = request.headers.get("Host", "")
-    # A browser of before 2022 does not take 'self' for ws too; a Host that is none of ours is
-    # refused, and not written back.
-    connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
-    response.headers.update(
-        {
-            "Content-Security-Policy": f"default-src 'self'; connect-src 'self'{connect}; "
-            "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Opener-Policy": "same-origin",
-            "Cross-Origin-Resource-Policy": "same-origin",
-        }
-    )
-    response.headers.setdefault("Cache-Control", "no-store")
-    response.headers["Server"] = "acsard"

@@ -403,7 +403,8 @@ def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus:
         bus.get("srv/reset_odometry")
         seen = messages.find(lambda one: one["total"] > before["total"], 3.0, "news")
     last = seen.value["events"][-1]
-    assert (last["name"], last["level"], last["count"]) == ("reset_odometry", "info", 1)
+    assert (last["name"], last["level"]) == ("reset_odometry", "info")
+    assert last["count"] >= 1  # what others here did in the same second counts with it
     assert "x 0, y 0" in last["text"]
     assert last["by"]
     assert seconds(last["stamp"]) == seconds(seen.value["stamp"]) >= seconds(before["stamp"])

@@ -77,6 +77,7 @@ def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> 
     run(story)
 
 
+@pytest.mark.network
 def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
     page: Page, bus: Bus
 ) -> None:
@@ -154,45 +155,6 @@ def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemo
             (name,) = [row["name"] for row in rows]
             async with session.get(f"/api/recordings/{name}") as answer:
                 assert (await answer.read()).startswith(b"\x89MCAP")
-
-    run(story)
-
-
-def test_the_page_killed_while_it_drives_costs_the_drive_and_nothing_else(
-    daemon: Daemon, bus: Bus, tmp_path: Path
-) -> None:
-    with Page(daemon, tmp_path) as page:
-
-        async def story() -> None:
-            async with hands(page) as ours:
-                await ours.say(subscribe="state", rate=50)
-                await ours.until_driving(0.3)
-                page.signal(signal.SIGKILL)
-
-        run(story)
-    state = bus.at_rest()
-    assert state["mode"] == "ready"
-
-
-def test_what_lay_in_a_frozen_server_moves_nothing_when_it_goes_on(page: Page, bus: Bus) -> None:
-    """Its commands have the stamps of when they were meant: they are old, and nobody's any more."""
-
-    async def story() -> None:
-        async with hands(page) as ours:
-            await ours.say(subscribe="state", rate=50)
-            await ours.until_driving(0.3)
-            page.signal(signal.SIGSTOP)
-            try:
-                await ours.hold(0.3, 1.0)
-                await asyncio.sleep(0.5)  # longer than any command counts
-                before = bus.at_rest()
-            finally:
-                page.signal(signal.SIGCONT)
-            await ours.say(ping=3)
-            await ours.find(lambda said: said.get("pong") == 3)
-            after = bus.state()
-            assert abs(after["x"] - before["x"]) < 0.005
-            assert after["counters"]["commands"] == before["counters"]["commands"]
 
     run(story)
 

@@ -92,7 +92,7 @@ def test_who_only_looks_drives_nothing_whatever_he_sends(page: Page, bus: Bus, v
 
     run(story)
     after = bus.state()
-    assert after["x"] == before["x"]
+    assert abs(after["x"] - before["x"]) < 0.005
     assert after["counters"].get("commands", 0) == before["counters"].get("commands", 0)
 
 
@@ -154,7 +154,8 @@ def test_an_attacker_is_refused_and_counted_and_nothing_moves(
     assert asyncio.run(_status(page, path, getattr(page, where), how)) == status
     assert page.refused()[reason] == counted + 1
     after = bus.state()
-    assert (after["mode"], after["x"]) == (before["mode"], before["x"])
+    assert after["mode"] == before["mode"]
+    assert abs(after["x"] - before["x"]) < 0.005
 
 
 @pytest.mark.parametrize("size", [100_000, 10_000_000])

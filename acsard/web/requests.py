@@ -1,0 +1,87 @@
+"""What a request shows of who sends it, and the headers that keep other pages out of ours."""
+
+from __future__ import annotations
+
+import re
+import socket
+from typing import Any
+
+import msgspec
+from aiohttp import web
+
+from acsard.web.who import Asked
+
+COOKIE = "__Host-acsard"
+"""By its name browsers take it only with Secure, of this host, for all paths."""
+
+HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
+"""What a browser writes into `Host`; it is written back into a header."""
+
+SEND_BUFFER = 65536
+"""Of the kernel, for one client: what lies in it is old when it arrives."""
+
+
+def asked_of(request: web.Request) -> Asked:
+    """What is known of it before anything in it is believed."""
+    hosts = request.headers.getall("Host", [])
+    return Asked(
+        request.remote or "",
+        request.secure,
+        hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
+        request.headers.get("Origin"),
+        request.headers.get("Sec-Fetch-Site"),
+    )
+
+
+def own_address(request: web.Request) -> str:
+    """The address of ours that the client has reached: no name that somebody points here."""
+    at = None if request.transport is None else request.transport.get_extra_info("sockname")
+    return str(at[0]).lower() if at else ""
+
+
+def token_shown(request: web.Request) -> str:
+    """The token in the cookie of a browser, or in the header of a program."""
+    kind, _, text = request.headers.get("Authorization", "").partition(" ")
+    return text.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
+
+
+async def token_posted(request: web.Request) -> str:
+    """The token in a form or in JSON; "" where there is none."""
+    body = await request.read()
+    if request.content_type == "application/json":
+        try:
+            given: Any = msgspec.json.decode(body, type=dict[str, str])
+        except (msgspec.MsgspecError, ValueError):
+            return ""
+    else:
+        given = await request.post()
+    text = given.get("token", "")
+    return text if isinstance(text, str) else ""
+
+
+def keep_little(request: web.Request) -> None:
+    """Let the kernel hold little for a client that does not read."""
+    at = None if request.transport is None else request.transport.get_extra_info("socket")
+    if at is not None:
+        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+
+async def secured(request: web.Request, response: web.StreamResponse) -> None:
+    """The headers that every answer has."""
+    host = request.headers.get("Host", "")
+    # A browser of before 2022 does not take 'self' for ws too; a Host that is none of ours is
+    # refused, and not written back.
+    connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
+    response.headers.update(
+        {
+            "Content-Security-Policy": f"default-src 'self'; connect-src 'self'{connect}; "
+            "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+    )
+    response.headers.setdefault("Cache-Control", "no-store")
+    response.headers["Server"] = "acsard"

@@ -1,0 +1,123 @@
+"""Each way to let go of the robot's page ends the drive, and nothing of it is obeyed later."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.browser import Hands, Page, hands, run
+from tests.system.harness import Bus, Daemon
+
+Way = Callable[[Hands, Page], Awaitable[None]]
+
+
+async def closes(ours: Hands, page: Page) -> None:
+    """The tab is closed."""
+    await ours.socket.close()
+
+
+async def vanishes(ours: Hands, page: Page) -> None:
+    """The browser is killed: the kernel resets its connection."""
+    ours.socket._writer.transport.abort()
+
+
+async def freezes(ours: Hands, page: Page) -> None:
+    """The browser is stopped, or its network is gone: nothing more comes, and nothing says so."""
+
+
+async def releases(ours: Hands, page: Page) -> None:
+    """The finger is lifted: one zero, then silence."""
+    await ours.drive(0.0)
+
+
+async def is_asked_to_end(ours: Hands, page: Page) -> None:
+    """The page's server gets SIGTERM."""
+    page.signal(signal.SIGTERM)
+
+
+async def is_killed(ours: Hands, page: Page) -> None:
+    """The page's server dies."""
+    page.signal(signal.SIGKILL)
+
+
+async def freezes_for_a_while(ours: Hands, page: Page) -> None:
+    """The page's server stands still while commands come in, and goes on later."""
+    page.signal(signal.SIGSTOP)
+    try:
+        await ours.hold(0.3, 0.5)
+        await asyncio.sleep(0.5)  # longer than any command counts
+    finally:
+        page.signal(signal.SIGCONT)
+
+
+OF_THE_BROWSER: tuple[Way, ...] = (closes, vanishes, freezes, releases, freezes_for_a_while)
+OF_THE_SERVER: tuple[Way, ...] = (is_asked_to_end, is_killed)
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with Daemon(tmp_path_factory.mktemp("daemon")) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with Page(daemon, tmp_path_factory.mktemp("page")) as page:
+        yield page
+
+
+def let_go(daemon: Daemon, page: Page, way: Way) -> None:
+    """Drive, let go, and look at what was obeyed until well after the robot stands."""
+    with Bus(daemon.endpoint) as bus:
+        bus.at_rest()
+
+        async def story() -> None:
+            async with hands(page) as ours:
+                await ours.say(subscribe="state", rate=50)
+                await ours.until_driving(0.3)
+                before = bus.count("commands")
+                await way(ours, page)
+                at_rest = bus.at_rest()
+                await asyncio.sleep(0.3)
+                after = bus.state()
+                # On its way when we looked: one, and one more that waited; then at most a zero.
+                assert after["counters"]["commands"] <= before + 3
+                assert abs(after["x"] - at_rest["x"]) < 0.005
+
+        run(story)
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
+def test_who_lets_go_drives_no_more(daemon: Daemon, page: Page, way: Way) -> None:
+    let_go(daemon, page, way)
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("way", OF_THE_SERVER, ids=lambda way: way.__name__)
+def test_whose_page_ends_drives_no_more(daemon: Daemon, tmp_path: Path, way: Way) -> None:
+    with Page(daemon, tmp_path) as page:
+        let_go(daemon, page, way)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
+def test_a_hundred_times(daemon: Daemon, page: Page, way: Way) -> None:
+    for _ in range(100):
+        let_go(daemon, page, way)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("way", OF_THE_SERVER, ids=lambda way: way.__name__)
+def test_a_hundred_ends_of_the_server(daemon: Daemon, tmp_path: Path, way: Way) -> None:
+    for n in range(100):
+        where = tmp_path / str(n)
+        where.mkdir()
+        with Page(daemon, where) as page:
+            let_go(daemon, page, way)
