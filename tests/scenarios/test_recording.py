@@ -46,7 +46,13 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert tally.poses == tally.poses_same >= least
 
 
-@pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
+@pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(PLAIN, id="plain", marks=pytest.mark.slow),
+        pytest.param(FULL, id="checked, counted, with a gyro"),
+    ],
+)
 def test_a_drive_through_every_fault_is_lived_again_to_the_last_bit(config: Config) -> None:
     tape = Tape()
     world = World(config, recorder=tape)

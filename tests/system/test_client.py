@@ -129,6 +129,7 @@ def test_the_readme_has_the_three_examples() -> None:
     assert sorted(map(kind, code_blocks())) == ["async", "five lines", "plain zenoh"]
 
 
+@pytest.mark.slow
 def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
     examples: dict[str, Outcome],
 ) -> None:

@@ -87,6 +87,9 @@ def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence
     return live[first:]
 
 
+pytestmark = pytest.mark.slow  # in virtual time it is in tests/scenarios/test_export.py
+
+
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What was heard live, the static transforms as they were asked for, and the bag."""

@@ -190,6 +190,7 @@ def test_it_has_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
     assert types == {topic: type_name for topic, (type_name, _) in TOPICS.items()}
 
 
+@SLOW
 def test_who_comes_late_gets_tf_static_and_the_last_state(
     viewer: Viewer, shows: Shows, bus: Bus
 ) -> None:
@@ -218,6 +219,7 @@ def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
     assert told.header.stamp.sec > 0
 
 
+@SLOW
 def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/log")
     looked.first()
@@ -301,6 +303,7 @@ def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None
     assert bus.state()["y"] == 0.0
 
 
+@SLOW
 def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bus: Bus) -> None:
     assert viewer.get()["limits.linear_speed"] == 1.0
     assert viewer.set({"limits.linear_speed": 2}) == {"limits.linear_speed": 2.0}

@@ -128,6 +128,7 @@ def test_an_answer_of_a_stranger_hides_no_other_and_does_nothing_to_the_terminal
     robots.tool("call", "clear", who=TWO)
 
 
+@pytest.mark.slow
 def test_who_gives_no_answer_hides_no_other(robots: Robots) -> None:
     with fake(robots, None):
         ended = robots.tool("get", "info")

@@ -80,6 +80,7 @@ def killed(where: Path, seconds: float) -> None:
     assert replayed(where, path) > 50
 
 
+@pytest.mark.slow
 def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: Path) -> None:
     killed(tmp_path, 1.5)
     (cut,) = files(tmp_path)

@@ -79,6 +79,7 @@ def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -
         assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
 
 
+@pytest.mark.slow
 def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:

@@ -51,6 +51,7 @@ def piped(daemon: Daemon) -> Program:
     return Program(acsard("top", "--config", str(daemon.config)), daemon.config.parent, env)
 
 
+@pytest.mark.slow
 def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon(
     tmp_path: Path,
 ) -> None:

@@ -96,6 +96,7 @@ def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
     assert commands[-1]["linear"]["x"] == 0
 
 
+@pytest.mark.slow
 def test_nobody_obeys_a_stamp_twice_or_one_from_before(page: Page, bus: Bus) -> None:
     async def story() -> None:
         async with hands(page) as ours:
