@@ -57,10 +57,11 @@ class Browser:
             words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )
         told = self._where / "DevToolsActivePort"
-        port = until(
-            lambda: told.read_text().split()[0] if told.exists() else "", 20.0, "a browser"
-        )
-        self._wait(self._connect(int(port)))
+
+        def port() -> str | None:
+            return next(iter(told.read_text().split()), None) if told.exists() else None
+
+        self._wait(self._connect(until(port, 20.0, "a browser")))
         for domain in ("Page", "Runtime", "Log"):
             self.ask(f"{domain}.enable")
 
@@ -74,7 +75,7 @@ class Browser:
         if how == signal.SIGKILL:
             self.process.wait(10.0)
 
-    async def _connect(self, port: int) -> None:
+    async def _connect(self, port: str) -> None:
         self._session = aiohttp.ClientSession()
         async with self._session.get(f"http://127.0.0.1:{port}/json") as answer:
             pages = await answer.json()
@@ -149,10 +150,16 @@ class Browser:
         self.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=where)
 
     def tap(self, name: str) -> None:
-        """One more finger, on the element and up again."""
-        down = self._down
-        self.touch("Start", *down, self.middle(name))
-        self.touch("Move" if down else "End", *down)  # who is missing has left the glass
+        """A finger on the element and up again; one more finger is an event of the page's own,
+        because Chromium passes on no touch any more once two were emulated."""
+        if self._down:
+            self.js(
+                f"document.getElementById({name!r}).dispatchEvent(new PointerEvent('pointerdown',"
+                " {pointerId: 99, bubbles: true, cancelable: true}))"
+            )
+        else:
+            self.touch("Start", self.middle(name))
+            self.touch("End")
 
     def lift(self) -> None:
         """All fingers, if there are any."""

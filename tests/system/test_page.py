@@ -45,10 +45,21 @@ class Phone:
         self.browser.touch(kind, (mx + x, my - y))
 
     def hold(self) -> None:
-        """A finger drives forwards."""
-        self.push(0, 0, "Start")
-        self.push(0, 90)
-        until(lambda: self.bus.state()["linear"] > 0.15, 10.0, "it drives")
+        """A finger drives forwards; it presses again where a busy machine made the page let go."""
+        told: list[str] = []
+
+        def drives() -> bool:
+            if not self.browser.js("document.getElementById('stick').matches('.held')"):
+                told.append(self.browser.text("told"))
+                self.browser.lift()
+                self.push(0, 0, "Start")
+                self.push(0, 90)
+            return bool(self.bus.state()["linear"] > 0.15)
+
+        try:
+            until(drives, 10.0, "it drives")
+        except AssertionError as error:
+            raise AssertionError(f"{error}; it said {told}") from None
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +105,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     browser.touch("End")
     browser.tap("clear")
     page.shows("mode", "READY")
-    assert bus.state()["linear"] == pytest.approx(0.0, abs=0.02)
+    bus.at_rest()
     page.hold()
     browser.touch("End")
     bus.at_rest()
@@ -140,7 +151,28 @@ def test_keys_drive_while_they_are_held(page: Phone) -> None:
 
 
 PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
+    mapping: 'standard',
     buttons: Array.from({length: 16}, (_, n) => ({pressed: n === 5 && HELD}))}]"""
+
+
+def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
+    browser, bus = page.browser, page.bus
+    for leave in ("document.getElementById('limit').focus()", "0"):
+        browser.js("document.activeElement.blur()")
+        browser.key("Down", "KeyW", "w")
+        until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+        browser.js(leave)
+        browser.ask("Input.dispatchKeyEvent", type="keyUp", code="KeyW", key="w", modifiers=2)
+        bus.at_rest()
+        assert browser.js("document.getElementById('stick').matches('.held')") is False
+
+
+def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
+    page.browser.tap("tab-events")
+    page.server.process.kill()
+    page.shows("age", "no connection")
+    page.browser.tap("stop")
+    page.shows("alarm", "STOP: no connection to the robot")
 
 
 def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
@@ -160,8 +192,7 @@ def released(page: Phone) -> None:
 
 
 def second_finger(page: Phone) -> None:
-    x, y = page.browser.middle("stick")
-    page.browser.touch("Start", (x, y - 90), (x + 20, y + 20))
+    page.browser.tap("stick")
 
 
 def blurred(page: Phone) -> None:
@@ -177,14 +208,6 @@ def hidden(page: Phone) -> None:
 
 def left(page: Phone) -> None:
     page.browser.open("about:blank")
-
-
-def offline(page: Phone) -> None:
-    page.browser.ask(
-        "Network.emulateNetworkConditions",
-        offline=True, latency=0, downloadThroughput=0, uploadThroughput=0,
-    )  # fmt: skip
-    page.browser.js("link => 0")
 
 
 def stalled(page: Phone) -> None:
@@ -261,12 +284,11 @@ def test_a_browser_that_is_killed_or_frozen_drives_no_more(
             assert took <= TIMEOUT_S + 2 * TICK_S + 1.0 + lost(begun)
             if how == signal.SIGSTOP:
                 until(lambda: time.monotonic() > begun + 1.5, 5.0, "longer than a page may freeze")
-                refused, x = bus.count("command_stale"), bus.state()["x"]
+                x = bus.state()["x"]
                 os.killpg(browser.process.pid, signal.SIGCONT)
                 browser.js("new Promise(done => setTimeout(done, 1000))")
                 # What it sent before it froze came late; and the frozen hand holds no more.
                 assert bus.state()["x"] == pytest.approx(x, abs=1e-3)
-                assert bus.count("command_stale") >= refused
                 assert not browser.js("document.getElementById('stick').classList.contains('held')")
 
 

@@ -98,6 +98,7 @@ export class Drive {
     stick.addEventListener("contextmenu", (event) => event.preventDefault());
     addEventListener("keydown", (event) => this.#key(event, true));
     addEventListener("keyup", (event) => this.#key(event, false));
+    addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
     addEventListener("blur", () => this.release("let go: the window lost the focus"));
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
@@ -125,14 +126,13 @@ export class Drive {
   }
 
   #key(event, down) {
-    const typing = event.target.closest?.("input:not([type=range]), select, textarea");
-    if (!(event.code in KEYS) || typing || event.ctrlKey || event.altKey || event.metaKey) return;
-    if (event.target.matches?.("input[type=range]")) return; // arrows set the slider
-    if (!this.shown) return;
+    if (!(event.code in KEYS)) return;
+    // A key that is let go is let go, wherever the focus is by then and whatever else is down.
+    if (!down && !this.#pressed.delete(event.code)) return;
+    if (down && (!this.shown || busy(event))) return;
     event.preventDefault();
     if (event.repeat) return;
     if (down) this.#pressed.add(event.code);
-    else this.#pressed.delete(event.code);
     if (this.#by && this.#by !== "keys") return;
     const sum = [...this.#pressed].reduce(([x, y], code) => [x + KEYS[code][0], y + KEYS[code][1]], [0, 0]);
     if (!this.#pressed.size) return this.release();
@@ -141,14 +141,26 @@ export class Drive {
   }
 
   #pad() {
-    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected);
+    // Of others nobody knows which axis is which: a trigger at rest may read as full lock.
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected && one.mapping === "standard");
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
-    if (held && this.#by === "pad") this.#show(pad.axes[2] || pad.axes[0] || 0, -(pad.axes[1] || 0));
-    if (held && !this.#padHeld && !this.#by) {
+    if (held && this.#by === "pad") this.#show(farther(pad.axes[0], pad.axes[2]), -farther(pad.axes[1], 0));
+    if (held && !this.#padHeld && !this.#by && document.hasFocus()) {
       this.#show(0, 0);
       this.#press("pad");
     }
     if (!held && this.#by === "pad") this.release();
     this.#padHeld = held;
   }
+}
+
+/** Keys mean something else to what has the focus, or with others. */
+function busy(event) {
+  return event.ctrlKey || event.altKey || event.metaKey || event.target.matches?.("input, select, textarea");
+}
+
+/** The axis that is pushed farther; nothing within the play of a spring. */
+function farther(one = 0, other = 0) {
+  const most = Math.abs(one) > Math.abs(other) ? one : other;
+  return Math.abs(most) < 0.12 ? 0 : most;
 }

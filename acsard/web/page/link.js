@@ -11,6 +11,7 @@ export class Link extends EventTarget {
   #answers = new Map();
   #number = 0;
   #heard = 0;
+  #asked = null; // a ping that has no answer yet, since when
   open = false;
   way = null; // there and back, ms
 
@@ -18,6 +19,11 @@ export class Link extends EventTarget {
     this.#connect();
     setInterval(() => this.#ping(), 1000);
     document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
+  }
+
+  /** How far what is shown may lag behind, ms: the last way there and back, or what is waited for. */
+  get lag() {
+    return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
   }
 
   /** Follow a key at most `rate` times a second, also after a new connection. */
@@ -54,10 +60,13 @@ export class Link extends EventTarget {
     if (this.#socket && this.#socket.readyState <= 1) return;
     const socket = new WebSocket(new URL("ws", location.href.replace(/^http/, "ws").replace(/#.*/, "")));
     this.#socket = socket;
+    const given = setTimeout(() => socket.readyState === WebSocket.CONNECTING && socket.close(), SILENT);
     socket.onopen = () => {
+      clearTimeout(given);
       this.open = true;
       this.#tries = 0;
       this.#heard = performance.now();
+      this.#asked = null;
       for (const [key, rate] of this.#wanted) this.send({ subscribe: key, rate });
       this.#tell("up", {});
       this.#ping();
@@ -65,9 +74,10 @@ export class Link extends EventTarget {
     socket.onmessage = (event) => this.#take(JSON.parse(event.data));
     socket.onclose = (event) => {
       if (this.#socket !== socket) return;
+      const was = this.open;
       this.open = false;
       this.way = null;
-      this.#tell("down", { reason: event.reason });
+      this.#tell("down", { reason: event.reason, never: !was });
       if (document.hidden) return; // again when somebody looks
       setTimeout(() => this.#connect(), AGAIN[Math.min(this.#tries++, AGAIN.length - 1)]);
     };
@@ -75,8 +85,10 @@ export class Link extends EventTarget {
 
   #take(message) {
     this.#heard = performance.now();
-    if ("pong" in message) this.way = performance.now() - message.pong;
-    else if ("answer" in message) this.#answer(message);
+    if ("pong" in message) {
+      this.way = performance.now() - message.pong;
+      if (message.pong === this.#asked) this.#asked = null;
+    } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
     else for (const kind of ["hello", "path", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
   }
@@ -100,7 +112,8 @@ export class Link extends EventTarget {
       this.#connect();
       return;
     }
-    this.send({ ping: performance.now() });
+    this.#asked ??= performance.now();
+    this.send({ ping: this.#asked });
   }
 
   #tell(kind, detail) {

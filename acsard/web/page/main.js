@@ -53,12 +53,12 @@ function followed(key, rate, wanted) {
 async function stop() {
   drive.release();
   const told = await link.call("stop");
-  if (!told.ok) views.text("told", `STOP: ${told.text}`);
+  views.alarm(told.ok ? "" : `STOP: ${told.text}`);
 }
 
 async function asked(verb) {
   const told = await link.call(verb);
-  views.text("told", told.ok ? "" : words(told.text));
+  views.alarm(told.ok ? "" : words(told.text));
   said(told);
 }
 
@@ -74,21 +74,25 @@ function said(told) {
 
 async function got(path) {
   try {
-    const answer = await fetch(path);
-    return answer.ok ? await answer.json() : null;
+    const answer = await fetch(path, { signal: AbortSignal.timeout(5000) });
+    const told = await answer.json();
+    return answer.ok ? told : { error: told.error ?? `${answer.status}` };
   } catch {
-    return null; // no connection: the age says so
+    return { error: "no answer from the robot" };
   }
 }
 
 async function listed() {
   const files = await got("api/recordings");
-  views.recordings($("recordings"), $("no-recordings"), files ?? []);
+  views.text("no-recordings", files.error ?? "none here");
+  views.recordings($("recordings"), $("no-recordings"), files.error ? [] : files);
 }
 
 async function configured() {
   if (hello?.role !== "maintainer") return views.text("set-told", "settings are for maintainers");
-  settings.show((await got("api/settings")) ?? []);
+  const rows = await got("api/settings");
+  if (rows.error) return views.text("set-told", rows.error);
+  settings.show(rows);
 }
 
 function limited() {
@@ -97,9 +101,11 @@ function limited() {
 }
 
 function looked() {
-  const old = link.open ? performance.now() - heard : Infinity;
-  views.freshness(old, link.way);
-  if (old > 1000) drive.release("let go: nothing is heard of the robot");
+  const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
+  // A state that is published seldom is old for longer.
+  const fresh = Math.max(500, 2500 / (hello?.state_rate || 10));
+  views.freshness(old, fresh, link.way);
+  if (old > 2 * fresh) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
   for (const plot of Object.values(plots)) plot.draw(performance.now());
 }
@@ -146,7 +152,8 @@ async function invited() {
   if (!token) return;
   history.replaceState(null, "", location.pathname);
   const body = JSON.stringify({ token });
-  const answer = await fetch("token", { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => null);
+  const headers = { "Content-Type": "application/json" };
+  const answer = await fetch("token", { method: "POST", headers, body, signal: AbortSignal.timeout(5000) }).catch(() => null);
   if (!answer?.ok && !answer?.redirected) views.text("reason", "this invitation is not valid: ask for a new one (acsard web --invite)");
 }
 
@@ -167,12 +174,20 @@ link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"),
 link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
 link.addEventListener("path", ({ detail }) => map.trail(detail.path));
 link.addEventListener("fleet", ({ detail }) => views.cards($("cards"), detail.fleet));
-link.addEventListener("refused", ({ detail }) => views.text("told", words(objection(state, SOURCE, hello?.sender)) || detail.reason));
+link.addEventListener("refused", ({ detail }) => {
+  const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
+  views.text("told", why || detail.reason);
+});
 link.addEventListener("gone", ({ detail }) => views.text("reason", detail.gone));
-link.addEventListener("down", ({ detail }) => {
+link.addEventListener("down", async ({ detail }) => {
   drive.release("let go: the connection is gone");
   heard = -Infinity;
   if (detail.reason) views.text("reason", detail.reason);
+  else if (detail.never) {
+    // A browser does not say why it was not let in; this does.
+    const told = await got("api/whoami");
+    if (told.error && !link.open) views.text("reason", told.error);
+  }
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));

@@ -88,10 +88,17 @@ export function banner(state) {
   doubt.hidden = !doubt.textContent;
 }
 
-/** How old what is shown is, and the way to the robot and back. */
-export function freshness(old, way) {
-  document.body.classList.toggle("stale", old > 500);
-  text("age", old === Infinity ? "no connection" : old > 500 ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
+/** How old what is shown is, ms; beyond `fresh` it is stale. And the way to the robot and back. */
+export function freshness(old, fresh, way) {
+  const stale = old > fresh;
+  document.body.classList.toggle("stale", stale);
+  text("age", old === Infinity ? "no connection" : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
+}
+
+/** What must be seen in every view, until `words` are "". */
+export function alarm(words) {
+  text("alarm", words);
+  document.getElementById("alarm").hidden = !words;
 }
 
 export function text(id, words) {
