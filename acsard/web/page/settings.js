@@ -21,7 +21,9 @@ export class Settings {
 
   #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
-    const label = made("label", "", row.key, made("small", "", `${row.what}${range}; ${row.when}`));
+    // A narrow screen breaks a name where its words end.
+    const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
+    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}`));
     label.htmlFor = id;
     const field = made(row.choices ? "select" : "input", "");
     for (const one of row.choices ?? []) field.append(new Option(one, one));
