@@ -17,6 +17,7 @@ from websockets.exceptions import InvalidStatus
 
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Twist, Vector3
+from acsard.values import NS_PER_S
 from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO,
@@ -509,7 +510,7 @@ def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) 
     looked = [viewer.show(topic) for topic in ("/odom", "/tf", "/joint_states")]
     for one in looked:
         one.first()
-    assert alone < cost() / 4
+    assert alone < cost() / 2
 
 
 @SLOW
@@ -521,19 +522,17 @@ def test_what_a_stamp_says_is_old_moves_nobody_however_it_trickles_in(
     twist = json.loads(speed(0.4))
 
     def stamped(ns: int) -> None:
-        sec, nanosec = divmod(ns, 10**9)
+        sec, nanosec = divmod(ns, NS_PER_S)
         header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}
         send(json.dumps({"header": header, "twist": twist}).encode())
         time.sleep(0.05)
 
     began, until_driven = time.time_ns(), time.monotonic() + 20.0
-    while bus.state()["linear"] < 0.2:
+    while bus.state()["linear"] < 0.2 or time.time_ns() - began < NS_PER_S:
         assert time.monotonic() < until_driven, bus.state()["reason"]
         stamped(time.time_ns())
     with followed(bus) as (asked, applied):
-        # A tunnel that was held up for a second passes on, one by one, what went into it.
-        late = time.time_ns() - began
-        assert late > 0
+        # A tunnel that was held up passes on, one by one, what went into it more than 1 s ago.
         bus.at_rest()
         stood = len(applied)
         for number in range(40):
