@@ -115,16 +115,17 @@ class Client:
         """The full key of a name of the topic table, for example "odom"."""
         return full_key(self._id, name)
 
-    def send(self, linear: float, angular: float = 0.0) -> None:
+    def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving.
 
         The first call sends a zero in its place, since the daemon wants one before it drives.
+        `stamp_ns` is when it was meant, by the clock of whoever meant it, where we only pass it on.
         """
         if self._opened:
-            self._put(linear, angular)
+            self._put(linear, angular, stamp_ns)
         else:
             self._opened = True
-            self._put(0.0, 0.0)
+            self._put(0.0, 0.0, stamp_ns)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for so long, then to a stand; returns when the robot stands.
@@ -209,14 +210,15 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def _put(self, linear: float, angular: float) -> None:
+    def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
         # The daemon takes 1000 commands a second on a key: a zero on the heels of another command
         # would be lost.
         time.sleep(max(0.0, self._put_s + SPACING_S - time.monotonic()))
         self._put_s = time.monotonic()
-        now_ns = clock.mono_ns() + self._wall_offset_ns
+        if stamp_ns is None:
+            stamp_ns = clock.mono_ns() + self._wall_offset_ns
         message = schema.TwistStamped(
-            schema.Header(schema.Time.from_ns(now_ns)),
+            schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
         self._sequence += 1
@@ -225,7 +227,7 @@ class Client:
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
-            attachment=Signature(self.sender, now_ns, self._sequence).pack(),
+            attachment=Signature(self.sender, stamp_ns, self._sequence).pack(),
             timestamp=self.session.new_timestamp(),
         )
 

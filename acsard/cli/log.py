@@ -6,14 +6,12 @@ import argparse
 import re
 import sys
 import time
-from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli import log_export
+from acsard.cli import log_export, log_report
 from acsard.cli.common import load
 from acsard.host.exits import Exit, ExitError
-from acsard.host.extras import install
 
 if TYPE_CHECKING:
     from acsard.record.file import Closing, Recording
@@ -58,16 +56,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     export = log_export.add(inner)
     _span(export)
     export.set_defaults(main=export_one)
-    report = inner.add_parser(
-        "report",
-        help="draw it: one HTML file with path, speeds, who drove and why, link, events",
-        description="Draw what happened as one HTML file that needs no network. Needs the library "
-        "plotly; without it, it tells what to type.",
-    )
-    report.add_argument("file", nargs="?", metavar="FILE")
-    report.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
+    report = log_report.add(inner)
     _span(report)
-    report.add_argument("--force", action="store_true", help="overwrite a file that is there")
     report.set_defaults(main=report_one)
     for one in (show, replay, recover, export, report):
         _directory(one, argparse.SUPPRESS)
@@ -197,45 +187,16 @@ def export_one(args: argparse.Namespace) -> int:
 
 def report_one(args: argparse.Namespace) -> int:
     """Draw it."""
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError:
-        message = f"needs the library plotly; run: {install('report')}"
-        raise ExitError(Exit.FAILURE, message) from None
-    from acsard.record.again import Onlooker, verdict
-    from acsard.report.account import Origin, notes
-    from acsard.report.course import Course
-    from acsard.report.page import page
-
+    plotly = log_report.library()
     recording = _recording(args)
-    new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
-    if new.exists() and not args.force:
-        raise ExitError(Exit.FAILURE, f"{new} is there already; another name, or --force")
-    about, looked = recording.about, Onlooker(recording)
-    began_s = about.wall_ns / 1e9
-    begin, end = (_seconds(text, began_s) for text in (args.begin, args.end))
-    course = Course(looked.config, begin, end)
-    for step, outputs, robot in looked.steps():
-        course.step(step, outputs, robot)
-        if course.over:
-            deque(recording.messages(), maxlen=0)  # only what is missing of it
-            break
-    if course.began is None:
-        raise ExitError(Exit.FAILURE, f"{recording.path} has no step of that time to draw")
-    course.end()
-    said = [*filter(None, [_state(recording).strip(" []")]), *looked.notes]
-    tally = looked.replay.tally
-    if not (tally.same or looked.notes or course.missing):
-        said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
-    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
-    offset_s = time.localtime(course.began).tm_gmtoff
-    text = page(course, origin, get_plotlyjs(), _clock, offset_s)
-    try:
-        new.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
-    print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
-    for note in notes(course, origin):
+    began_s = recording.about.wall_ns / 1e9
+    notes = log_report.report_one(
+        recording,
+        args,
+        plotly,
+        log_report.Words(lambda text: _seconds(text, began_s), _clock, _state),
+    )
+    for note in notes:
         print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
 
@@ -293,8 +254,10 @@ def _seconds(text: str | None, began_s: float) -> float | None:
 
 
 def _sentence(one: Told) -> str:
+    from acsard.ros.shapes import how_often
+
     by = f" (by {one.by})" if one.by else ""
-    times = f" ({one.count} times)" if one.count > 1 else ""
+    times = how_often(one.text, one.count)
     mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
     return f"{_clock(one.seconds)}  {mark}{one.name.replace('_', ' ')}: {one.text}{by}{times}"
 

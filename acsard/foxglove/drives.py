@@ -9,13 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from threading import Condition, Thread
 
+import zenoh
+
 from acsard.client import Client
-from acsard.foxglove.hand import Hand
+from acsard.foxglove.hand import Hand, Wish
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.twists import encoding_of, twist
+from acsard.foxglove.twists import encoding_of, wish
 from acsard.host import clock
 from acsard.messages.encodings import DecodeError
-from acsard.values import NS_PER_S, REST, Twist
+from acsard.values import NS_PER_S
 
 CHANNELS = 64
 """That one viewer may publish on."""
@@ -27,6 +29,9 @@ TOO_SLOW = (
     "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 Hz "
     "or more"
 )
+
+
+LOST = "the bus takes no commands: what a panel publishes is lost until it does"
 
 
 class _Viewer:
@@ -47,7 +52,7 @@ class Drives:
         self.topic, self.forbidden = topic, forbidden
         self._robot_of, self._notices = robot_of, notices
         self._viewers: dict[int, _Viewer] = {}
-        self._parting: list[Client] = []
+        self._parting: list[tuple[Client, Wish]] = []
         self._news = Condition()
         self._ended = False
         self._thread = Thread(target=self._run, name="drives", daemon=True)
@@ -87,12 +92,12 @@ class Drives:
             self._notices.say("error", "drive", self.forbidden)
             return
         try:
-            wish = twist(encoding, data)
+            wished = wish(encoding, data)
         except DecodeError as error:
             self._notices.say("warning", "drive", f"{self.topic}: refused: {error}")
             return
         with self._news:
-            viewer.hand.take(wish, now_ns)
+            viewer.hand.take(wished, now_ns)
             self._news.notify()
         if viewer.hand.is_slow():
             self._notices.say("warning", "drive", TOO_SLOW)
@@ -104,8 +109,8 @@ class Drives:
             if viewer is None:
                 return
             encoding, _ = viewer.channels.pop(channel, ("", ""))
-            if encoding and viewer.hand.end(clock.mono_ns()) is not None:
-                self._parting.append(viewer.robot)
+            if encoding:
+                self._part(viewer)
             if not viewer.channels:
                 del self._viewers[client]
             self._news.notify()
@@ -123,8 +128,7 @@ class Drives:
         """A zero for everybody who drives, then silence."""
         with self._news:
             for viewer in self._viewers.values():
-                if viewer.hand.end(clock.mono_ns()) is not None:
-                    self._parting.append(viewer.robot)
+                self._part(viewer)
             self._viewers.clear()
             self._ended = True
             self._news.notify()
@@ -132,25 +136,41 @@ class Drives:
 
     # ours
 
+    def _part(self, viewer: _Viewer) -> None:
+        """The viewer lets go; the lock is held."""
+        zero = viewer.hand.end(clock.mono_ns())
+        if zero is not None:
+            self._parting.append((viewer.robot, zero))
+
     def _run(self) -> None:
         while True:
             with self._news:
-                while not (due := self._due()) and not self._ended:
+                while not ((due := self._due()) or self._parting or self._ended):
                     self._news.wait(self._left())
-            for robot, wish in due:
-                robot.send(wish.linear, wish.angular)
-            if self._ended and not due:
-                return
+                parting, self._parting = self._parting, []
+                if not (parting or due):
+                    return
+            for robot, zero in parting:
+                self._send(robot, zero)
+            for viewer in due:
+                # The bus may have held up the one before: how old it is counts from now.
+                with self._news:
+                    wished = viewer.hand.send(clock.mono_ns())
+                if wished is not None:
+                    self._send(viewer.robot, wished)
 
-    def _due(self) -> list[tuple[Client, Twist]]:
+    def _send(self, robot: Client, wished: Wish) -> None:
+        twist = wished.twist
+        try:
+            robot.send(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
+        except zenoh.ZError as error:
+            self._notices.say("error", "drive", f"{LOST} ({error})")
+
+    def _due(self) -> list[_Viewer]:
+        """Who has something to send."""
         now_ns = clock.mono_ns()
-        due = [(robot, REST) for robot in self._parting]
-        self._parting.clear()
-        for viewer in self._viewers.values():
-            wish = viewer.hand.send(now_ns)
-            if wish is not None:
-                due.append((viewer.robot, wish))
-        return due
+        times = [(viewer, viewer.hand.due_ns()) for viewer in self._viewers.values()]
+        return [viewer for viewer, due_ns in times if due_ns is not None and due_ns <= now_ns]
 
     def _left(self) -> float | None:
         """How long until something is due, s; None for nothing."""

@@ -2,11 +2,13 @@
 
 A panel repeats what it asks for while a button is held, and falls silent when it is let go. Each
 message goes once: nothing is repeated here. After a silence a zero goes first, as the daemon wants
-of who begins. Messages carry no time, but a heap of them after a silence is what a link, or a
-process that stood, has held back: it is lived by nobody.
+of who begins. How late a message with a stamp is, the daemon judges. Few have one, but a heap of
+them after a silence is what a link, or a process that stood, has held back: it is lived by nobody.
 """
 
 from __future__ import annotations
+
+from msgspec import Struct
 
 from acsard.values import NS_PER_S, REST, Twist
 
@@ -31,13 +33,22 @@ SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 panel that publishes too seldom."""
 
 
+class Wish(Struct, frozen=True):
+    """A twist, and when it was meant by the clock of who meant it, ns; None where nothing says."""
+
+    twist: Twist
+    stamp_ns: int | None = None
+
+
 class Hand:
     """The commands of one viewer: of those that wait, the newest."""
 
     def __init__(self) -> None:
         self.replaced = self.stale = 0
         """Messages that did not go: a newer one came, or it was too late for them."""
-        self._wish: Twist | None = None
+        self._wish: Wish | None = None
+        self._stamp_ns: int | None = None
+        """Of the last that came."""
         self._came_ns = 0
         self._heard_ns: int | None = None
         self._lead = False
@@ -50,7 +61,7 @@ class Hand:
         """When a speed was last asked for, and no zero since."""
         self._slow = 0
 
-    def take(self, twist: Twist, now_ns: int) -> None:
+    def take(self, wish: Wish, now_ns: int) -> None:
         """One has come."""
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         if silence is None or silence > SILENCE_NS:
@@ -62,8 +73,9 @@ class Hand:
             self._heap += 1
         if self._wish is not None:
             self.replaced += 1
-        self._wish, self._came_ns, self._heard_ns = twist, now_ns, now_ns
-        self._asked_ns = None if twist == REST else now_ns
+        self._wish, self._stamp_ns = wish, wish.stamp_ns
+        self._came_ns = self._heard_ns = now_ns
+        self._asked_ns = None if wish.twist == REST else now_ns
 
     def due_ns(self) -> int | None:
         """When `send` has something to send: at once for what is past; None for never."""
@@ -71,29 +83,35 @@ class Hand:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
-    def send(self, now_ns: int) -> Twist | None:
+    def send(self, now_ns: int) -> Wish | None:
         """What to send now; None for nothing."""
         if self._lead:
             self._lead = False
-            return REST
+            return self._zero(now_ns)
         if self._wish is None or now_ns < self._hold_until_ns:
             return None
-        twist, self._wish = self._wish, None
+        wish, self._wish = self._wish, None
         heap, self._heap = self._heap, 0
         if heap > 1 or now_ns - self._came_ns > STALE_NS:
             self.stale += 1
             return None
-        self._moved_ns = None if twist == REST else now_ns
-        return twist
+        self._moved_ns = None if wish.twist == REST else now_ns
+        return wish
 
-    def end(self, now_ns: int) -> Twist | None:
+    def end(self, now_ns: int) -> Wish | None:
         """The viewer lets go: a zero if a speed of his may still be followed."""
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
         if moved_ns is None or now_ns - moved_ns > LONGEST_NS:
             return None
-        return REST
+        return self._zero(now_ns)
+
+    def _zero(self, now_ns: int) -> Wish:
+        """One of ours, by his clock: another's would look as if his had been set."""
+        if self._stamp_ns is None:
+            return Wish(REST)
+        return Wish(REST, self._stamp_ns + now_ns - self._came_ns)
 
     def drives(self, now_ns: int) -> bool:
         """He asks for a speed."""

@@ -1,4 +1,4 @@
-"""What a viewer publishes -> a twist, or why it is none; pure.
+"""What a viewer publishes -> what it wishes, or why that is nothing; pure.
 
 Decoded as the daemon decodes commands, by its rules: refused whole, with the reason.
 """
@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.foxglove.hand import Wish
 from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
 from acsard.messages.encodings import DecodeError, encoding_name
-from acsard.values import Command, Twist
+from acsard.values import Command
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """For twists alone, of which neither joints nor wheels are asked."""
@@ -33,6 +34,7 @@ def command(key: str, encoding: str, payload: bytes, arrived_ns: int) -> Command
     return _receiver.command(Arrival(key, True, payload, encoding, arrived_ns, None, ""))
 
 
-def twist(encoding: str, payload: bytes) -> Twist:
-    """The twist in what a viewer published; raises `DecodeError`."""
-    return command("cmd/app", encoding, payload, 0).twist
+def wish(encoding: str, payload: bytes) -> Wish:
+    """The twist in what a viewer published, with its stamp; raises `DecodeError`."""
+    found = command("cmd/app", encoding, payload, 0)
+    return Wish(found.twist, found.stamp_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 from acsard.config.parsing import ConfigError, parse
@@ -70,13 +71,19 @@ class Course:
             self.robot, self.last = state
             # by newer code, its parts may have what it knows nothing of
             adopt(self.robot, Robot(config_of(recording)), Robot(self.config))
-        self._whole = state is not None
+        self._state = state
+
+    @contextmanager
+    def living(self) -> Iterator[None]:
+        """Around what lives it; raises `RecordingError` where its state lacks what is asked."""
+        with _known(self._recording, self._state):
+            yield
 
     def steps(self) -> Iterator[Step]:
         """One after the other, while none is missing; raises `RecordingError`."""
         path, number = self._recording.path, None
         for step in steps(self._recording):
-            if number is None and not self._whole and step.number > 0:
+            if number is None and self._state is None and step.number > 0:
                 raise RecordingError(f"{path}: its first steps are missing or damaged")
             if number is not None and step.number != number + 1:
                 missing = step.number - number - 1
@@ -92,8 +99,9 @@ def live(recording: Recording, other: Config | None = None) -> Lived:
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
     course = Course(recording, other)
     replay = Replay(course.config, course.robot, course.last)
-    for step in course.steps():
-        replay.step(step)
+    with course.living():
+        for step in course.steps():
+            replay.step(step)
     return Lived(replay.tally, course.trouble)
 
 
@@ -108,19 +116,25 @@ class Onlooker:
         self.config = config_of(recording)
         try:
             self._began = _state(recording)
+            if self._began is not None:
+                adopt(self._began.robot, Robot(self.config), Robot(self.config))
         except RecordingError as error:
             self._began = None
             self.notes.append(f"what is computed begins with a robot that knows nothing: {error}")
         self.replay = Replay(self.config, *(self._began or ()))
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
-        """Each step as it was recorded, what it decides now, and the robot after it."""
+        """Each step as it was recorded, what it decides now, and the robot after it.
+
+        Raises `RecordingError` where its state lacks what is asked of it.
+        """
         number = None
         for step in steps(self._recording):
             if number is None and self._began is None and step.number > 0 and not self.notes:
                 self.notes.append("its first steps are missing: the robot is begun without them")
             number = step.number
-            self.replay.step(step)
+            with _known(self._recording, self._began):
+                self.replay.step(step)
             if self.replay.outputs is not None:
                 yield step, self.replay.outputs, self.replay.robot
 
@@ -131,13 +145,29 @@ def _state(recording: Recording) -> State | None:
             try:
                 return thaw(data)
             except StateError as error:
-                raise RecordingError(
-                    f"{recording.path}: {error}; it was recorded by acsard "
-                    f"{recording.about.version}, whose replay can read it"
-                ) from None
+                raise _foreign(recording, str(error)) from None
         if topic == "steps":
             return None
     return None
+
+
+@contextmanager
+def _known(recording: Recording, state: State | None) -> Iterator[None]:
+    """A robot of other code may lack, deep in it, what the code of today asks for."""
+    try:
+        yield
+    except AttributeError as error:
+        if state is None:
+            raise
+        lacks = f"this version cannot read the state at its start: {error}"
+        raise _foreign(recording, lacks) from error
+
+
+def _foreign(recording: Recording, why: str) -> RecordingError:
+    return RecordingError(
+        f"{recording.path}: {why}; it was recorded by acsard {recording.about.version}, whose "
+        "replay can read it"
+    )
 
 
 def verdict(tally: Tally) -> str:

@@ -1,15 +1,8 @@
-"""A recording -> files for other programs: what the robot said then, or a table of what it did.
-
-A file stands there whole or not at all: it is written beside its name and gets it at the end.
-"""
+"""A recording -> files for other programs: what the robot said then, or a table of what it did."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from errno import EEXIST
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple, Protocol
 
@@ -21,6 +14,7 @@ from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record import bag, table
 from acsard.record.again import Course
+from acsard.record.beside import beside, synced
 from acsard.record.file import About, Recording
 from acsard.record.published import Published, Publisher
 from acsard.record.replay import lived
@@ -165,16 +159,17 @@ def export(
     course = Course(recording, other)
 
     def written(sink: _Sink, stream: BinaryIO) -> None:
-        _all(course, sink, span, progress)
+        with course.living():
+            _all(course, sink, span, progress)
         if not sink.count:
             raise RecordingError(f"{recording.path} has nothing in that time")
         sink.finish()
-        _synced(stream)
+        synced(stream)
 
     def messages(stream: BinaryIO) -> _Messages:
         return _Messages(stream, course.robot, recording.about, recording.path.name)
 
-    with _beside(new, force) as part:
+    with beside(new, force) as part:
         if kind == "rosbag2":
             part.mkdir()
             file = part / f"{new.name}_0.mcap"
@@ -182,7 +177,7 @@ def export(
                 written(sink := messages(stream), stream)
             with (part / "metadata.yaml").open("wb") as stream:
                 stream.write(bag.metadata(file.name, sink.topics, *sink.times).encode())
-                _synced(stream)
+                synced(stream)
             return Done(sink.count, course.trouble)
         with part.open("wb") as stream:
             one: _Sink = _Table(stream) if kind == "csv" else messages(stream)
@@ -205,9 +200,10 @@ def measured(recording: Recording) -> bytes:
     """The table that `acsard calibrate` reads; raises `RecordingError` if it were no use."""
     course = Course(recording)
     lines, turned = [table.MEASURED_HEADER], False
-    for step in course.steps():
-        lines += table.measured(step, lived(course.robot, step))
-        turned = turned or bool(step.inputs.gyro)
+    with course.living():
+        for step in course.steps():
+            lines += table.measured(step, lived(course.robot, step))
+            turned = turned or bool(step.inputs.gyro)
     if not turned:
         raise RecordingError(
             f"{recording.path} holds no gyro, so there is nothing to compare the wheels with: "
@@ -215,51 +211,3 @@ def measured(recording: Recording) -> bytes:
             "columns x and y of what measures positions"
         )
     return ("\n".join(lines) + "\n").encode()
-
-
-def _synced(stream: BinaryIO) -> None:
-    stream.flush()
-    os.fsync(stream.fileno())
-
-
-@contextmanager
-def _beside(new: Path, force: bool) -> Iterator[Path]:
-    """Where to write what is to be `new`, which it is at the end, if all went well."""
-    _require_free(new, force)
-    part = new.with_name(f".{new.name}.{os.getpid()}.part")
-    try:
-        yield part
-        _require_free(new, force)
-        if new.is_dir():
-            shutil.rmtree(new)
-        os.replace(part, new)
-    except BaseException:
-        _remove(part)
-        raise
-
-
-def _require_free(new: Path, force: bool) -> None:
-    """Only what may have been an export may go, and only by `force`."""
-    if not (new.exists() or new.is_symlink()):
-        return
-    if not force:
-        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
-    if new.is_dir() and not (new / "metadata.yaml").is_file():
-        raise FileExistsError(EEXIST, "it is a directory, and no bag")
-    if new.is_file() and _is_recording(new):
-        raise FileExistsError(EEXIST, "it is a recording; name another file")
-
-
-def _is_recording(path: Path) -> bool:
-    try:
-        Recording(path)
-    except RecordingError:
-        return False
-    return True
-
-
-def _remove(part: Path) -> None:
-    if part.is_dir():
-        shutil.rmtree(part)
-    else:
-        part.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ CDR has no maps and no "none", so counters are a list and an age that there is n
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -29,6 +30,9 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
+NUMBERED = re.compile(r"\d+ (x|times)\b")
+"""So begins what `drive/tally.py` has put together of several."""
+
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """As ROS numbers them."""
 
@@ -36,9 +40,13 @@ LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 def log(event: Event | Happening, stamp: Time) -> Log:
     """An event of a step, or of `events`, told in one line."""
     by = f" (by {event.by})" if event.by else ""
-    times = f" ({event.count} times)" if event.count > 1 else ""
-    text = f"{event.text}{by}{times}"
+    text = f"{event.text}{by}{how_often(event.text, event.count)}"
     return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
+
+
+def how_often(text: str, count: int) -> str:
+    """What to put behind a text that does not begin with its numbers itself; "" for nothing."""
+    return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
 
 class Counter(Struct, frozen=True):

@@ -58,9 +58,9 @@ class Tape:
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
 
-    def write(self, path: Path, config: Config) -> None:
-        """The file that the daemon would have written."""
-        now = self.taken[0].inputs.now
+    def write(self, path: Path, config: Config, first: int = 0) -> None:
+        """The file that the daemon would have written, from the start or from a state it has."""
+        now = self.taken[first].inputs.now
         text = "\n".join(document(effective(config))) + "\n"
         about = About(
             config.robot.id,
@@ -72,7 +72,9 @@ class Tape:
             started_ns=START.wall_ns,
         )
         writing = Writing(path, about)
-        for at in range(0, len(self.taken), BATCH):
+        if first:
+            writing.add("state", now.wall_ns, self.states[first])
+        for at in range(first, len(self.taken), BATCH):
             batch = self.taken[at : at + BATCH]
             before = self.taken[at - 1].outputs.reason if at else None
             writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch, before))

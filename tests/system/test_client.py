@@ -537,9 +537,9 @@ def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> N
     sent = ""
     original = Client._put
 
-    def put(self: Client, linear: float, angular: float) -> None:
+    def put(self: Client, linear: float, angular: float, stamp_ns: int | None) -> None:
         nonlocal sent
-        original(self, linear, angular)
+        original(self, linear, angular, stamp_ns)
         sent = str(linear)
 
     with pytest.MonkeyPatch.context() as patch, fresh.follow("cmd/app") as commands:

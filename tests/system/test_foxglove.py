@@ -17,6 +17,7 @@ from websockets.exceptions import InvalidStatus
 
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Twist, Vector3
+from acsard.values import NS_PER_S
 from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO,
@@ -497,9 +498,45 @@ def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> N
 
 
 @SLOW
-def test_nobody_who_looks_costs_nothing(shows: Shows, bus: Bus) -> None:
-    before = cpu_seconds(shows.pid)
-    with bus.follow("odom") as odom:
-        until(lambda: len(odom.seen) >= 100, 5.0, "a second of odometry")
-    # A tick of the kernel's accounting is 10 ms.
-    assert cpu_seconds(shows.pid) - before <= 0.05
+def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) -> None:
+    def cost() -> float:
+        """Processor time while the daemon publishes so much, s."""
+        with bus.follow("odom") as odom:
+            before = cpu_seconds(shows.pid)
+            until(lambda: len(odom.seen) >= 300, 20.0, "three seconds of odometry")
+            return cpu_seconds(shows.pid) - before
+
+    alone = cost()
+    looked = [viewer.show(topic) for topic in ("/odom", "/tf", "/joint_states")]
+    for one in looked:
+        one.first()
+    assert alone < cost() / 2
+
+
+@SLOW
+def test_what_a_stamp_says_is_old_moves_nobody_however_it_trickles_in(
+    viewer: Viewer, bus: Bus
+) -> None:
+    name = "geometry_msgs/msg/TwistStamped"
+    send, _ = viewer.publish_on("/cmd_vel", "json", name)
+    twist = json.loads(speed(0.4))
+
+    def stamped(ns: int) -> None:
+        sec, nanosec = divmod(ns, NS_PER_S)
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}
+        send(json.dumps({"header": header, "twist": twist}).encode())
+        time.sleep(0.05)
+
+    began, until_driven = time.time_ns(), time.monotonic() + 20.0
+    while bus.state()["linear"] < 0.2 or time.time_ns() - began < NS_PER_S:
+        assert time.monotonic() < until_driven, bus.state()["reason"]
+        stamped(time.time_ns())
+    with followed(bus) as (asked, applied):
+        # A tunnel that was held up passes on, one by one, what went into it more than 1 s ago.
+        bus.at_rest()
+        stood = len(applied)
+        for number in range(40):
+            stamped(began + number * 50_000_000)
+        assert len(asked) >= 40
+        until(lambda: len(applied) > stood, 5.0, "what is applied")
+    assert {linear for _, linear in applied[stood:]} == {0.0}

@@ -64,10 +64,34 @@ def test_nothing_is_overwritten_without_force(
     new.write_text("mine")
     code, _, err = report(capsys, QUIET, new)
     assert code == 1
-    assert f"{new} is there already" in err
+    assert f"cannot write {new}: it exists; --force writes it anew" in err
     assert new.read_text() == "mine"
     assert report(capsys, QUIET, new, "--force")[0] == 0
     assert new.stat().st_size > 1e6
+
+
+def test_a_recording_never_goes_not_even_by_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "other.mcap"
+    shutil.copy(QUIET, new)
+    code, _, err = report(capsys, QUIET, new, "--force")
+    assert code == 1
+    assert f"cannot write {new}: it is a recording; name another file" in err
+    assert new.read_bytes() == QUIET.read_bytes()
+
+
+def test_what_was_there_goes_only_when_all_of_the_new_one_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "here.html"
+    new.write_text("mine")
+    assert report(capsys, QUIET, new, "--force", "--from", "9999")[0] == 1
+    assert new.read_text() == "mine"
+    before = new.stat().st_ino
+    assert report(capsys, QUIET, new, "--force")[0] == 0
+    assert new.stat().st_ino != before  # another file in its place, not the old one written over
+    assert [*tmp_path.iterdir()] == [new]
 
 
 def test_a_part_of_the_time_and_what_was_cut(

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.foxglove.hand import DRIVES_NS, HEAP_NS, LONGEST_NS, SILENCE_NS, STALE_NS, Hand
+from acsard.foxglove.hand import (
+    DRIVES_NS,
+    HEAP_NS,
+    LONGEST_NS,
+    SILENCE_NS,
+    STALE_NS,
+    Hand,
+    Wish,
+)
 from acsard.values import NS_PER_S, REST, Twist
 
 AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
@@ -25,12 +33,12 @@ class Panel:
             self.now = max(self.now, due)
             wish = self.hand.send(self.now)
             if wish is not None:
-                self.gone.append(wish)
+                self.gone.append(wish.twist)
         self.now = end
 
     def press(self, twist: Twist, times: int = 1, every_ns: int = 100 * MS) -> None:
         for _ in range(times):
-            self.hand.take(twist, self.now)
+            self.hand.take(Wish(twist), self.now)
             self.wait(every_ns)
 
 
@@ -63,7 +71,7 @@ def test_a_heap_that_was_held_back_is_lived_by_nobody(panel: Panel) -> None:
     panel.press(AHEAD, times=3)
     panel.wait(2 * NS_PER_S)
     for _ in range(20):
-        panel.hand.take(AHEAD, panel.now)
+        panel.hand.take(Wish(AHEAD), panel.now)
         panel.now += MS
     panel.wait(NS_PER_S)
     assert panel.gone == [REST, *[AHEAD] * 3, REST]
@@ -80,8 +88,8 @@ def test_behind_a_heap_what_the_person_wants_now_goes(panel: Panel) -> None:
 
 def test_of_those_that_wait_the_newest_goes(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
-    panel.hand.take(AHEAD, panel.now)
-    panel.hand.take(LEFT, panel.now)
+    panel.hand.take(Wish(AHEAD), panel.now)
+    panel.hand.take(Wish(LEFT), panel.now)
     panel.wait(0)
     assert panel.gone == [REST, AHEAD, AHEAD, LEFT]
     assert panel.hand.replaced == 1
@@ -89,26 +97,26 @@ def test_of_those_that_wait_the_newest_goes(panel: Panel) -> None:
 
 def test_what_waited_too_long_does_not_go(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
-    panel.hand.take(AHEAD, panel.now)
+    panel.hand.take(Wish(AHEAD), panel.now)
     assert panel.hand.send(panel.now + STALE_NS + 1) is None
     assert panel.hand.stale == 1
     assert panel.hand.due_ns() is None
 
 
 def test_who_begins_waits_for_the_heap_and_nobody_else(panel: Panel) -> None:
-    panel.hand.take(AHEAD, panel.now)
-    assert panel.hand.send(panel.now) == REST
+    panel.hand.take(Wish(AHEAD), panel.now)
+    assert panel.hand.send(panel.now) == Wish(REST)
     assert panel.hand.send(panel.now + HEAP_NS - 1) is None
-    assert panel.hand.send(panel.now + HEAP_NS) == AHEAD
+    assert panel.hand.send(panel.now + HEAP_NS) == Wish(AHEAD)
     panel.now += 100 * MS
-    panel.hand.take(AHEAD, panel.now)
-    assert panel.hand.send(panel.now) == AHEAD
+    panel.hand.take(Wish(AHEAD), panel.now)
+    assert panel.hand.send(panel.now) == Wish(AHEAD)
 
 
 def test_who_lets_go_while_driving_leaves_one_zero(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
-    panel.hand.take(AHEAD, panel.now)
-    assert panel.hand.end(panel.now) == REST
+    panel.hand.take(Wish(AHEAD), panel.now)
+    assert panel.hand.end(panel.now) == Wish(REST)
     assert panel.hand.end(panel.now) is None
     assert panel.hand.due_ns() is None
 
@@ -140,3 +148,19 @@ def test_a_panel_that_publishes_too_seldom_is_known(panel: Panel, rate: float, s
 def test_single_presses_are_no_slow_panel(panel: Panel) -> None:
     panel.press(AHEAD, times=6, every_ns=4 * NS_PER_S)
     assert not panel.hand.is_slow()
+
+
+def test_a_stamp_goes_with_its_message_and_zeros_are_by_the_same_clock(panel: Panel) -> None:
+    panel.hand.take(Wish(AHEAD, 1000), panel.now)
+    assert panel.hand.send(panel.now + 3) == Wish(REST, 1003)
+    panel.now += HEAP_NS
+    assert panel.hand.send(panel.now) == Wish(AHEAD, 1000)
+    panel.hand.take(Wish(LEFT, 1000 + 2 * HEAP_NS), panel.now)
+    assert panel.hand.send(panel.now) == Wish(LEFT, 1000 + 2 * HEAP_NS)
+    assert panel.hand.end(panel.now + 5) == Wish(REST, 1005 + 2 * HEAP_NS)
+
+
+def test_who_stamps_no_more_has_zeros_without_a_stamp(panel: Panel) -> None:
+    panel.hand.take(Wish(AHEAD, 1000), panel.now)
+    panel.hand.take(Wish(AHEAD), panel.now)
+    assert panel.hand.send(panel.now) == Wish(REST)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.foxglove.twists import command, encoding_of, twist
+from acsard.foxglove.hand import Wish
+from acsard.foxglove.twists import command, encoding_of, wish
 from acsard.messages.encodings import DecodeError, encode
 from acsard.messages.schema import Header, Time, TwistStamped, Vector3
 from acsard.messages.schema import Twist as Message
-from acsard.values import Twist
+from acsard.values import NS_PER_S, Twist
 
 MESSAGE = Message(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
@@ -18,13 +19,15 @@ STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
 @pytest.mark.parametrize("form", ["json", "cdr"])
 def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
     encoding = encoding_of(form, name)
-    assert twist(encoding, encode(MESSAGE, "json" if form == "json" else "cdr")) == Twist(0.3, -0.2)
+    found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
+    assert found == Wish(Twist(0.3, -0.2))
 
 
 @pytest.mark.parametrize("form", ["json", "cdr"])
-def test_a_stamped_one_too(form: str) -> None:
+def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
     encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
-    assert twist(encoding, encode(STAMPED, "json" if form == "json" else "cdr")) == Twist(0.3, -0.2)
+    found = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
+    assert found == Wish(Twist(0.3, -0.2), 5 * NS_PER_S)
 
 
 @pytest.mark.parametrize(
@@ -58,13 +61,13 @@ def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> 
 def test_what_is_no_twist_is_refused(payload: bytes) -> None:
     for encoding in (encoding_of("json", "geometry_msgs/Twist"),):
         with pytest.raises(DecodeError):
-            twist(encoding, payload)
+            wish(encoding, payload)
 
 
 @pytest.mark.parametrize("cut", range(0, 52, 4))
 def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
     with pytest.raises(DecodeError):
-        twist(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
+        wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
 
 
 def test_a_command_on_the_bus_is_read_by_the_same_rules() -> None:

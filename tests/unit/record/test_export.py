@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
+from acsard.record.beside import beside
 from acsard.record.export import Kind, Span, export, measured
 from acsard.record.file import Recording
 from acsard.ros.channels import CHANNELS
@@ -28,6 +29,8 @@ from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
 SECONDS = 2.0
+
+KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +149,7 @@ def test_a_time_with_nothing_in_it_writes_nothing(path: Path, tmp_path: Path) ->
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize("kind", ["mcap", "csv", "rosbag2"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_stands_there_stays_unless_it_is_to_go(kind: Kind, path: Path, tmp_path: Path) -> None:
     new, recording = tmp_path / "new", Recording(path)
     first = export(recording, new, kind)
@@ -167,6 +170,45 @@ def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> No
             export(Recording(path), new, kind, force=True)
     assert (new / "chapter").read_text() == "1"
     assert [*tmp_path.iterdir()] == [new]
+
+
+def test_a_bag_with_anything_else_in_it_never_goes(path: Path, tmp_path: Path) -> None:
+    for name in ("notes.txt", "photos", "kept.mcap"):
+        new = tmp_path / f"bag {name}"
+        export(Recording(path), new, "rosbag2")
+        match name:
+            case "photos":
+                (new / name).mkdir()
+            case "kept.mcap":
+                (new / name).write_bytes(path.read_bytes())
+            case _:
+                (new / name).write_text("1")
+        before = sorted(new.iterdir())
+        for kind in KINDS:
+            with pytest.raises(FileExistsError, match=name):
+                export(Recording(path), new, kind, force=True)
+        assert sorted(new.iterdir()) == before
+
+
+def test_a_link_to_a_bag_goes_and_the_bag_stays(path: Path, tmp_path: Path) -> None:
+    bag, link = tmp_path / "bag", tmp_path / "link"
+    export(Recording(path), bag, "rosbag2")
+    link.symlink_to(bag)
+    export(Recording(path), link, "rosbag2", force=True)
+    assert not link.is_symlink()
+    assert {one.name for one in bag.iterdir()} == {"bag_0.mcap", "metadata.yaml"}
+    assert {one.name for one in tmp_path.iterdir()} == {"bag", "link"}
+
+
+def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for name in ("metadata.yaml", "bag_0.db3"):
+        (bag / name).write_text("1")
+    with pytest.raises(FileNotFoundError), beside(bag, force=True):
+        pass  # nothing is written that could
+    assert {one.name for one in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
+    assert [*tmp_path.iterdir()] == [bag]
 
 
 def test_a_recording_never_goes(path: Path, tmp_path: Path) -> None:

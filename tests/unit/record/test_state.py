@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from acsard.config.settings import Config
+from acsard.host.errors import RecordingError
+from acsard.record.again import Onlooker, live
+from acsard.record.export import export
+from acsard.record.file import Recording
 from acsard.record.state import StateError, freeze, thaw
 from acsard.robot import Robot
 from acsard.values import Instant
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
@@ -76,3 +83,44 @@ def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(StateError):
         thaw(b"")
     assert isinstance(thaw(data).robot, Robot)
+
+
+def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
+    """A recording that begins within a drive, with a robot that lacks what `forget` takes away."""
+    first, tape = 100, Tape(every=100)
+    World(recorder=tape).drive(0.5, seconds=2.0)
+    robot, last = thaw(tape.states[first])
+    forget(robot)
+    tape.states[first] = freeze(robot, last)
+    tape.write(path, Config(), first)
+    return Recording(path)
+
+
+def test_what_a_part_of_an_older_robot_lacks_begins_as_in_a_new_one(tmp_path: Path) -> None:
+    def forget(robot: Robot) -> None:
+        for wheel in robot._sanity._wheels:
+            del wheel.suspected
+
+    recording = of_older_code(tmp_path / "old.mcap", forget)
+    looked = Onlooker(recording)
+    assert len([*looked.steps()]) == looked.replay.tally.steps > 100
+    assert looked.replay.tally.same
+    assert live(recording).tally.same
+
+
+def test_what_no_new_robot_has_is_a_sentence_and_no_traceback(tmp_path: Path) -> None:
+    def forget(robot: Robot) -> None:
+        for sender in robot._arbiter._sources["app"].senders.values():
+            del sender.arrived_ns
+
+    recording = of_older_code(tmp_path / "old.mcap", forget)
+    words = (
+        r"old\.mcap: this version cannot read the state at its start: .*'arrived_ns'.* by acsard"
+    )
+    with pytest.raises(RecordingError, match=words):
+        live(recording)
+    with pytest.raises(RecordingError, match=words):
+        list(Onlooker(recording).steps())
+    with pytest.raises(RecordingError, match=words):
+        export(recording, tmp_path / "new.mcap", "mcap")
+    assert [*tmp_path.iterdir()] == [recording.path]

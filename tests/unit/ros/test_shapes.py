@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import pytest
+
 from acsard.messages.schema import Happening, RobotState, SourceState, Time
 from acsard.ros.shapes import Counter, Log, Source, log, state
 from acsard.values import Event
@@ -32,6 +34,11 @@ def test_an_event_is_a_log_line_of_ros() -> None:
     assert log(event, Time(1, 500_000_000)) == Log(
         Time(1, 500_000_000), 30, "command_refused", "too old (by a phone) (3 times)"
     )
+
+
+@pytest.mark.parametrize("text", ["3 x stale; the last: late", "2 x stale, 1 x crowded", "3 times"])
+def test_what_begins_with_its_numbers_is_not_counted_twice(text: str) -> None:
+    assert log(Event("command_refused", text, count=3), Time()).msg == text
 
 
 def test_what_the_topic_says_of_an_event_is_the_same_line() -> None:

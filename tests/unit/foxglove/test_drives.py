@@ -1,0 +1,150 @@
+"""What of a viewer's commands reaches the bus, with which stamp, and when the bus makes trouble."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from threading import Event
+from typing import Any
+
+import pytest
+import zenoh
+
+from acsard.client import Client
+from acsard.config.settings import DriveConfig, JointsConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.foxglove.drives import Drives
+from acsard.foxglove.hand import STALE_NS
+from acsard.foxglove.notices import Notices
+from acsard.host import clock
+from acsard.incoming.commands import Arrival, Receiver
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Header, Message, Time, Twist, TwistStamped, Vector3
+from acsard.values import NS_PER_S, REST, Command
+from tests.system.harness import until
+
+RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+
+AHEAD, STILL = Twist(Vector3(x=0.3), Vector3()), Twist(Vector3(), Vector3())
+
+HOLD_S = 5.0
+
+
+class Session:
+    """Takes what is put, as the daemon would hear it, or does to it what a bus in trouble does."""
+
+    def __init__(self) -> None:
+        self.heard: list[Command] = []
+        self.locked, self.entered = False, Event()
+        self.free = Event()
+        self.broken = False
+
+    def zid(self) -> str:
+        return "0123456789abcdef"
+
+    def new_timestamp(self) -> None:
+        return None
+
+    def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
+        if self.broken:
+            raise zenoh.ZError("closed")
+        if self.locked:
+            self.entered.set()
+            assert self.free.wait(HOLD_S)
+        key = key.removeprefix("acsard/acsar/")
+        arrival = Arrival(key, True, payload, encoding, 0, None, "", attachment=attachment)
+        self.heard.append(RECEIVER.command(arrival))
+
+
+class Viewers:
+    """Each with a session of its own."""
+
+    def __init__(self) -> None:
+        self.sessions: dict[int, Session] = {1: Session(), 2: Session()}
+        self.notices = Notices(lambda text: None, lambda: None)
+        self.drives = Drives(self._robot, "/cmd_vel", self.notices, "")
+        for viewer in self.sessions:
+            for channel, name in ((1, "Twist"), (2, "TwistStamped")):
+                kind = f"geometry_msgs/msg/{name}"
+                self.drives.advertised(viewer, channel, "/cmd_vel", "cdr", kind)
+
+    def _robot(self, viewer: int) -> Client:
+        fake: Any = self.sessions[viewer]
+        return Client(fake, "acsar", "app")
+
+    def publish(self, viewer: int, message: Message) -> None:
+        channel = 2 if isinstance(message, TwistStamped) else 1
+        self.drives.came(viewer, channel, encode(message, "cdr"))
+
+    def heard(self, viewer: int, count: int) -> list[Command]:
+        """At least so many."""
+        heard = self.sessions[viewer].heard
+        until(lambda: len(heard) >= count, HOLD_S, f"{count} commands of {viewer}, not {heard}")
+        return heard
+
+
+@pytest.fixture
+def viewers() -> Iterator[Viewers]:
+    viewers = Viewers()
+    yield viewers
+    for session in viewers.sessions.values():
+        session.free.set()
+    viewers.drives.end()
+
+
+def test_a_stamp_is_passed_on_and_the_zeros_around_go_by_the_same_clock(viewers: Viewers) -> None:
+    long_ago_ns = clock.now().wall_ns - 100 * NS_PER_S
+    viewers.publish(1, TwistStamped(Header(Time.from_ns(long_ago_ns)), AHEAD))
+    viewers.heard(1, 2)
+    viewers.drives.withdrawn(1, 2)
+    heard = viewers.heard(1, 3)
+    assert [one.twist.linear for one in heard] == [0.0, 0.3, 0.0]
+    assert heard[1].stamp_ns == long_ago_ns
+    assert len({one.clock for one in heard}) == 1
+    for one in heard:
+        assert one.stamp_ns is not None
+        assert 0 <= one.stamp_ns - long_ago_ns < HOLD_S * NS_PER_S
+
+
+def test_a_plain_twist_has_the_time_of_its_receipt(viewers: Viewers) -> None:
+    before_ns = clock.now().wall_ns
+    viewers.publish(1, AHEAD)
+    for one in viewers.heard(1, 2):
+        assert one.stamp_ns is not None
+        assert abs(one.stamp_ns - before_ns) < HOLD_S * NS_PER_S
+
+
+def test_what_waited_behind_another_s_bus_that_is_locked_is_too_old_to_go(
+    viewers: Viewers,
+) -> None:
+    for viewer in viewers.sessions:
+        viewers.publish(viewer, AHEAD)
+        viewers.heard(viewer, 2)
+    first, second = viewers.sessions.values()
+    first.locked = True
+    with viewers.drives._news:  # its thread waits for it: both fall due in one round
+        began_ns = clock.mono_ns()
+        for viewer in viewers.sessions:
+            viewers.publish(viewer, AHEAD)
+    assert first.entered.wait(HOLD_S)
+    until(lambda: clock.mono_ns() - began_ns > STALE_NS, HOLD_S, "that it is too old")
+    first.free.set()
+    viewers.heard(1, 3)
+    viewers.publish(2, STILL)
+    until(lambda: second.heard[-1].twist == REST, HOLD_S, "the zero behind it")
+    assert [one.twist.linear for one in second.heard if one.twist != REST] == [0.3]
+
+
+def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers) -> None:
+    viewers.sessions[1].broken = True
+    viewers.publish(1, AHEAD)
+    until(lambda: said(viewers.notices), HOLD_S, "that the bus takes nothing")
+    assert "the bus takes no commands" in said(viewers.notices)[0]
+    viewers.publish(2, AHEAD)
+    assert [one.twist.linear for one in viewers.heard(2, 2)] == [0.0, 0.3]
+    viewers.sessions[1].broken = False
+    viewers.publish(1, AHEAD)
+    viewers.heard(1, 1)
+
+
+def said(notices: Notices) -> list[str]:
+    return [one.text for one in notices._waiting]
