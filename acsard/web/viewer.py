@@ -281,6 +281,7 @@ class Viewer:
                     "sender": self.sender,
                     "limits": {"linear": about.linear, "angular": about.angular},
                     "simulated": about.simulated,
+                    "state_rate": about.state_hz,
                 }
             }
         )
