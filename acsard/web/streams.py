@@ -15,6 +15,7 @@ import zenoh
 from acsard.bus.subscription import encoded
 from acsard.client import Client
 from acsard.host import clock
+from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, detect
 from acsard.messages.topics import PUBLISHED
@@ -27,6 +28,9 @@ MOST = 200
 """Keys of all robots at once."""
 
 DECLARE_S = 3.0
+
+UNREADY = (TimeoutError, zenoh.ZError, UsageError)
+"""A bus that is stuck, or a session that has ended: later there may be a way again."""
 
 
 class Stream:

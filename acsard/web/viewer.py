@@ -36,8 +36,8 @@ from acsard.web.frames import (
 from acsard.web.hand import Hand, Order
 from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
 from acsard.web.outgoing import Following, Outgoing
-from acsard.web.robots import Robots
-from acsard.web.streams import KEYS
+from acsard.web.robots import AGAIN_S, Robots
+from acsard.web.streams import KEYS, UNREADY
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0
@@ -52,6 +52,9 @@ FRAMES_HZ = 300.0
 
 DROVE_NS = NS_PER_S
 """Whose last command is older drives no more."""
+
+CLIENT_S = 0.2
+"""How often it is looked whether there is a way to the robot."""
 
 FLEET, FLEET_S = "fleet", 1.0
 
@@ -82,6 +85,8 @@ class Viewer:
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._stops: set[asyncio.Task[None]] = set()
+        self._ended = False
         self._last: Order | None = None
         self._sequence = 0
         self._gone, self._about = "", robots.about
@@ -108,6 +113,7 @@ class Viewer:
 
     def end(self, why: str) -> None:
         """Close it from outside; `why` is at most 120 characters."""
+        self._ended = True
         self._release()
         self._start(self._out.close(why))
 
@@ -115,6 +121,8 @@ class Viewer:
 
     async def _take(self, message: aiohttp.WSMessage) -> bool:
         """One message; False when the connection is over."""
+        if self._ended:
+            return True  # until the socket is closed, which one who does not read delays
         if message.type == aiohttp.WSMsgType.ERROR:
             self._counts.refuse("too_big")
             return False
@@ -127,11 +135,11 @@ class Viewer:
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
             return room or await self._overrun()
-        if not room and not (isinstance(frame, Call) and frame.call == "stop"):
+        if room or (isinstance(frame, Call) and frame.call == "stop"):
+            self._obey(frame)
+        else:
             self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
-            return await self._overrun()
-        self._obey(frame)
-        return True
+        return room or await self._overrun()
 
     async def _overrun(self) -> bool:
         self._overruns += 1
@@ -182,12 +190,15 @@ class Viewer:
         self._hand.give(Order(self.sender, 0.0, 0.0, stamp_ns, self._sequence, now_ns))
 
     def _call(self, frame: Call) -> None:
-        if frame.call != "stop":
+        if frame.call == "stop":
+            # Whoever sent it may be gone before it is asked for: the robot stops all the same.
+            self._start(self._answer(frame), self._stops)
+        else:
             if self._calling >= CALLS_AT_ONCE:
                 self._out.refuse("call", "too_fast", f"{CALLS_AT_ONCE} calls are under way")
                 return
             self._calling += 1
-        self._start(self._answer(frame))
+            self._start(self._answer(frame))
 
     async def _answer(self, frame: Call) -> None:
         try:
@@ -244,15 +255,22 @@ class Viewer:
             self._start(self._leave(one))
 
     async def _join(self, one: Following) -> None:
-        while self._robots.client is None:
-            await asyncio.sleep(0.2)
-        try:
-            stream = await self._robots.streams.follow(self._robots.client, one.robot, one.name)
-        except TimeoutError:
-            stream = None
+        stream = None
+        while stream is None and self._out.following.get((one.robot, one.name)) is one:
+            if self._robots.client is None:
+                await asyncio.sleep(CLIENT_S)
+                continue
+            try:
+                stream = await self._robots.streams.follow(self._robots.client, one.robot, one.name)
+            except UNREADY as error:
+                text = f"the bus is stuck; it is tried again ({error})".replace(" ()", "")
+                self._out.refuse("subscribe", "stuck", text)
+                await asyncio.sleep(AGAIN_S)
+            else:
+                if stream is None:
+                    del self._out.following[one.robot, one.name]
+                    self._out.refuse("subscribe", "too_many", "no room for another key: try again")
         if stream is None:
-            self._out.following.pop((one.robot, one.name), None)
-            self._out.refuse("subscribe", "too_many", "the bus is stuck, or has no room: try again")
             return
         if self._out.following.get((one.robot, one.name)) is not one:  # left meanwhile
             await self._robots.streams.leave(one.robot, one.name)
@@ -299,7 +317,10 @@ class Viewer:
             self._out.say({"fleet": self._fleet.rows()})
         return now + LOOK_S
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start(
+        self, work: Coroutine[Any, Any, None], among: set[asyncio.Task[None]] | None = None
+    ) -> None:
+        among = self._tasks if among is None else among
         task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        among.add(task)
+        task.add_done_callback(among.discard)

@@ -19,7 +19,7 @@ from acsard.values import ROLES, Role
 
 Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
-    "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy",
+    "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
 """What a refusal is counted under."""
 
