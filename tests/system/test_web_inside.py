@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import aiohttp
 import pytest
@@ -79,7 +79,8 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
             await ours.drive(0.0)
             await eventually(lambda: inside.counts.all().get("commands_dropped"))
             (viewer,) = inside.page._viewers
-            ours.socket._response.connection.transport.pause_reading()
+            wire = cast(Any, ours.socket)._response.connection.transport
+            wire.pause_reading()
             viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
             inside.page.end_all("your token has ended")
             before = inside.counts.all()
@@ -90,7 +91,7 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
             await asyncio.sleep(0.2)
             inside.hand.flush(PATIENCE_S)
             assert inside.counts.all() == before
-            ours.socket._response.connection.transport.abort()
+            wire.abort()
 
     run(story)
 
