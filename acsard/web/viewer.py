@@ -215,7 +215,7 @@ class Viewer:
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
             self._fleet_due = 0.0
-            self._start(self._fleet.join(self))
+            self._fleet.join(self)
             self._out.wake()
             return
         robot, key = frame.robot or self._robots.id, frame.subscribe
