@@ -201,7 +201,7 @@ async def _until(
 async def _tidy(page: Page) -> None:
     while True:
         await asyncio.sleep(TIDY_S)
-        page.end_revoked()
+        await page.end_revoked()
 
 
 async def _held(leaving: asyncio.Event) -> None:
