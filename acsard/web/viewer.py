@@ -16,9 +16,7 @@ import aiohttp
 from aiohttp import web
 
 from acsard.bus.access import MAY
-from acsard.bus.address import require_id
 from acsard.host import clock
-from acsard.host.errors import UsageError
 from acsard.values import NS_PER_S
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
@@ -34,27 +32,19 @@ from acsard.web.frames import (
     decode,
 )
 from acsard.web.hand import Hand, Order
+from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
-from acsard.web.outgoing import Following, Outgoing
-from acsard.web.robots import AGAIN_S, Robots
-from acsard.web.streams import KEYS, UNREADY
+from acsard.web.outgoing import Outgoing
+from acsard.web.robots import Robots
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0
 """A client that has not answered for half of this is gone."""
 
-KNOWN = ", ".join(sorted(KEYS))
-
-KEYS_AT_ONCE, CALLS_AT_ONCE = 32, 8
-
-FRAMES_HZ = 300.0
-"""Of all keys of one connection together: nobody who looks takes the time of who drives."""
+CALLS_AT_ONCE = 8
 
 DROVE_NS = NS_PER_S
 """Whose last command is older drives no more."""
-
-CLIENT_S = 0.2
-"""How often it is looked whether there is a way to the robot."""
 
 FLEET, FLEET_S = "fleet", 1.0
 
@@ -84,6 +74,7 @@ class Viewer:
         self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts)
+        self._keys = Keys(self._out, robots, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
@@ -107,8 +98,7 @@ class Viewer:
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
-            for one in list(self._out.following.values()):
-                await self._leave(one)
+            await self._keys.leave_all()
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
@@ -217,74 +207,15 @@ class Viewer:
             self._fleet_due = 0.0
             self._fleet.join(self)
             self._out.wake()
-            return
-        robot, key = frame.robot or self._robots.id, frame.subscribe
-        try:
-            require_id(robot)
-        except UsageError as error:
-            self._out.refuse("subscribe", "malformed", str(error))
-            return
-        if key not in KEYS:
-            self._out.refuse(
-                "subscribe", "malformed", f"{key!r} is none of {', '.join(sorted(KEYS))}"
-            )
-            return
-        known = self._out.following.get((robot, key))
-        others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
-        if others + frame.rate > FRAMES_HZ:
-            self._out.refuse("subscribe", "too_many", f"{FRAMES_HZ:g} messages a second in all")
-            return
-        if known is not None:
-            known.period, known.due = 1.0 / frame.rate, 0.0
-            self._out.wake()
-            return
-        if len(self._out.following) >= KEYS_AT_ONCE:
-            self._out.refuse("subscribe", "too_many", f"{KEYS_AT_ONCE} keys at most")
-            return
-        one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
-        self._out.following[robot, key] = one
-        self._start(self._join(one))
+        else:
+            self._keys.subscribe(frame)
 
     def _unsubscribe(self, frame: Unsubscribe) -> None:
         if frame.unsubscribe == FLEET:
             self._fleet_due = None
             self._fleet.leave(self)
-            return
-        one = self._out.following.get((frame.robot or self._robots.id, frame.unsubscribe))
-        if one is not None:
-            self._start(self._leave(one))
-
-    async def _join(self, one: Following) -> None:
-        stream = None
-        while stream is None and self._out.following.get((one.robot, one.name)) is one:
-            if self._robots.client is None:
-                await asyncio.sleep(CLIENT_S)
-                continue
-            try:
-                stream = await self._robots.streams.follow(self._robots.client, one.robot, one.name)
-            except UNREADY as error:
-                text = f"the bus is stuck; it is tried again ({error})".replace(" ()", "")
-                self._out.refuse("subscribe", "stuck", text)
-                await asyncio.sleep(AGAIN_S)
-            else:
-                if stream is None:
-                    del self._out.following[one.robot, one.name]
-                    self._out.refuse("subscribe", "too_many", "no room for another key: try again")
-        if stream is None:
-            return
-        if self._out.following.get((one.robot, one.name)) is not one:  # left meanwhile
-            await self._robots.streams.leave(one.robot, one.name)
-            return
-        one.stream = stream
-        self._out.wake()
-
-    async def _leave(self, one: Following) -> None:
-        if (
-            self._out.following.pop((one.robot, one.name), None) is not None
-            and one.stream is not None
-        ):
-            one.stream = None
-            await self._robots.streams.leave(one.robot, one.name)
+        else:
+            self._keys.unsubscribe(frame)
 
     # what goes out
 

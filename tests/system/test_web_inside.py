@@ -122,6 +122,28 @@ def test_a_flood_of_stops_ends_and_each_of_them_was_taken_up(inside: Inside) -> 
     run(story)
 
 
+def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
+    inside: Inside, tmp_path: Path
+) -> None:
+    async def story(daemon: Daemon) -> None:
+        with client_session(daemon.endpoint, "") as session:
+            inside.robots.client = Client(session, "acsar", "teleop")
+            async with inside.hands() as ours:
+                await ours.say(subscribe="state", rate=10)
+                await ours.state(lambda state: state["mode"])
+                for _ in range(20):
+                    await ours.say(unsubscribe="state")
+                    await ours.say(subscribe="state", rate=10)
+                await ours.say(ping=1)
+                await ours.find(lambda said: "pong" in said)
+                await ours.state(lambda state: state["mode"])
+                (viewer,) = inside.page._viewers
+                assert list(viewer._out.following) == [("acsar", "state")]
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
+
+
 def test_a_bus_that_is_gone_is_told_and_the_key_comes_when_it_is_back(
     inside: Inside, tmp_path: Path
 ) -> None:
