@@ -89,9 +89,8 @@ class Hand:
         try:
             while True:
                 self._work(self._next())
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - carried to who waits for it
             self.dead.set_exception(error)
-            raise
 
     def _work(self, order: Order) -> None:
         try:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from acsard.client import Client
 from acsard.host import clock
 from acsard.web.counts import Counts
@@ -29,7 +27,6 @@ def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
     assert not hand.dead.done()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_hand_that_dies_says_so() -> None:
     def deadly() -> Client | None:
         raise SystemExit
