@@ -90,8 +90,8 @@ class Keys:
             return None
         try:
             stream = await self._robots.streams.follow(client, one.robot, one.name)
-        except UNREADY as error:
-            self._out.refuse("subscribe", "stuck", f"the bus is stuck, it is tried again: {error}")
+        except UNREADY:
+            self._out.refuse("subscribe", "stuck", "the bus is stuck; it is tried again")
             await asyncio.sleep(AGAIN_S)
             return None
         if stream is None and self._is_followed(one):

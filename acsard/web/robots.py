@@ -102,8 +102,8 @@ class Robots:
                 stream = await self.streams.follow(self.client, self.id, key)
                 assert stream is not None, "the first ones find room"
                 return stream
-            except UNREADY as error:
-                self.gone = f"the bus is stuck; it is tried again ({error})".replace(" ()", "")
+            except UNREADY:
+                self.gone = "the bus is stuck; it is tried again"
                 await asyncio.sleep(AGAIN_S)
 
     async def _watch(self, states: Stream) -> None:

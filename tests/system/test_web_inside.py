@@ -15,6 +15,8 @@ from aiohttp.test_utils import TestServer
 from acsard.bus.address import Address
 from acsard.bus.session import client_session
 from acsard.client import Client
+from acsard.config.settings import Config
+from acsard.host.errors import UnreachableError
 from acsard.messages.signature import MOST
 from acsard.web.app import Page
 from acsard.web.calls import Calls
@@ -24,6 +26,7 @@ from acsard.web.gate import Gate
 from acsard.web.hand import Hand
 from acsard.web.limits import OVERRUNS
 from acsard.web.robots import About, Robots
+from acsard.web.server import Wanted, _until
 from acsard.web.tokens import Vault
 from tests.system.browser import Hands, run
 from tests.system.harness import PATIENCE_S, Daemon
@@ -40,7 +43,7 @@ class Inside:
         self.counts = Counts()
 
         def connect() -> Client:
-            raise AssertionError("nobody runs this")
+            raise UnreachableError("nobody is there")
 
         self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
         self.hand = Hand(lambda: self.robots.client, self.counts)
@@ -161,3 +164,32 @@ def test_a_bus_that_is_gone_is_told_and_the_key_comes_when_it_is_back(
 
     with Daemon(tmp_path) as daemon:
         run(lambda: story(daemon))
+
+
+def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
+    inside: Inside, tmp_path: Path
+) -> None:
+    async def story(daemon: Daemon) -> None:
+        closed = client_session(daemon.endpoint, "")
+        closed.close()
+        way = Client(closed, "acsar", "teleop")
+        robots = Robots(Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts)
+        running = asyncio.create_task(robots.run())
+        await eventually(lambda: "again" in robots.gone or running.done())
+        assert not running.done()
+        running.cancel()
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
+
+
+def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
+    address = Address("tcp/127.0.0.1:1", "acsar", "")
+    wanted = Wanted(Config(), address, (), "", tmp_path, next_port=False, held=False)
+
+    async def story() -> None:
+        inside.hand.dead.set_exception(MemoryError("no room"))
+        with pytest.raises(MemoryError):
+            await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
+
+    run(story)
