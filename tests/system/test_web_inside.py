@@ -112,7 +112,7 @@ def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(inside: I
     run(story)
 
 
-def test_a_flood_of_stops_ends_and_each_of_them_was_taken_up(inside: Inside) -> None:
+def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
     async def story() -> None:
         async with inside.hands() as ours:
             for n in range(3 * OVERRUNS):
