@@ -130,6 +130,8 @@ def _invite(args: argparse.Namespace, config: Config) -> int:
     print()
     segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
     print(f"\nended sooner by: acsard web --revoke {token.name}")
+    if unknown := vault.unknown_to():
+        print(unknown)
     return int(Exit.OK)
 
 

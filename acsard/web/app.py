@@ -12,6 +12,7 @@ from pathlib import Path
 from aiohttp import web
 
 from acsard.host import clock
+from acsard.host.threads import in_thread
 from acsard.web.calls import Calls
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
@@ -20,7 +21,7 @@ from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.hand import Hand
 from acsard.web.limits import CONNECTIONS, CONNECTIONS_OF_ONE, Places, Tries
-from acsard.web.programs import Programs, TroubleError
+from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.requests import (
     COOKIE,
     asked_of,
@@ -108,10 +109,14 @@ class Page:
         for viewer in list(self._viewers):
             viewer.end(why)
 
-    def end_revoked(self) -> None:
-        """Those go whose token counts no more."""
+    async def end_revoked(self) -> None:
+        """Those go whose token counts no more, or cannot be looked up."""
+        try:
+            counting = await in_thread(self._vault.counting, READ_S)
+        except TimeoutError:
+            counting = frozenset()
         for viewer in list(self._viewers):
-            if viewer.who.token and not self._vault.counts(viewer.who.token):
+            if viewer.who.token and viewer.who.token not in counting:
                 viewer.end("your token has ended")
 
     # who
@@ -131,12 +136,15 @@ class Page:
         if request.path in OPEN or request.path.startswith("/page/"):
             request[WHO] = MAINTAINER if spot == "here" else None
         else:
-            who = MAINTAINER if spot == "here" else self._known(asked.peer, token_shown(request))
+            shown = token_shown(request)
+            who = MAINTAINER if spot == "here" else await self._known(asked.peer, shown)
             if isinstance(who, Refusal):
                 return self.refused(who)
             request[WHO] = who
         try:
             return await handler(request)
+        except TimeoutError:
+            return problem(503, "the disk does not answer")
         except TroubleError as trouble:
             return problem(trouble.status, str(trouble))
         except web.HTTPException as error:
@@ -145,12 +153,15 @@ class Page:
             self._counts.refuse(REASONS.get(error.status, "malformed"))
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
-    def _known(self, peer: str, shown: str) -> Who | Refusal:
+    async def _known(self, peer: str, shown: str) -> Who | Refusal:
         """Whose token this is."""
         now_ns = clock.mono_ns()
         if not shown:
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
-        who = self._vault.who(shown)
+        try:
+            who = await in_thread(lambda: self._vault.who(shown), READ_S)
+        except TimeoutError:
+            who = None  # whom we cannot look up we do not let in
         if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
             return who
         if self._tries.spent(peer, now_ns):
@@ -168,12 +179,13 @@ class Page:
         text = await token_posted(request)
         if not request.secure:
             return self.refused(Refusal("plain", "here you need no token"))
-        who = self._known(request.remote or "", text)
+        who = await self._known(request.remote or "", text)
         if isinstance(who, Refusal):
             return self.refused(who)
+        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
-            COOKIE, text, max_age=self._vault.left_s(who.token), path="/",
+            COOKIE, text, max_age=left_s, path="/",
             secure=True, httponly=True, samesite="Strict",
         )  # fmt: skip
         return response
@@ -181,16 +193,16 @@ class Page:
     # the page
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
-        return self._send(request, "index.html")
+        return await self._send(request, "index.html")
 
     async def _icon(self, request: web.Request) -> web.StreamResponse:
-        return self._send(request, "icon.svg")
+        return await self._send(request, "icon.svg")
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        return self._send(request, request.match_info["name"])
+        return await self._send(request, request.match_info["name"])
 
-    def _send(self, request: web.Request, name: str) -> web.StreamResponse:
-        file = self._files.get(name)
+    async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
+        file = await in_thread(lambda: self._files.get(name), READ_S)
         if file is None:
             raise web.HTTPNotFound
         headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}

@@ -3,6 +3,7 @@ nothing, and so many at most."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -42,7 +43,7 @@ class Calls:
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
-        self._running = self._stopping = 0
+        self._running, self._stops = 0, Stops()
 
     async def call(self, who: Who, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
         """Call a service in the name of `who`; raises `RefusedError`."""
@@ -55,7 +56,7 @@ class Calls:
             return _named(client, self._robots.id, who).request(verb, payload)
 
         try:
-            reply = await (self._stop(request) if verb == "stop" else self._ask(request))
+            reply = await (self._stops.ask(request) if verb == "stop" else self._ask(request))
         except (MendableError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "no answer in time")
         if verb == "set" and reply.success:
@@ -78,14 +79,28 @@ class Calls:
         finally:
             self._running -= 1
 
-    async def _stop(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        if self._stopping >= STOPS_AT_ONCE:
-            return ServiceReply(True, "stops are under way")
-        self._stopping += 1
-        try:
+
+class Stops:
+    """So many at once; those beyond wait, together, for one that is asked after all of them."""
+
+    def __init__(self) -> None:
+        self._room = asyncio.Semaphore(STOPS_AT_ONCE)
+        self._next: asyncio.Task[ServiceReply] | None = None
+
+    async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
+        """The robot's own answer, of this call or of one that is asked later than now."""
+        if not self._room.locked():
+            async with self._room:
+                return await in_thread(call, ANSWER_S)
+        if self._next is None:
+            self._next = asyncio.create_task(self._later(call))
+            self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return await asyncio.shield(self._next)
+
+    async def _later(self, call: Callable[[], ServiceReply]) -> ServiceReply:
+        async with self._room:
+            self._next = None  # who comes from now on is confirmed by another
             return await in_thread(call, ANSWER_S)
-        finally:
-            self._stopping -= 1
 
 
 def require(who: Who, verb: str) -> None:

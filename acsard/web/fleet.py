@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Coroutine, Sequence
 from typing import Any
 
 import zenoh
@@ -10,14 +11,15 @@ from msgspec import Struct
 
 from acsard.bus.fleet import ALL, robot_of
 from acsard.bus.subscription import encoded
+from acsard.client import Client
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import RobotState
+from acsard.messages.schema import Info, RobotState
 from acsard.messages.topics import full_key
 from acsard.values import NS_PER_S
 from acsard.web.robots import Robots
-from acsard.web.streams import DECLARE_S
+from acsard.web.streams import DECLARE_S, UNREADY
 
 MOST = 200
 """Robots; a stranger may invent names."""
@@ -25,44 +27,56 @@ MOST = 200
 FORGET_NS = 30 * NS_PER_S
 """Not heard of for so long, it is none any more."""
 
+ASK_NS = 2 * NS_PER_S
+"""Who has not said his version is asked again so often."""
+
+LONG = 40
+"""Characters of a version that are shown."""
+
 
 class Row(Struct, frozen=True):
     """One robot."""
 
     robot: str
-    mode: str
+    mode: str | None
+    """As in `state`; "gone" once its daemon has said that it ends, None while nothing is heard."""
     reason: str
-    speed: float
+    speed: float | None
     """m/s"""
     link: str
-    age: float
-    """ms since it was heard."""
+    age: float | None
+    """s since its state was heard, or its daemon ended."""
+    version: str
+    """"" until it says."""
+
+
+class _Known:
+    """What is known of one; each value is set whole, since other threads set them."""
+
+    def __init__(self, now_ns: int) -> None:
+        self.newest: tuple[zenoh.Sample | None, int] = None, now_ns
+        """Its state, and when it was heard; without one when it was first heard of."""
+        self.here: bool | None = None
+        """By its token; None where no tokens are told, as over TLS."""
+        self.version = ""
+        self.asked_ns = now_ns - ASK_NS
 
 
 class Fleet:
-    """Follows the state of all robots for as long as somebody has joined."""
+    """Follows all robots for as long as somebody has joined."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
         self._joined: set[object] = set()
-        self._newest: dict[str, tuple[zenoh.Sample, int]] = {}
-        self._decoder = Decoder(RobotState)
-        self._subscriber: Any = None
-        self._lock = asyncio.Lock()
+        self._known: dict[str, _Known] = {}
+        self._states, self._infos = Decoder(RobotState), Decoder(Info)
+        self._declared: list[Any] = []
+        self._busy: set[asyncio.Task[None]] = set()
 
-    async def join(self, viewer: object) -> None:
+    def join(self, viewer: object) -> None:
         """This one looks from now on."""
         self._joined.add(viewer)
-        async with self._lock:
-            client = self._robots.client
-            if self._subscriber is None and client is not None:
-                key = full_key(ALL, "state")
-                declare = client.session.declare_subscriber
-                try:
-                    self._subscriber = await in_thread(lambda: declare(key, self._take), DECLARE_S)
-                except (TimeoutError, zenoh.ZError):
-                    pass  # the bus is stuck: there are no rows
-        self._tidy()
+        self._look()
 
     def leave(self, viewer: object) -> None:
         """This one does not."""
@@ -70,29 +84,131 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """What is known now, by name."""
+        """What is known now, by name; whatever is not declared or known yet is tried again."""
+        self._look()
         now_ns, rows = clock.mono_ns(), []
-        for robot, (sample, at_ns) in sorted(self._newest.copy().items()):
-            if now_ns - at_ns > FORGET_NS:
-                self._newest.pop(robot, None)
-                continue
-            try:
-                state = self._decoder.decode(*encoded(sample))
-            except DecodeError:
-                continue
-            age = round((now_ns - at_ns) / 1e6, 1)
-            rows.append(Row(robot, state.mode, state.reason, state.linear, state.link, age))
+        for robot, one in sorted(self._known.copy().items()):
+            if now_ns - one.newest[1] > FORGET_NS and not one.here:
+                self._known.pop(robot, None)
+            elif (row := self._row(robot, one, now_ns)) is not None:
+                rows.append(row)
         return rows
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _row(self, robot: str, one: _Known, now_ns: int) -> Row | None:
+        sample, at_ns = one.newest
+        if sample is None:
+            gone = one.here is False
+            mode, reason = ("gone", "its daemon has ended") if gone else (None, "")
+            return Row(robot, mode, reason, None, "", None, one.version)
+        try:
+            state = self._states.decode(*encoded(sample))
+        except DecodeError:
+            return None
+        age = round((now_ns - at_ns) / NS_PER_S, 3)
+        if one.here is False:
+            was = f"its daemon has ended; it was {state.mode}"
+            return Row(robot, "gone", was, None, "", age, one.version)
+        return Row(robot, state.mode, state.reason, state.linear, state.link, age, one.version)
+
+    # on threads of Zenoh's
+
+    def _of(self, sample: zenoh.Sample) -> _Known | None:
         robot = robot_of(str(sample.key_expr))
-        if robot and (robot in self._newest or len(self._newest) < MOST):
-            self._newest[robot] = sample, clock.mono_ns()
+        if robot and (robot in self._known or len(self._known) < MOST):
+            return self._known.setdefault(robot, _Known(clock.mono_ns()))
+        return None
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is not None:
+            one.newest = sample, clock.mono_ns()
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is not None:
+            one.here = sample.kind == zenoh.SampleKind.PUT
+            if not one.here:
+                one.newest = one.newest[0], clock.mono_ns()  # told as gone for a while
+                one.version = ""  # it may come back as another
+
+    def _info(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        try:
+            version = self._infos.decode(*encoded(sample)).version
+        except DecodeError:
+            version = "?"
+        if one is not None:
+            one.version = version[:LONG]
+
+    # the way there
+
+    def _look(self) -> None:
+        client = self._robots.client
+        if not self._joined or client is None or self._busy:
+            return
+        if not self._declared:
+            self._start(self._declare(client))
+            return
+        now_ns, unknown = clock.mono_ns(), []
+        for robot, one in self._known.copy().items():
+            if one.here is not False and not one.version and now_ns - one.asked_ns >= ASK_NS:
+                one.asked_ns = now_ns
+                unknown.append(robot)
+        if unknown:
+            self._start(self._ask(client, unknown))
+
+    async def _declare(self, client: Client) -> None:
+        def declare() -> list[Any]:
+            session = client.session
+            states = session.declare_subscriber(full_key(ALL, "state"), self._state)
+            try:
+                tokens = session.liveliness().declare_subscriber(
+                    full_key(ALL, "alive"), self._token, history=True
+                )
+            except zenoh.ZError:
+                states.undeclare()
+                raise
+            return [states, tokens]
+
+        try:
+            self._declared = await in_thread(declare, DECLARE_S, _undeclare)
+        except UNREADY:
+            return  # who looks next tries again
+        self._tidy()
+
+    async def _ask(self, client: Client, robots: Sequence[str]) -> None:
+        def ask() -> None:
+            for robot in robots:
+                try:
+                    client.like(robot).ask("info", self._info)
+                except UNREADY:
+                    continue  # a name that no robot has, or a bus that is stuck
+
+        try:
+            await in_thread(ask, DECLARE_S)
+        except TimeoutError:
+            pass  # the bus is stuck: they are asked again
 
     def _tidy(self) -> None:
-        if self._joined or self._subscriber is None:
+        if self._joined or not self._declared:
             return
-        subscriber, self._subscriber = self._subscriber, None
-        task = asyncio.get_running_loop().create_task(in_thread(subscriber.undeclare, DECLARE_S))
-        task.add_done_callback(lambda done: done.cancelled() or done.exception())
-        self._newest.clear()
+        declared, self._declared = self._declared, []
+        self._known.clear()
+        self._start(_ended(declared))
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._busy.add(task)
+        task.add_done_callback(self._busy.discard)
+
+
+async def _ended(declared: Sequence[Any]) -> None:
+    try:
+        await in_thread(lambda: _undeclare(declared), DECLARE_S)
+    except UNREADY:
+        pass  # the bus is stuck, or gone: what comes is forgotten
+
+
+def _undeclare(declared: Sequence[Any]) -> None:
+    for one in declared:
+        one.undeclare()

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.messages.signature import MOST
 from acsard.values import AcsardError
 
 MAX_BYTES = 65536
@@ -20,8 +21,9 @@ MAX_BYTES = 65536
 MAX_RATE, USUAL_RATE = 50.0, 10.0
 """Messages of one key a second."""
 
-LATEST_STAMP_MS = 2.0**52
-"""ms since 1970; beyond it a float has no ms."""
+LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
+"""ms since 1970: what a signature holds in ns, but for a day, since the zero of who lets go has a
+later stamp than his last command."""
 
 Short = Annotated[str, Meta(max_length=80)]
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Never
 
-import zenoh
 from msgspec import Struct
 
 from acsard.client import Client
@@ -64,7 +65,9 @@ class Hand:
         self._news = threading.Condition()
         self._idle = True
         self._put_ns = 0
-        threading.Thread(target=self._work, name="hand", daemon=True).start()
+        self.dead: Future[Never] = Future()
+        """Raises what ended the thread, if ever: without it nobody drives, and no zero goes out."""
+        threading.Thread(target=self._live, name="hand", daemon=True).start()
 
     def give(self, order: Order) -> None:
         """Hand this on, in the place of an older one of the same sender."""
@@ -82,20 +85,24 @@ class Hand:
         with self._news:
             self._news.wait_for(lambda: self._idle and not self._waiting, seconds)
 
-    def _work(self) -> None:
-        while True:
-            order = self._next()
+    def _live(self) -> None:
+        try:
+            while True:
+                self._work(self._next())
+        except BaseException as error:  # noqa: BLE001 - carried to who waits for it
+            self.dead.set_exception(error)
+
+    def _work(self, order: Order) -> None:
+        try:
             client = self._client()
             late = clock.mono_ns() - order.given_ns > LATE_NS
-            if client is None or (late and order.moves):
-                self._counts.add("commands_dropped")
-                continue
-            try:
+            if client is not None and not (late and order.moves):
                 self._put(client, order)
-            except zenoh.ZError:
-                self._counts.add("commands_dropped")
-            else:
                 self._counts.add("commands")
+                return
+        except Exception:  # noqa: BLE001, S110 - of one command; the next is another's, or a zero
+            pass
+        self._counts.add("commands_dropped")
 
     def _next(self) -> Order:
         with self._news:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
-from typing import Any
+from urllib.parse import parse_qsl
 
 import msgspec
 from aiohttp import web
@@ -16,6 +16,11 @@ COOKIE = "__Host-acsard"
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
 """What a browser writes into `Host`; it is written back into a header."""
+
+PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
+"""How the headers begin by which a proxy says that it hands on what another asked."""
+
+NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
 
 SEND_BUFFER = 65536
 """Of the kernel, for one client: what lies in it is old when it arrives."""
@@ -30,6 +35,7 @@ def asked_of(request: web.Request) -> Asked:
         hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
         request.headers.get("Origin"),
         request.headers.get("Sec-Fetch-Site"),
+        any(name.lower().startswith(PROXIES) for name in request.headers),
     )
 
 
@@ -46,17 +52,17 @@ def token_shown(request: web.Request) -> str:
 
 
 async def token_posted(request: web.Request) -> str:
-    """The token in a form or in JSON; "" where there is none."""
+    """The token in a form or in JSON, "" where there is none; raises `HTTPBadRequest`."""
     body = await request.read()
-    if request.content_type == "application/json":
-        try:
-            given: Any = msgspec.json.decode(body, type=dict[str, str])
-        except (msgspec.MsgspecError, ValueError):
-            return ""
-    else:
-        given = await request.post()
-    text = given.get("token", "")
-    return text if isinstance(text, str) else ""
+    try:
+        text = body.decode(request.charset or "utf-8")
+        if request.content_type == "application/json":
+            return msgspec.json.decode(text, type=dict[str, str]).get("token", "")
+        if request.content_type == "application/x-www-form-urlencoded":
+            return dict(parse_qsl(text, errors="strict", max_num_fields=10)).get("token", "")
+    except (msgspec.MsgspecError, ValueError, LookupError):
+        pass
+    raise web.HTTPBadRequest(reason=NO_TOKEN)
 
 
 def keep_little(request: web.Request) -> None:

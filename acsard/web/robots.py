@@ -18,7 +18,7 @@ from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, PoseStamped, RobotState
 from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
-from acsard.web.streams import Stream, Streams
+from acsard.web.streams import UNREADY, Stream, Streams
 from acsard.web.trail import Trail
 
 LOOK_S = 0.1
@@ -102,7 +102,8 @@ class Robots:
                 stream = await self.streams.follow(self.client, self.id, key)
                 assert stream is not None, "the first ones find room"
                 return stream
-            except TimeoutError:
+            except UNREADY:
+                self.gone = "the bus is stuck; it is tried again"
                 await asyncio.sleep(AGAIN_S)
 
     async def _watch(self, states: Stream) -> None:

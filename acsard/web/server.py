@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 from aiohttp import web
 from msgspec import Struct
@@ -170,18 +171,21 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
             )
             stack.callback(server.close)
         announce([one.url for one, _ in places])
-        await _until(leaving, robots, page, wanted)
+        await _until(leaving, robots, hand, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
         await asyncio.to_thread(hand.flush, LEAVE_S)
 
 
-async def _until(leaving: asyncio.Event, robots: Robots, page: Page, wanted: Wanted) -> None:
+async def _until(
+    leaving: asyncio.Event, robots: Robots, hand: Hand, page: Page, wanted: Wanted
+) -> None:
     """Work until told to leave, or until something ends that must not."""
-    work = [
+    work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(robots.run()),
         asyncio.create_task(_tidy(page)),
+        asyncio.wrap_future(hand.dead),
     ]
     if wanted.held:
         work.append(asyncio.create_task(_held(leaving)))
@@ -197,7 +201,7 @@ async def _until(leaving: asyncio.Event, robots: Robots, page: Page, wanted: Wan
 async def _tidy(page: Page) -> None:
     while True:
         await asyncio.sleep(TIDY_S)
-        page.end_revoked()
+        await page.end_revoked()
 
 
 async def _held(leaving: asyncio.Event) -> None:

@@ -7,6 +7,7 @@ is subscribed to is the key as it is (msgpack): it costs the daemon one reader m
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any
 
 import msgspec
@@ -15,6 +16,7 @@ import zenoh
 from acsard.bus.subscription import encoded
 from acsard.client import Client
 from acsard.host import clock
+from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, detect
 from acsard.messages.topics import PUBLISHED
@@ -28,12 +30,16 @@ MOST = 200
 
 DECLARE_S = 3.0
 
+UNREADY = (TimeoutError, zenoh.ZError, UsageError)
+"""A bus that is stuck, or a session that has ended: later there may be a way again."""
+
 
 class Stream:
     """One key of one robot."""
 
     def __init__(self, key: str) -> None:
         self._key = key
+        self._taking = threading.Lock()
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
         self._text: tuple[int, bytes] = (0, b"null")
         self.declared: Any = None
@@ -48,7 +54,15 @@ class Stream:
     def take(self, sample: zenoh.Sample) -> None:
         """One has come; what a stranger put on a wildcard is none."""
         if str(sample.key_expr) == self._key:
-            self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
+            with self._taking:
+                self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
+
+    def answered(self, sample: zenoh.Sample) -> None:
+        """What was asked for: only what was published since then is newer."""
+        if str(sample.key_expr) == self._key:
+            with self._taking:
+                if not self._newest[0]:
+                    self._newest = (1, sample, clock.mono_ns())
 
     def value(self) -> tuple[int, bytes, float]:
         """Number, JSON and age in ms of the newest."""
@@ -107,13 +121,14 @@ class Streams:
         def late(subscriber: Any) -> None:
             subscriber.undeclare()
 
-        def take(sample: zenoh.Sample) -> None:
-            stream.take(sample)
-
         def declare() -> Any:
-            # What is published seldom is there at once.
-            client.ask(key, take)
-            return client.listen(key, take)
+            heard = client.listen(key, stream.take)
+            try:
+                client.ask(key, stream.answered)  # what is published seldom is there at once
+            except zenoh.ZError:
+                heard.undeclare()
+                raise
+            return heard
 
         return await in_thread(declare, DECLARE_S, late)
 

@@ -50,8 +50,8 @@ class Vault:
 
     def __init__(self, directory: Path) -> None:
         self.path = directory / FILE
-        self._tokens: list[Token] = []
-        self._stamp: tuple[int, int] | None = None
+        self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
+        """Its stamp and its tokens: one value, since several threads look."""
 
     def who(self, text: str) -> Who | None:
         """Whose this token is, while it counts."""
@@ -65,10 +65,6 @@ class Vault:
             return None
         return Who(found.role, found.name, found.digest)
 
-    def counts(self, digest: str) -> bool:
-        """It has not ended and is not revoked."""
-        return any(one.digest == digest and one.ends > time.time() for one in self.all())
-
     def left_s(self, digest: str) -> int:
         """Seconds until it ends."""
         ends = [one.ends for one in self.all() if one.digest == digest]
@@ -79,15 +75,27 @@ class Vault:
         try:
             seen = self.path.stat()
             stamp = seen.st_mtime_ns, seen.st_ino
-            if stamp != self._stamp:
-                self._tokens = msgspec.json.decode(self.path.read_bytes(), type=list[Token])
-                self._stamp = stamp
-        except FileNotFoundError:
-            self._tokens, self._stamp = [], None
+            read = self._read
+            if stamp != read[0]:
+                read = stamp, msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except (OSError, msgspec.MsgspecError):
-            # Whom we cannot look up we let in no more.
-            self._tokens, self._stamp = [], None
-        return self._tokens
+            read = None, []  # there are none; or whom we cannot look up we let in no more
+        self._read = read
+        return read[1]
+
+    def counting(self) -> frozenset[str]:
+        """What those are known by that have not ended and are not revoked."""
+        now_s = time.time()
+        return frozenset(one.digest for one in self.all() if one.ends > now_s)
+
+    def unknown_to(self, service: Path = SERVICE) -> str:
+        """That a service on this machine does not know these; "" where none is, or it does."""
+        if self.path.parent == service or not os.path.lexists(service):
+            return ""
+        return (
+            f"kept in {self.path}, which the service on this machine does not read: for its page "
+            "do the same with sudo"
+        )
 
     def invite(self, role: Role, name: str, days: int) -> tuple[str, Token]:
         """A new token, to be shown once, and what is kept of it; raises `UsageError`."""
@@ -120,13 +128,25 @@ class Vault:
             handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX)
-                tokens = list(self.all())
+                tokens = self._kept()
                 yield tokens
                 self._write(tokens)
             finally:
                 os.close(handle)
         except PermissionError:
             raise NotPermittedError(f"no permission to write {self.path}: use sudo") from None
+
+    def _kept(self) -> list[Token]:
+        """What the file holds, none where there is none; raises `UsageError`."""
+        try:
+            return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
+        except FileNotFoundError:
+            return []
+        except msgspec.MsgspecError as error:
+            raise UsageError(
+                f"{self.path} cannot be read as tokens ({error}): mend it, or move it away and "
+                "invite all anew"
+            ) from None
 
     def _write(self, tokens: list[Token]) -> None:
         directory = self.path.parent

@@ -16,9 +16,7 @@ import aiohttp
 from aiohttp import web
 
 from acsard.bus.access import MAY
-from acsard.bus.address import require_id
 from acsard.host import clock
-from acsard.host.errors import UsageError
 from acsard.values import NS_PER_S
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
@@ -34,21 +32,16 @@ from acsard.web.frames import (
     decode,
 )
 from acsard.web.hand import Hand, Order
+from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
-from acsard.web.outgoing import Following, Outgoing
+from acsard.web.outgoing import Outgoing
 from acsard.web.robots import Robots
-from acsard.web.streams import KEYS
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0
 """A client that has not answered for half of this is gone."""
 
-KNOWN = ", ".join(sorted(KEYS))
-
-KEYS_AT_ONCE, CALLS_AT_ONCE = 32, 8
-
-FRAMES_HZ = 300.0
-"""Of all keys of one connection together: nobody who looks takes the time of who drives."""
+CALLS_AT_ONCE = 8
 
 DROVE_NS = NS_PER_S
 """Whose last command is older drives no more."""
@@ -81,7 +74,10 @@ class Viewer:
         self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts)
+        self._keys = Keys(self._out, robots, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._stops: set[asyncio.Task[None]] = set()
+        self._ended = False
         self._last: Order | None = None
         self._sequence = 0
         self._gone, self._about = "", robots.about
@@ -102,12 +98,12 @@ class Viewer:
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
-            for one in list(self._out.following.values()):
-                await self._leave(one)
+            await self._keys.leave_all()
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
         """Close it from outside; `why` is at most 120 characters."""
+        self._ended = True
         self._release()
         self._start(self._out.close(why))
 
@@ -115,6 +111,8 @@ class Viewer:
 
     async def _take(self, message: aiohttp.WSMessage) -> bool:
         """One message; False when the connection is over."""
+        if self._ended:
+            return True  # until the socket is closed, which one who does not read delays
         if message.type == aiohttp.WSMsgType.ERROR:
             self._counts.refuse("too_big")
             return False
@@ -127,11 +125,11 @@ class Viewer:
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
             return room or await self._overrun()
-        if not room and not (isinstance(frame, Call) and frame.call == "stop"):
+        if room or (isinstance(frame, Call) and frame.call == "stop"):
+            self._obey(frame)
+        else:
             self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
-            return await self._overrun()
-        self._obey(frame)
-        return True
+        return room or await self._overrun()
 
     async def _overrun(self) -> bool:
         self._overruns += 1
@@ -182,12 +180,15 @@ class Viewer:
         self._hand.give(Order(self.sender, 0.0, 0.0, stamp_ns, self._sequence, now_ns))
 
     def _call(self, frame: Call) -> None:
-        if frame.call != "stop":
+        if frame.call == "stop":
+            # Whoever sent it may be gone before it is asked for: the robot stops all the same.
+            self._start(self._answer(frame), self._stops)
+        else:
             if self._calling >= CALLS_AT_ONCE:
                 self._out.refuse("call", "too_fast", f"{CALLS_AT_ONCE} calls are under way")
                 return
             self._calling += 1
-        self._start(self._answer(frame))
+            self._start(self._answer(frame))
 
     async def _answer(self, frame: Call) -> None:
         try:
@@ -204,69 +205,17 @@ class Viewer:
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
             self._fleet_due = 0.0
-            self._start(self._fleet.join(self))
+            self._fleet.join(self)
             self._out.wake()
-            return
-        robot, key = frame.robot or self._robots.id, frame.subscribe
-        try:
-            require_id(robot)
-        except UsageError as error:
-            self._out.refuse("subscribe", "malformed", str(error))
-            return
-        if key not in KEYS:
-            self._out.refuse(
-                "subscribe", "malformed", f"{key!r} is none of {', '.join(sorted(KEYS))}"
-            )
-            return
-        known = self._out.following.get((robot, key))
-        others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
-        if others + frame.rate > FRAMES_HZ:
-            self._out.refuse("subscribe", "too_many", f"{FRAMES_HZ:g} messages a second in all")
-            return
-        if known is not None:
-            known.period, known.due = 1.0 / frame.rate, 0.0
-            self._out.wake()
-            return
-        if len(self._out.following) >= KEYS_AT_ONCE:
-            self._out.refuse("subscribe", "too_many", f"{KEYS_AT_ONCE} keys at most")
-            return
-        one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
-        self._out.following[robot, key] = one
-        self._start(self._join(one))
+        else:
+            self._keys.subscribe(frame)
 
     def _unsubscribe(self, frame: Unsubscribe) -> None:
         if frame.unsubscribe == FLEET:
             self._fleet_due = None
             self._fleet.leave(self)
-            return
-        one = self._out.following.get((frame.robot or self._robots.id, frame.unsubscribe))
-        if one is not None:
-            self._start(self._leave(one))
-
-    async def _join(self, one: Following) -> None:
-        while self._robots.client is None:
-            await asyncio.sleep(0.2)
-        try:
-            stream = await self._robots.streams.follow(self._robots.client, one.robot, one.name)
-        except TimeoutError:
-            stream = None
-        if stream is None:
-            self._out.following.pop((one.robot, one.name), None)
-            self._out.refuse("subscribe", "too_many", "the bus is stuck, or has no room: try again")
-            return
-        if self._out.following.get((one.robot, one.name)) is not one:  # left meanwhile
-            await self._robots.streams.leave(one.robot, one.name)
-            return
-        one.stream = stream
-        self._out.wake()
-
-    async def _leave(self, one: Following) -> None:
-        if (
-            self._out.following.pop((one.robot, one.name), None) is not None
-            and one.stream is not None
-        ):
-            one.stream = None
-            await self._robots.streams.leave(one.robot, one.name)
+        else:
+            self._keys.unsubscribe(frame)
 
     # what goes out
 
@@ -281,6 +230,7 @@ class Viewer:
                     "sender": self.sender,
                     "limits": {"linear": about.linear, "angular": about.angular},
                     "simulated": about.simulated,
+                    "state_rate": about.state_hz,
                 }
             }
         )
@@ -298,7 +248,10 @@ class Viewer:
             self._out.say({"fleet": self._fleet.rows()})
         return now + LOOK_S
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start(
+        self, work: Coroutine[Any, Any, None], among: set[asyncio.Task[None]] | None = None
+    ) -> None:
+        among = self._tasks if among is None else among
         task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        among.add(task)
+        task.add_done_callback(among.discard)

@@ -3,7 +3,8 @@
 Who is at the machine is its maintainer. But any page in his browser may open `ws://localhost`, or
 point a name of its own at 127.0.0.1: so the name in `Host` must be a loopback one, and where the
 browser tells of a page (`Origin`), it must be ours. From beyond the machine one comes by HTTPS, to
-a name that the robot has, with a token.
+a name that the robot has, with a token. Nobody comes through a proxy: on the robot, with the `Host`
+rewritten, it would make a maintainer of everybody behind it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from acsard.values import ROLES, Role
 
 Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
-    "too_big", "malformed", "path", "replayed", "crowded", "slow",
+    "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
 """What a refusal is counted under."""
 
@@ -65,10 +66,18 @@ class Asked(Struct, frozen=True):
     """The `Origin` header, where there is one."""
     site: str | None = None
     """`Sec-Fetch-Site`."""
+    proxied: bool = False
+    """By somebody who hands it on, and says so."""
 
 
 def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
     """Where a request comes from; `names` are those of the robot, lower case."""
+    if asked.proxied:
+        return Refusal(
+            "proxy",
+            "through a proxy everybody would look as if he were at the machine: open this page "
+            "without one, from elsewhere by https",
+        )
     host = host_name(asked.host)
     if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):
         return "here"

@@ -64,6 +64,7 @@ def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> 
             assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
             assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
             assert hello["simulated"] is True
+            assert hello["state_rate"] == 10.0
             assert "path" in await ours.find(lambda said: "path" in said)
             await ours.say(ping=12.5)
             assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5

@@ -130,6 +130,25 @@ TABLE: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
         "away", "/", {"headers": {"Host": "evil.example"}}, 403, "host"),
     "localhost from elsewhere, without a token": (
         "away", "/api/state", {"headers": {"Host": NAME}}, 401, "no_token"),
+    "through a proxy that says so": (
+        "here", "/api/state", {"headers": {"X-Forwarded-For": "203.0.113.5"}}, 403, "proxy"),
+    "through a proxy that says so otherwise": (
+        "here", "/", {"headers": {"Forwarded": "for=203.0.113.5"}}, 403, "proxy"),
+    "through a proxy, to the socket": (
+        "here", "/ws", {"headers": UPGRADE | {"Via": "1.1 proxy"}}, 403, "proxy"),
+    "a token in parts without a boundary": (
+        "away", "/token", {"method": "POST", "data": b"token=x",
+        "headers": {"Content-Type": "multipart/form-data"}}, 400, "malformed"),
+    "a token in letters that are none": (
+        "away", "/token", {"method": "POST", "data": b"token=x",
+        "headers": {"Content-Type": "application/x-www-form-urlencoded; charset=foo"}},
+        400, "malformed"),
+    "a token that is no text": (
+        "away", "/token", {"method": "POST", "data": b"token=\xff",
+        "headers": {"Content-Type": "application/x-www-form-urlencoded"}}, 400, "malformed"),
+    "a token in JSON that is none": (
+        "away", "/token", {"method": "POST", "data": b"{\xff",
+        "headers": {"Content-Type": "application/json"}}, 400, "malformed"),
     "a path upwards": ("here", "/page/../app.py", {}, 404, "path"),
     "a path upwards, encoded": ("here", "/page/%2e%2e%2fapp.py", {}, 404, "path"),
     "a recording upwards": ("here", "/api/recordings/..%2f..%2fetc%2fpasswd", {}, 404, "path"),

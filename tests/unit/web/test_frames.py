@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.web.frames import Call, Command, FrameError, Ping, Subscribe, Unsubscribe, Wish, decode
+from acsard.messages.signature import Signature, unpack
+from acsard.values import NS_PER_S
+from acsard.web.frames import (
+    LATEST_STAMP_MS,
+    Call,
+    Command,
+    FrameError,
+    Ping,
+    Subscribe,
+    Unsubscribe,
+    Wish,
+    decode,
+)
 
 COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4}
 
@@ -26,6 +39,19 @@ def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
     frame = decode(json.dumps(COMMAND))
     assert isinstance(frame, Command)
     assert abs(frame.stamp_ns - 1763700000123_400000) < 1000
+
+
+@pytest.mark.parametrize("stamp", [9.3e12, 1.8e13, 2.0**51, LATEST_STAMP_MS])
+def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
+    with pytest.raises(FrameError, match="ms since 1970"):
+        decode(json.dumps(COMMAND | {"stamp": stamp}))
+
+
+def test_the_zero_after_the_latest_stamp_can_still_be_signed() -> None:
+    frame = decode(json.dumps(COMMAND | {"stamp": math.nextafter(LATEST_STAMP_MS, 0.0)}))
+    assert isinstance(frame, Command)
+    signed = Signature("phone/1", frame.stamp_ns + 60 * NS_PER_S, 1)
+    assert unpack(signed.pack()) == signed
 
 
 def test_a_command_of_two_zeros_moves_nothing() -> None:

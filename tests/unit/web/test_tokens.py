@@ -21,10 +21,10 @@ def test_an_invitation_is_somebody_until_it_is_revoked(tmp_path: Path) -> None:
     who = server.who(text)
     assert who is not None
     assert (who.role, who.name) == ("operator", "phone")
-    assert server.counts(who.token)
+    assert who.token in server.counting()
     keeper.revoke("phone")
     assert server.who(text) is None
-    assert not server.counts(who.token)
+    assert who.token not in server.counting()
 
 
 def test_the_token_itself_is_nowhere_on_the_disk(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
     text, token = vault.invite("viewer", "tv", 1)
     vault.path.write_bytes(msgspec.json.encode([replace(token, ends=token.made - 1)]))
     assert vault.who(text) is None
-    assert not vault.counts(token.digest)
+    assert token.digest not in vault.counting()
 
 
 @pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0"])
@@ -56,6 +56,36 @@ def test_a_damaged_file_lets_nobody_in(tmp_path: Path) -> None:
     text, _ = vault.invite("maintainer", "me", 1)
     vault.path.write_bytes(vault.path.read_bytes()[:-3])
     assert vault.who(text) is None
+
+
+def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
+    vault = Vault(tmp_path)
+    vault.invite("maintainer", "me", 1)
+    damaged = vault.path.read_bytes()[:-3]
+    vault.path.write_bytes(damaged)
+    for change in (lambda: vault.invite("viewer", "tv", 1), lambda: vault.revoke("me")):
+        with pytest.raises(UsageError, match="cannot be read"):
+            change()
+    assert vault.path.read_bytes() == damaged
+
+
+def test_who_invites_beside_a_service_is_told_that_it_does_not_know_the_token(
+    tmp_path: Path,
+) -> None:
+    own, service = Vault(tmp_path / "own"), tmp_path / "service"
+    assert own.unknown_to(service) == ""
+    service.mkdir()
+    assert "sudo" in own.unknown_to(service)
+    assert Vault(service).unknown_to(service) == ""
+
+
+def test_those_that_count_are_told_at_once(tmp_path: Path) -> None:
+    vault = Vault(tmp_path)
+    _, first = vault.invite("viewer", "tv", 1)
+    _, second = vault.invite("operator", "phone", 1)
+    assert vault.counting() == {first.digest, second.digest}
+    vault.revoke("tv")
+    assert vault.counting() == {second.digest}
 
 
 def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:

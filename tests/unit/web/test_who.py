@@ -46,6 +46,14 @@ def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
     assert found.reason == reason
 
 
+@pytest.mark.parametrize("secure", [False, True])
+@pytest.mark.parametrize("host", ["localhost:8080", "robot.local"])
+def test_who_comes_through_a_proxy_is_nobody_we_know(secure: bool, host: str) -> None:
+    found = place(Asked("127.0.0.1", secure, host, proxied=True), NAMES)
+    assert isinstance(found, Refusal)
+    assert (found.reason, "proxy" in found.text) == ("proxy", True)
+
+
 @pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
 def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
     assert place(Asked("192.168.1.50", True, host), NAMES) == "away"

@@ -1,0 +1,195 @@
+"""The page's server in this process: what no client can bring about at will."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import aiohttp
+import pytest
+from aiohttp.test_utils import TestServer
+
+from acsard.bus.address import Address
+from acsard.bus.session import client_session
+from acsard.client import Client
+from acsard.config.settings import Config
+from acsard.host.errors import UnreachableError
+from acsard.messages.signature import MOST
+from acsard.web.app import Page
+from acsard.web.calls import Calls
+from acsard.web.counts import Counts
+from acsard.web.fleet import Fleet
+from acsard.web.gate import Gate
+from acsard.web.hand import Hand
+from acsard.web.limits import OVERRUNS
+from acsard.web.robots import About, Robots
+from acsard.web.server import Wanted, _until
+from acsard.web.tokens import Vault
+from tests.system.browser import Hands, run
+from tests.system.harness import PATIENCE_S, Daemon
+
+pytestmark = pytest.mark.network
+
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
+
+
+class Inside:
+    """All of it but the way to a robot, which is opened where a test wants one."""
+
+    def __init__(self, where: Path) -> None:
+        self.counts = Counts()
+
+        def connect() -> Client:
+            raise UnreachableError("nobody is there")
+
+        self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
+        self.hand = Hand(lambda: self.robots.client, self.counts)
+        self.fleet, self.gate = Fleet(self.robots), Gate(self.counts)
+        self.page = Page(
+            self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
+            Vault(where), frozenset(), self.gate,
+        )  # fmt: skip
+
+    @asynccontextmanager
+    async def hands(self) -> AsyncIterator[Hands]:
+        """A page that is open."""
+        async with (
+            TestServer(self.page.app) as server,
+            aiohttp.ClientSession() as session,
+            session.ws_connect(server.make_url("/ws")) as opened,
+        ):
+            yield Hands(opened)
+
+
+@pytest.fixture
+def inside(tmp_path: Path) -> Inside:
+    return Inside(tmp_path)
+
+
+async def eventually(look: Callable[[], Any]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not look():
+            await asyncio.sleep(0.01)
+
+
+def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside) -> None:
+    async def story() -> None:
+        async with inside.hands() as ours:
+            await ours.find(lambda said: "hello" in said)
+            await ours.drive(0.0)
+            await eventually(lambda: inside.counts.all().get("commands_dropped"))
+            (viewer,) = inside.page._viewers
+            wire = cast(Any, ours.socket)._response.connection.transport
+            wire.pause_reading()
+            viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
+            inside.page.end_all("your token has ended")
+            before = inside.counts.all()
+            for _ in range(20):
+                await ours.drive(0.5)
+                await asyncio.sleep(0.01)
+            await ours.say(ping=1)
+            await asyncio.sleep(0.2)
+            inside.hand.flush(PATIENCE_S)
+            assert inside.counts.all() == before
+            wire.abort()
+
+    run(story)
+
+
+def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(inside: Inside) -> None:
+    async def story() -> None:
+        async with inside.hands() as ours:
+            wish = {"linear_x": 0.2, "angular_z": 0.0}
+            await ours.say(cmd=wish, stamp=MOST / 1e6)
+            refused = await ours.find(lambda said: said.get("refused") == "cmd")
+            assert "ms since 1970" in refused["reason"]
+            await ours.drive(0.0)
+            await eventually(lambda: inside.counts.all().get("commands_dropped"))
+
+    run(story)
+
+
+def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
+    async def story() -> None:
+        async with inside.hands() as ours:
+            for n in range(3 * OVERRUNS):
+                await ours.say(call="stop", id=n)
+            async with asyncio.timeout(PATIENCE_S):
+                while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                    pass
+            assert ours.socket.close_code == 1008
+
+    run(story)
+
+
+def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
+    inside: Inside, tmp_path: Path
+) -> None:
+    async def story(daemon: Daemon) -> None:
+        with client_session(daemon.endpoint, "") as session:
+            inside.robots.client = Client(session, "acsar", "teleop")
+            async with inside.hands() as ours:
+                await ours.say(subscribe="state", rate=10)
+                await ours.state(lambda state: state["mode"])
+                for _ in range(20):
+                    await ours.say(unsubscribe="state")
+                    await ours.say(subscribe="state", rate=10)
+                await ours.say(ping=1)
+                await ours.find(lambda said: "pong" in said)
+                await ours.state(lambda state: state["mode"])
+                (viewer,) = inside.page._viewers
+                assert list(viewer._out.following) == [("acsar", "state")]
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
+
+
+def test_a_bus_that_is_gone_is_told_and_the_key_comes_when_it_is_back(
+    inside: Inside, tmp_path: Path
+) -> None:
+    async def story(daemon: Daemon) -> None:
+        closed = client_session(daemon.endpoint, "")
+        closed.close()
+        inside.robots.client = Client(closed, "acsar", "teleop")
+        async with inside.hands() as ours:
+            await ours.say(subscribe="state", rate=10)
+            refused = await ours.find(lambda said: said.get("refused") == "subscribe")
+            assert "again" in refused["reason"]
+            with client_session(daemon.endpoint, "") as session:
+                inside.robots.client = Client(session, "acsar", "teleop")
+                await ours.state(lambda state: state["mode"])
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
+
+
+def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
+    inside: Inside, tmp_path: Path
+) -> None:
+    async def story(daemon: Daemon) -> None:
+        closed = client_session(daemon.endpoint, "")
+        closed.close()
+        way = Client(closed, "acsar", "teleop")
+        robots = Robots(Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts)
+        running = asyncio.create_task(robots.run())
+        await eventually(lambda: "again" in robots.gone or running.done())
+        assert not running.done()
+        running.cancel()
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
+
+
+def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
+    address = Address("tcp/127.0.0.1:1", "acsar", "")
+    wanted = Wanted(Config(), address, (), "", tmp_path, next_port=False, held=False)
+
+    async def story() -> None:
+        inside.hand.dead.set_exception(MemoryError("no room"))
+        with pytest.raises(MemoryError):
+            await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
+
+    run(story)

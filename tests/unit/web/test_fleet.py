@@ -1,0 +1,117 @@
+"""The rows of a fleet: who is there, and who has gone, in a session that reaches nobody else."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from acsard.bus.address import Address
+from acsard.client import Client
+from acsard.messages.encodings import encode, encoding_name
+from acsard.messages.schema import Info
+from acsard.web.counts import Counts
+from acsard.web.fleet import Fleet, Row
+from acsard.web.robots import About, Robots
+from tests.unit.web.test_metrics import STATE
+
+PATIENCE_S = 20.0
+
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
+
+INFO = Info("r2", "1.2.3", 42, "/dev/pts/3", True, 100.0, [], [])
+
+
+def quiet() -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", "[]")
+    return config
+
+
+@pytest.fixture
+def session() -> Iterator[zenoh.Session]:
+    with zenoh.open(quiet()) as session:
+        yield session
+
+
+def robots(client: Client | None) -> Robots:
+    def connect() -> Client:
+        raise AssertionError("nobody runs this")
+
+    found = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, Counts())
+    found.client = client
+    return found
+
+
+async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
+    """The first one that it finds true."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            for one in fleet.rows():
+                if look(one):
+                    return one
+            await asyncio.sleep(0.01)
+
+
+def test_a_robot_is_told_with_its_version_and_seconds_and_as_gone_when_its_token_is(
+    session: zenoh.Session,
+) -> None:
+    def say() -> None:
+        session.put(
+            "acsard/r2/state", encode(STATE, "msgpack"),
+            encoding=encoding_name("msgpack", "RobotState"),
+        )  # fmt: skip
+
+    def info(query: zenoh.Query) -> None:
+        said = encode(INFO, "msgpack")
+        query.reply("acsard/r2/info", said, encoding=encoding_name("msgpack", "Info"))
+        query.drop()
+
+    async def story() -> None:
+        fleet = Fleet(robots(Client(session, "acsar", "teleop")))
+        session.declare_queryable("acsard/r2/info", info)
+        token = session.liveliness().declare_token("acsard/r2/alive")
+        fleet.join(1)
+        silent = await row(fleet, lambda one: one.robot == "r2")
+        assert (silent.mode, silent.speed, silent.age) == (None, None, None)
+        say()
+        heard = await row(fleet, lambda one: one.mode == STATE.mode and one.version)
+        assert (heard.version, heard.speed) == ("1.2.3", STATE.linear)
+        say()
+        await asyncio.sleep(0.5)
+        (late,) = fleet.rows()
+        assert late.age is not None
+        assert 0.4 < late.age < PATIENCE_S
+        token.undeclare()
+        gone = await row(fleet, lambda one: one.mode == "gone")
+        assert STATE.mode in gone.reason
+        assert gone.version == ""
+        fleet.leave(1)
+
+    asyncio.run(story())
+
+
+def test_it_is_looked_for_again_when_there_was_no_way_or_the_bus_failed(
+    session: zenoh.Session,
+) -> None:
+    async def story() -> None:
+        with zenoh.open(quiet()) as ended:
+            pass
+        known = robots(None)
+        fleet = Fleet(known)
+        fleet.join(1)
+        assert fleet.rows() == []
+        known.client = Client(ended, "acsar", "teleop")
+        fleet.rows()
+        await asyncio.sleep(0.1)
+        known.client = Client(session, "acsar", "teleop")
+        token = session.liveliness().declare_token("acsard/r2/alive")
+        await row(fleet, lambda one: one.robot == "r2")
+        token.undeclare()
+        fleet.leave(1)
+
+    asyncio.run(story())
