@@ -225,6 +225,9 @@ def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> Non
     bench.line()
     found = read(bench, 60, 3)
     assert [f.dt for f in found] == pytest.approx([0.02] * 3)
+    stamps = [f.at.mono_ns for f in found]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([20 * MS] * 2)
+    assert stamps[-1] == bench.now_ns - WIRE_NS
 
 
 def test_a_new_session_begins_without_the_old_ones_clock() -> None:
@@ -273,6 +276,20 @@ def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
         found = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
         assert found.asked_ns == 10**9 + ms * MS
         assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
+
+
+def test_of_answers_in_batches_each_has_its_line_from_the_first_second_on() -> None:
+    bench = Bench(counts=0)
+    began, left = bench.now_ns, 0
+    found: list[Feedback] = []
+    for batch in range(1, 26):
+        ready = (16 * batch - 9) // 10 + 1  # each answered 9 ms later
+        while left * 10 < 16 * batch:
+            bench.timeline.left(began + left * 10 * MS)
+            left += 1
+        found += read(bench, 16, ready - len(found))
+    assert [f.dt for f in found[10:]] == pytest.approx([0.01] * len(found[10:]))
+    assert not any(f.bridged for f in found[10:])
 
 
 def test_a_change_of_clocks_adds_up_to_no_time() -> None:
