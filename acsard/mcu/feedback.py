@@ -179,9 +179,7 @@ class Timeline:
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
             prompts = self._prompts
-            # Nor is there anything better while nobody can tell and no period is found.
-            best = slots.period is None and prompts.complete
-            plain = (speaks is False or prompts.thinks or best) and not prompts.lost
+            plain = (speaks is False or prompts.thinks) and not prompts.lost
             ours = asked_ns is not None or plain
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:

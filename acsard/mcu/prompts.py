@@ -110,11 +110,6 @@ class Prompts:
         return self._batched and self._losses > MOST_LOST
 
     @property
-    def complete(self) -> bool:
-        """Hardly a line goes without an answer: who reports less often leaves most without."""
-        return max(self._missing, self._losses) <= MOST_LOST
-
-    @property
     def _batched(self) -> bool:
         """An adapter holds answers back, so that several come in one read."""
         return self._several > SEVERAL

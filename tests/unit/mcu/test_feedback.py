@@ -278,20 +278,6 @@ def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
         assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
 
 
-def test_of_answers_in_batches_each_has_its_line_from_the_first_second_on() -> None:
-    bench = Bench(counts=0)
-    began, left = bench.now_ns, 0
-    found: list[Feedback] = []
-    for batch in range(1, 26):
-        ready = (16 * batch - 9) // 10 + 1  # each answered 9 ms later
-        while left * 10 < 16 * batch:
-            bench.timeline.left(began + left * 10 * MS)
-            left += 1
-        found += read(bench, 16, ready - len(found))
-    assert [f.dt for f in found[10:]] == pytest.approx([0.01] * len(found[10:]))
-    assert not any(f.bridged for f in found[10:])
-
-
 def test_a_change_of_clocks_adds_up_to_no_time() -> None:
     bench = Bench(counts=0)
     began = bench.now_ns + 10 * MS

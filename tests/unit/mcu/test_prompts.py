@@ -126,16 +126,6 @@ def test_where_answers_get_lost_one_of_two_close_lines_may_be_without() -> None:
     assert bench.reply(403.0 + DELAY_MS + 0.2) == [193.0, 190.0]
 
 
-def test_whose_lines_all_have_an_answer_is_complete_whose_have_not_is_not() -> None:
-    bench = Bench().talk()
-    assert bench.prompts.complete
-    for number in range(20, 120):
-        bench.leave(number * 10)
-        if number % 5 == 4:  # who reports every 50 ms
-            bench.reply(number * 10 + DELAY_MS)
-    assert not bench.prompts.complete
-
-
 def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
     bench = Bench().talk()
     bench.leave(200.0)
