@@ -213,9 +213,12 @@ class Prompts:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
-            close = apart < self._apart / 2
+            # Behind a stall two lines leave at once, and the first one's answer is late; but not so
+            # late that the second one's ought to be read by then.
+            overdue = at - left[1] - delay > max(self._apart / 2, wide)
+            close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE:
-                break  # behind a stall two lines leave at once, and the first one's answer is late
+                break
             self._passed, self._lost = left.popleft(), True
             self._missing += LOSING * (not close)
         if not lost or not left:

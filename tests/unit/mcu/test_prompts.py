@@ -116,6 +116,16 @@ def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
     assert bench.reply(403.0 + DELAY_MS + 3.0)[1] == 0.0
 
 
+def test_a_silence_that_begins_with_two_close_lines_leaves_all_of_its_lines_without() -> None:
+    """Nobody's answer is so late that the second line's own ought to be read by then."""
+    bench = Bench().talk()
+    for ms in (200.0, 203.9, 220.0, 320.0, 420.0, 520.0, 620.0):
+        bench.leave(ms)
+    assert bench.reply(620.0 + DELAY_MS) == [430.0, 330.0]
+    bench.leave(630.0)
+    assert bench.reply(630.0 + DELAY_MS) == [10.0, 0.0]
+
+
 def test_where_answers_get_lost_one_of_two_close_lines_may_be_without() -> None:
     bench = Bench().talk()
     bench.leave(200.0)
