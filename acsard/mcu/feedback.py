@@ -154,7 +154,7 @@ class Timeline:
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
         told = self._told_by(asked_ns, came_ns)
         dt, bridged = self._since_last(told)
-        first, at = self._last is None, self._sampled(came_ns, told, length)
+        first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # Who answers makes no line that we do not ask for: none is missing for that we were silent.
         clocked = told.clock != "reads" or self._prompts.lost
@@ -169,6 +169,7 @@ class Timeline:
             self._told = self._told_by_reads() if told.clock == "reads" else told
             dt = bridged = since = 0.0
         self._forgotten = False
+        at = self._sampled(came_ns, self._told, length)
         since = 0.0 if silent else since
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
@@ -223,7 +224,7 @@ class Timeline:
 
     def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
         """When the sample of a line was made: its own bytes were on the wire after that."""
-        late = 0 if told.clock == "reads" else max(0, came_ns - told.due_ns)
+        late = max(0, came_ns - told.due_ns)
         mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

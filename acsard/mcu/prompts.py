@@ -24,6 +24,12 @@ GAIN = 0.05
 SLOW = 0.0125
 """How quickly it shows whose that spread is."""
 
+LEAST = 0.002
+"""How quickly the least delay is forgotten: in 500 answers."""
+
+RARE = 0.002
+"""Share of answers lost, below which of two lines close to each other none is taken to be."""
+
 JITTER_NS = 350_000
 """What USB and the scheduler make of a constant delay: its mean deviation."""
 
@@ -74,7 +80,11 @@ class Prompts:
         """What was sent until now is answered, or nobody will."""
         self._left.clear()
         self._delay: float | None = None
-        self._spread = 0.0
+        self._spread = self._least = 0.0
+        """The usual delay's mean deviation; the least one, ns."""
+        self._made: int | None = None
+        self._apart = self._missing = 0.0
+        """When the last line left, how far two usually are apart, the share of answers lost."""
         self._last: int | None = None
         """When the line left that was answered last, and what its answer took beyond the usual."""
         self._passed = self._line = 0
@@ -106,6 +116,10 @@ class Prompts:
 
     def left(self, made_ns: int) -> None:
         """A line has left that was made then."""
+        if self._made is not None:
+            apart, usual = made_ns - self._made, self._apart
+            self._apart = usual + GAIN * (min(apart, 2 * usual) - usual) if usual else apart
+        self._made = made_ns
         self._left.append(made_ns)
 
     def read(self, at_ns: int, lines: int) -> None:
@@ -165,7 +179,7 @@ class Prompts:
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
         if left:
-            self._delay = float(self._at - left[0])
+            self._delay = self._least = float(self._at - left[0])
 
     def _weigh(self, lines: int, since: int) -> None:
         """Give up lines that a batch's last answer is too late for, `since` the read before."""
@@ -192,11 +206,21 @@ class Prompts:
         """The line that was given up last was not lost; else gives up those that are now."""
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
+        self._missing -= LOSING * self._missing
+        # No answer comes sooner than any ever does: then it is a late one of the line before.
+        soonest = max(self._soonest, self._least)
         while len(left) > 1:
-            most = max((left[1] - left[0]) / 2, wide)
-            if at - left[0] - delay <= most or at - left[1] < self._soonest:
+            apart = left[1] - left[0]
+            if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
+                break
+            # Behind a stall two lines leave at once, and the first one's answer is late; but not so
+            # late that the second one's ought to be read by then.
+            overdue = at - left[1] - delay > max(self._apart / 2, wide)
+            close = apart < self._apart / 2 and not overdue
+            if close and self._missing < RARE:
                 break
             self._passed, self._lost = left.popleft(), True
+            self._missing += LOSING * (not close)
         if not lost or not left:
             return lost
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
@@ -214,6 +238,7 @@ class Prompts:
         if abs(error) >= max(delay, 4 * spread):
             return 0  # a stall
         self._delay = delay + GAIN * error
+        self._least = min(self._least + LEAST * (delay - self._least), delay + error)
         self._spread += GAIN * (abs(error) - spread)
         if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
             return 0

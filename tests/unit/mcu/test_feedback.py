@@ -225,6 +225,9 @@ def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> Non
     bench.line()
     found = read(bench, 60, 3)
     assert [f.dt for f in found] == pytest.approx([0.02] * 3)
+    stamps = [f.at.mono_ns for f in found]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([20 * MS] * 2)
+    assert stamps[-1] == bench.now_ns - WIRE_NS
 
 
 def test_a_new_session_begins_without_the_old_ones_clock() -> None:

@@ -85,13 +85,55 @@ def test_a_damaged_reply_leaves_its_line_without_one() -> None:
 
 
 def test_a_line_given_up_too_early_gets_its_reply_back() -> None:
+    bench = Bench()
+    bench.leave(-10.0)
+    bench.reply(-10.0 + DELAY_MS - 1.5)  # so soon one may come
+    bench.talk()
+    bench.leave(200.0)
+    bench.leave(210.0)
+    early, bridged = bench.reply(210.0 + DELAY_MS - 1)  # the first one's, read late
+    assert (early, bridged) == pytest.approx((20.0, 10.0), abs=1.0)
+    own, nothing = bench.reply(210.0 + DELAY_MS)
+    assert (early + own, nothing) == pytest.approx((20.0, 0.0), abs=1.0)
+    bench.leave(220.0)
+    assert bench.reply(220.0 + DELAY_MS) == pytest.approx([10.0, 0.0], abs=1.0)
+
+
+def test_a_late_answer_is_none_that_comes_sooner_than_any() -> None:
     bench = Bench().talk()
     bench.leave(200.0)
     bench.leave(210.0)
-    assert bench.reply(210.0 + DELAY_MS - 1)[0] == 20.0  # the first one's, read late
-    assert bench.reply(210.0 + DELAY_MS) == [0.0, 0.0]
-    bench.leave(220.0)
-    assert bench.reply(220.0 + DELAY_MS) == [10.0, 0.0]
+    assert bench.reply(210.0 + DELAY_MS - 1) == [10.0, 0.0]
+    assert bench.reply(210.0 + DELAY_MS) == [10.0, 0.0]
+
+
+def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
+    """Nothing is bridged: the first one's answer, read late, tells of all of the stall."""
+    bench = Bench().talk()
+    bench.leave(400.0)
+    bench.leave(403.0)
+    assert bench.reply(403.0 + DELAY_MS + 0.2) == [210.0, 0.0]
+    assert bench.reply(403.0 + DELAY_MS + 3.0)[1] == 0.0
+
+
+def test_a_silence_that_begins_with_two_close_lines_leaves_all_of_its_lines_without() -> None:
+    """Nobody's answer is so late that the second line's own ought to be read by then."""
+    bench = Bench().talk()
+    for ms in (200.0, 203.9, 220.0, 320.0, 420.0, 520.0, 620.0):
+        bench.leave(ms)
+    assert bench.reply(620.0 + DELAY_MS) == [430.0, 330.0]
+    bench.leave(630.0)
+    assert bench.reply(630.0 + DELAY_MS) == [10.0, 0.0]
+
+
+def test_where_answers_get_lost_one_of_two_close_lines_may_be_without() -> None:
+    bench = Bench().talk()
+    bench.leave(200.0)
+    bench.leave(210.0)
+    assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
+    bench.leave(400.0)
+    bench.leave(403.0)
+    assert bench.reply(403.0 + DELAY_MS + 0.2) == [193.0, 190.0]
 
 
 def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
