@@ -272,7 +272,7 @@ COMMANDS: dict[str, How] = {
         "test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role",
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
-    "acsard web --tls tls --address http://127.0.0.1:8080 --address https://0.0.0.0:8443": INVITED,
+    "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
     # deploy/ros2

@@ -71,6 +71,8 @@ def _require_free(new: Path, force: bool) -> None:
         raise FileExistsError(EEXIST, "it exists; --force writes it anew")
     if new.is_dir():
         _require_bag(new)
+    elif new.exists() and not new.is_file():
+        raise FileExistsError(EEXIST, "it is no file but a device or a pipe; name a file")
     elif new.is_file() and _is_recording(new):
         raise FileExistsError(EEXIST, "it is a recording; name another file")
 

@@ -25,6 +25,7 @@ from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.requests import (
     COOKIE,
     asked_of,
+    body_of,
     keep_little,
     own_address,
     secured,
@@ -257,7 +258,7 @@ class Page:
         return await self._programs.value(_who(request), request.match_info["key"])
 
     async def _service(self, request: web.Request) -> web.StreamResponse:
-        body = await request.read()
+        body = await body_of(request)
         return await self._programs.call(_who(request), request.match_info["verb"], body)
 
     async def _recordings(self, request: web.Request) -> web.StreamResponse:

@@ -110,7 +110,7 @@ def require(who: Who, verb: str) -> None:
     least = SERVICE_ROLES[verb]
     if not who.may(least):
         raise RefusedError(
-            f"{verb} is for an {least}; you are {who.role}: {MAY[who.role]}", role=True
+            f"{verb} is for who is at least {least}; you are {who.role}: {MAY[who.role]}", role=True
         )
 
 

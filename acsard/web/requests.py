@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 from urllib.parse import parse_qsl
@@ -21,6 +22,9 @@ PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
 """How the headers begin by which a proxy says that it hands on what another asked."""
 
 NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
+
+BODY_S = 5.0
+"""For a body of a few hundred bytes; who keeps it keeps a place that others wait for."""
 
 SEND_BUFFER = 65536
 """Of the kernel, for one client: what lies in it is old when it arrives."""
@@ -51,9 +55,18 @@ def token_shown(request: web.Request) -> str:
     return text.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
 
 
+async def body_of(request: web.Request) -> bytes:
+    """All of it; raises `HTTPRequestTimeout` for who announces one and keeps it."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            return await request.read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(reason=f"no body came within {BODY_S:g} s") from None
+
+
 async def token_posted(request: web.Request) -> str:
     """The token in a form or in JSON, "" where there is none; raises `HTTPBadRequest`."""
-    body = await request.read()
+    body = await body_of(request)
     try:
         text = body.decode(request.charset or "utf-8")
         if request.content_type == "application/json":

@@ -302,6 +302,8 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     page.shows("age", "live")
     page.server.process.kill()
     page.shows("age", "no connection")
+    page.shows("mode", "NO CONNECTION")
+    assert page.browser.text("speed") == "–"
 
 
 def test_somebody_else_who_drives_is_named(page: Phone) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, suppress
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from yarl import URL
 
 from acsard.lan.authority import Authority
+from acsard.web.requests import BODY_S
 from tests.system.browser import NAME, Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, Daemon, resident_kb
 
@@ -293,3 +295,14 @@ def test_an_address_has_room_for_twenty_pages(page: Page, bus: Bus) -> None:
             assert caught.value.status == 503
 
     run(story)
+
+
+def test_who_announces_a_body_and_keeps_it_is_sent_away(page: Page, daemon: Daemon) -> None:
+    port = int(page.here.rpartition(":")[2])
+    begun = time.monotonic()
+    with socket.create_connection(("127.0.0.1", port), 30.0) as held:
+        held.sendall(b"POST /api/srv/clear HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" % port)
+        held.sendall(b"Content-Length: 100\r\n\r\n")
+        answer = held.recv(4096)
+    assert answer.startswith(b"HTTP/1.1 408"), answer
+    assert time.monotonic() - begun < BODY_S + PATIENCE_S

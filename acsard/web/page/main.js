@@ -113,7 +113,7 @@ function looked() {
 function stated({ detail }) {
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
-  views.banner(state);
+  views.banner(state, hello?.role === "viewer");
   $("clear").hidden = !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
@@ -182,12 +182,11 @@ link.addEventListener("gone", ({ detail }) => views.text("reason", detail.gone))
 link.addEventListener("down", async ({ detail }) => {
   drive.release("let go: the connection is gone");
   heard = -Infinity;
-  if (detail.reason) views.text("reason", detail.reason);
-  else if (detail.never) {
-    // A browser does not say why it was not let in; this does.
-    const told = await got("api/whoami");
-    if (told.error && !link.open) views.text("reason", told.error);
-  }
+  views.lost(detail.reason);
+  if (detail.reason || !detail.never) return;
+  // A browser does not say why it was not let in; this does.
+  const told = await got("api/whoami");
+  if (told.error && !link.open) views.lost(told.error);
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));

@@ -59,7 +59,7 @@ export function cards(list, robots) {
       one.version ? `version ${one.version}` : "",
       typeof one.age === "number" ? `heard ${ago(one.age)}` : "",
     ];
-    return made("li", bad, made("strong", "", one.robot), ` ${one.mode ?? "silent"}`, made("div", "quiet", one.reason ?? ""),
+    return made("li", bad, made("strong", "", one.robot), ` ${one.mode ?? "silent"}`, made("div", "quiet", said(one.reason ?? "")),
       made("div", "quiet", facts.filter(Boolean).join(" · ")));
   });
   list.replaceChildren(...(shown.length ? shown : [made("li", "warning", "no robot is heard")]));
@@ -78,14 +78,23 @@ export function recordings(list, none, files) {
 }
 
 /** Mode and why, in words, and what doubts there are. */
-export function banner(state) {
+export function banner(state, viewer) {
   document.body.dataset.mode = state.mode;
   text("mode", state.mode.toUpperCase());
-  text("reason", reason(state));
+  const why = reason(state);
+  text("reason", viewer ? why.replace("press Clear", "an operator clears it") : why);
   const doubt = document.getElementById("doubt");
   const warned = [state.doubt, state.recording, state.certificate.startsWith("valid") ? "" : state.certificate];
   doubt.textContent = warned.filter(Boolean).join("; ");
   doubt.hidden = !doubt.textContent;
+}
+
+/** Nothing is known any more: what was shown last is not what is. */
+export function lost(why) {
+  document.body.dataset.mode = "waiting";
+  text("mode", "NO CONNECTION");
+  if (why) text("reason", why);
+  for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 
 /** How old what is shown is, ms; beyond `fresh` it is stale. And the way to the robot and back. */

@@ -211,6 +211,15 @@ def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> Non
     assert [*tmp_path.iterdir()] == [bag]
 
 
+def test_what_is_no_file_never_goes(path: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for kind in KINDS:
+        with pytest.raises(FileExistsError, match="it is no file"):
+            export(Recording(path), pipe, kind, force=True)
+    assert pipe.is_fifo()
+
+
 def test_a_recording_never_goes(path: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     before = path.read_bytes()
