@@ -78,7 +78,7 @@ def page(tmp_path: Path, browser: Browser) -> Iterator[Phone]:
             browser.said.clear()
             browser.open(server.here)
             page.shows("mode", "READY")
-            until(lambda: browser.js("!document.body.classList.contains('stale')"), 5.0, "news")
+            page.shows("age", "live")
             yield page
             browser.lift()
             browser.open("about:blank")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -34,8 +35,16 @@ def quiet() -> zenoh.Config:
 
 @pytest.fixture
 def session() -> Iterator[zenoh.Session]:
-    with zenoh.open(quiet()) as session:
-        yield session
+    session = zenoh.open(quiet())
+    yield session
+    for _ in range(100):
+        try:
+            session.close()
+        except RuntimeError:  # a thread of its own still holds it, of a call that was given up
+            time.sleep(0.05)
+        else:
+            return
+    raise AssertionError("somebody keeps the session")
 
 
 def robots(client: Client | None) -> Robots:
