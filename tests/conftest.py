@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from xdist.scheduler import LoadGroupScheduling
 
 # No deadline: a slow machine must not fail a true sentence. The same examples every time: what a
 # change is judged by must not be luck. `explore` looks for new ones.
-settings.register_profile("default", deadline=None, max_examples=30, derandomize=True)
+settings.register_profile("default", deadline=None, max_examples=10, derandomize=True)
 settings.register_profile("thorough", deadline=None, max_examples=300, derandomize=True)
 """`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
 settings.register_profile("explore", deadline=None, max_examples=3000)
@@ -43,9 +44,10 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
-TIMED = ("bench", "firmware", "system", "systemd")
-"""Where real time passes: these run one after the other. All else is only computed beside them, or
-says by a mark of its own that it does not mind."""
+TIMED = {"bench": "timed", "firmware": "timed", "system": "timed", "systemd": "systemd"}
+"""Where real time passes, and its group: those of one run one after the other. What a container
+waits for minds company as little as what is only computed, so it goes on beside the others; a mark
+of its own says the same of a single test."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -71,10 +73,24 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
     return _ByFile(config, log)
 
 
+def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
+    seen = Counter[str]()
+    for item in items:
+        one_in = item.get_closest_marker("variations")
+        if one_in is None:
+            continue
+        test = item.nodeid.partition("[")[0]
+        if seen[test] % one_in.args[0]:
+            item.add_marker(pytest.mark.slow)
+        seen[test] += 1
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
+    _all_but_some_are_slow(items)
     for item in items:
-        timed = item.path.relative_to(here).parts[0] in TIMED
-        if timed and not item.get_closest_marker("xdist_group"):
-            item.add_marker(pytest.mark.xdist_group("timed"))
+        group = TIMED.get(item.path.relative_to(here).parts[0])
+        if group and not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group(group))
     items.sort(key=lambda item: item.path.relative_to(here).parts[0] not in TIMED)

@@ -219,6 +219,7 @@ def encoded(
     return made
 
 
+@pytest.mark.slow
 def test_a_tree_nobody_listens_to_encodes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     robot, ros = config().robot.id, "odom"
     ours, text = full_key(robot, "odom"), full_key(robot, "json/odom")

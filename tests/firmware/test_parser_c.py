@@ -326,7 +326,14 @@ def wrong_values(parser: Parser, count: int, checked_lines: bool) -> int:
     return wrong
 
 
-@pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    "count",
+    [
+        3_000,
+        pytest.param(20_000, marks=pytest.mark.slow),
+        pytest.param(1_000_000, marks=pytest.mark.soak),
+    ],
+)
 @pytest.mark.timeout(600)
 def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
     parser: Parser, count: int

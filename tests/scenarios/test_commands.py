@@ -452,6 +452,7 @@ def test_two_nodes_behind_one_bridge_that_stamps_nothing_are_one_sender(world: W
     assert waits_for(world) == ""
 
 
+@pytest.mark.variations(3)
 @by_each_way
 @pytest.mark.parametrize("cleared_after", [0.05, 0.2, 0.4, 0.55])
 def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
@@ -491,6 +492,7 @@ def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
     assert waits_for(world).startswith("neutral first")
 
 
+@pytest.mark.variations(3)
 @by_each_way
 @pytest.mark.parametrize("nonsense", ["NaN", "cut", "nothing", "a NaN in a stamped one"])
 def test_one_who_sends_nonsense_for_a_while_was_not_silent(

@@ -51,6 +51,7 @@ def test_a_sender_whose_clock_is_new_here_is_no_warning(world: World) -> None:
     assert row(world, "commands").level == OK
 
 
+@pytest.mark.slow
 def test_missed_periods_are_a_warning_for_a_minute(world: World) -> None:
     assert row(world, "control loop").level == OK
     for _ in range(20):

@@ -61,6 +61,7 @@ def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
     return drive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turned(
     seed: int,

@@ -64,6 +64,7 @@ def test_odometry_goes_on_without_a_jump_after_replugging(world: World) -> None:
     assert world.state.x == pytest.approx(before, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     with world.mcu.mute():

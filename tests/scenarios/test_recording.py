@@ -82,6 +82,7 @@ def test_settings_that_were_changed_meanwhile_are_lived_again_too() -> None:
     lives_again(tape, PLAIN, first)
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
     tape = Tape(every=397)
     world = World(FULL, recorder=tape)

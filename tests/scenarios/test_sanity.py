@@ -27,6 +27,7 @@ def stopped(world: World) -> bool:
     return world.mcu.vehicle.set_points == [0.0] * 4
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("kind", ["stuck", "reversed", "runaway"])
 def test_a_lying_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
@@ -185,6 +186,7 @@ def test_wheels_turned_by_hand_are_told_at_most_once_a_second_and_counted(
 ONE_OF_EACH = {(0.2, "zero"), (0.4, "stop"), (0.6, "silence")}
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("lag", "way"),
     [
@@ -208,6 +210,7 @@ def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way
     assert told(world, "fault") == told(world, "wheels_turned") == []
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("linear", "way", "within"),
     [

@@ -537,6 +537,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
     assert not +wrong
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("rate", [0.92, slow(1.08)])
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
@@ -553,6 +554,7 @@ def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     assert driving_again(world, speaker), world.state.reason
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     "ahead",
     [slow(-86400.0), slow(-3600.0), -2.0, slow(-0.3), 0.3, slow(2.0), slow(3600.0), 86400.0],

@@ -153,6 +153,7 @@ def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said
     assert changed == {f"command_{reason}"}
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_command_is_counted_and_said_and_moves_nothing(bus: Bus, name: str) -> None:
     bad = BAD[name]

@@ -204,6 +204,7 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
     assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
 
 
+@pytest.mark.slow
 def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()

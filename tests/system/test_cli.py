@@ -308,6 +308,7 @@ def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str,
 # words that nothing is called
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

@@ -145,6 +145,7 @@ def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
     assert state["y"] == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
     examples: dict[str, Outcome],
 ) -> None:
@@ -155,6 +156,7 @@ def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
     assert state["x"] == pytest.approx(0.97, abs=0.05 + 0.5 * late)
 
 
+@pytest.mark.slow
 def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_prints_the_odometry(
     examples: dict[str, Outcome],
 ) -> None:

@@ -321,7 +321,8 @@ def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bu
 # driving
 
 
-@pytest.mark.parametrize("encoding", ["json", pytest.param("cdr", marks=SLOW)])
+@SLOW
+@pytest.mark.parametrize("encoding", ["json", "cdr"])
 def test_a_held_button_drives_and_letting_go_stops(viewer: Viewer, bus: Bus, encoding: str) -> None:
     twist = Twist(Vector3(x=0.4), Vector3())
     data = speed(0.4) if encoding == "json" else encode(twist, "cdr")

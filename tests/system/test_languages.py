@@ -81,6 +81,7 @@ def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
     bus.at_rest()
 
 
+@pytest.mark.slow
 def test_the_python_example_follows_the_robot(shared: Daemon, bus: Bus, tmp_path: Path) -> None:
     words = [sys.executable, str(CLIENTS / "python/follow.py"), shared.endpoint]
     followed(words, tmp_path, bus)

@@ -34,6 +34,8 @@ from tests.system.identities import free_tls_endpoint
 from tests.system.test_cli import ON_TERMINAL, Terminal, screens
 from tests.system.typed import typed
 
+pytestmark = pytest.mark.slow  # two robots and a router, each time
+
 ONE, TWO = "robot1", "robot2"
 
 

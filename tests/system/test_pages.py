@@ -31,13 +31,14 @@ from tests.system.harness import (
 )
 from tests.system.test_fleet import Fleet
 
-SLOW_PAGES = ("deploy/zenoh/README.md",)
+MARKS = {"README.md": pytest.mark.slow, "deploy/zenoh/README.md": pytest.mark.network}
+"""Of pages whose commands take their time."""
 
 TYPED = [
     pytest.param(
         block,
         id=block.where,
-        marks=[pytest.mark.network] if block.page in SLOW_PAGES else [],
+        marks=MARKS.get(block.page, ()),
     )
     for block in blocks()
     if any(isinstance(COMMANDS.get(command), Run) for command in block.commands())

@@ -54,7 +54,7 @@ def is_even(periods: Periods, waited: float) -> None:
 @pytest.mark.parametrize(
     "length",
     [
-        2.0,
+        1.0,
         pytest.param(5.0, marks=pytest.mark.slow),
         pytest.param(60.0, marks=pytest.mark.soak),
     ],

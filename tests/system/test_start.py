@@ -114,6 +114,7 @@ def test_state_answers_as_soon_as_the_daemon_says_it_is_up(tmp_path: Path) -> No
 # in use: 75
 
 
+@pytest.mark.slow
 def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
     tmp_path: Path, peer: Peer
 ) -> None:

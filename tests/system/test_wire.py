@@ -148,6 +148,7 @@ def steady(bus: Bus) -> Any:
     return state if right else None
 
 
+@pytest.mark.slow
 def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -> None:
     # 0.4 m/s is 8 rad/s, which can be said with one digit and with one decimal.
     begun = time.monotonic()
@@ -234,6 +235,7 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
         bus.linked()
 
 
+@pytest.mark.slow
 def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_short_gap(
     tmp_path: Path, peer: Peer
 ) -> None:

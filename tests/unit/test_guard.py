@@ -437,11 +437,22 @@ def test_one_trip_is_one_fault_that_names_it() -> None:
     assert loop.wire[-1][0] == STOP
 
 
-CONFIGS = [
-    Config(),
-    Config(commands=CommandsConfig(neutral_first=False)),
-    Config(limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=20.0)),
-]
+EACH_CONFIG = pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(Config(), id="default"),
+        pytest.param(
+            Config(commands=CommandsConfig(neutral_first=False)),
+            id="without neutral first",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            Config(limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=20.0)),
+            id="jerk",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
 
 
 def random_walk(rng: random.Random, config: Config) -> Loop:
@@ -473,7 +484,7 @@ def random_walk(rng: random.Random, config: Config) -> Loop:
     return loop
 
 
-@pytest.mark.parametrize("config", CONFIGS, ids=["default", "without neutral first", "jerk"])
+@EACH_CONFIG
 def test_a_healthy_robot_never_trips_the_guard(config: Config) -> None:
     moved = 0
     for seed in range(40):
@@ -483,7 +494,7 @@ def test_a_healthy_robot_never_trips_the_guard(config: Config) -> None:
     assert moved > 500
 
 
-@pytest.mark.parametrize("config", CONFIGS, ids=["default", "without neutral first", "jerk"])
+@EACH_CONFIG
 def test_on_the_wire_no_wheel_grows_without_a_fresh_command_nor_moves_without_a_link(
     config: Config,
 ) -> None:

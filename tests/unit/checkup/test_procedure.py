@@ -38,6 +38,7 @@ GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
 }
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(("faults", "mcu"), GOOD.values(), ids=GOOD)
 @pytest.mark.parametrize("person", [False, True])
 def test_a_robot_that_is_right_passes(
@@ -154,6 +155,7 @@ def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
     assert checked.changes["mcu.reply_period"] == 0.1
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("letter", MOTORS)
 @pytest.mark.parametrize("part", ["motor", "encoder"])
 def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
@@ -182,6 +184,7 @@ def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
     assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[one]}"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("what", ["motors", "encoders"])
 @pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
 def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, other: str) -> None:
@@ -201,6 +204,7 @@ def test_any_wiring_is_found_out() -> None:
     assert found == {w: getattr(wired, w) for w in WHEELS}
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("part", ["dead_motor", "stuck_encoder"])
 @pytest.mark.parametrize("letter", MOTORS)
 def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(

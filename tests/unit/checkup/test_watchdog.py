@@ -37,6 +37,7 @@ def measured(robot: Robot, *motors: int) -> tuple[str, str]:
     return finding.verdict, finding.figure
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
 @pytest.mark.parametrize("time_ms", [120, 450])
 @pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
@@ -51,6 +52,7 @@ def test_a_time_within_the_contract_is_measured(
     assert verdict == "PASS"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", [("plain_only",), (), ("unprompted",)])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
 def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(

@@ -29,6 +29,7 @@ def errors(name: str, case: Case, seconds: float, seeds: int) -> np.ndarray:
     return np.asarray(found)
 
 
+@pytest.mark.variations(3)
 @EFFORT
 @pytest.mark.parametrize("stall", [0.05, 0.09, 0.15, 0.25])
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
@@ -105,6 +106,7 @@ def test_every_slot_of_a_drive_is_counted_once() -> None:
     assert all(feedback.bridged == feedback.gap == 0.0 for feedback in host.heard)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     "case",
     [

@@ -150,7 +150,11 @@ def happen_fault(world: World) -> None:
         world.hold(0.5, seconds=3.0)
 
 
-@pytest.mark.parametrize("happen", [happen_stop, happen_loss, happen_silence, happen_fault])
+@pytest.mark.parametrize(
+    "happen",
+    [happen_stop, happen_fault]
+    + [pytest.param(other, marks=pytest.mark.slow) for other in (happen_loss, happen_silence)],
+)
 def test_the_minute_before_and_after_what_happened_is_kept(
     happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
