@@ -204,6 +204,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m 'languages and not soak'": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
+    ".venv/bin/python -m tests.screens": Shown("prints what tests/unit/top and others assert"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
