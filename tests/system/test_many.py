@@ -245,7 +245,7 @@ def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> Non
             told = view.tool("fleet", "--once").out
             return all(re.search(rf"^{name} +ready", told, re.M) for name in (ONE, TWO))
 
-        until(both, 20.0, "both in one view")
+        until(both, 60.0, "both in one view")
         stopped = view.tool("call", "stop")
         assert stopped.code == 0
         assert {line.split(":")[0] for line in stopped.out.splitlines()} == {ONE, TWO}
