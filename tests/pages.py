@@ -131,6 +131,9 @@ MANY = Elsewhere(
     "test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do",
     "robot2 is not there",
 )
+IN_ONE_VIEW = Elsewhere(
+    "tests/system/test_many.py", "test_the_two_robots_of_the_fleet_page_are_in_one_view"
+)
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
@@ -159,6 +162,7 @@ COOKIE = Elsewhere(WEB, "test_a_token_becomes_a_cookie_that_no_script_reads_and_
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
 _LAUNCH_FILE = "deploy/ros2/acsar.launch.py"
 _ROUTER = "--id robot1 --connect tls/router.local:7447 --tls"
+_PLAIN = "--connect tcp/127.0.0.1:7447"
 _ROUTERS = _ROUTER.replace("robot1", "robot1,robot2")
 _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'"""
 
@@ -170,6 +174,7 @@ COMMANDS: dict[str, How] = {
     ),
     ". .venv/bin/activate": Run(),
     "acsard drive": DRIVE,
+    "acsard echo odom -n 1 --short": Run(r"^x +[+-]\d.* m  y .* m  yaw .*°  forward .* m/s  turn"),
     "acsard echo odom -n 1": Run('"child_frame_id":"base_link"'),
     "acsard echo state -n 1": Run('"mode":"[a-z]+","reason":'),
     "acsard top": Run("pose and twist"),
@@ -199,6 +204,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m 'languages and not soak'": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
+    ".venv/bin/python -m tests.screens": Shown("prints what tests/unit/top and others assert"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
@@ -362,6 +368,12 @@ COMMANDS: dict[str, How] = {
         but="it calls `stop` instead"
     ),
     # deploy/zenoh
+    "acsard router two.json5": IN_ONE_VIEW,
+    f"acsard run --id robot1 --listen tcp/127.0.0.1:7451 {_PLAIN}": IN_ONE_VIEW,
+    f"acsard run --id robot2 --listen tcp/127.0.0.1:7452 {_PLAIN}": IN_ONE_VIEW,
+    f"acsard fleet {_PLAIN}": IN_ONE_VIEW,
+    f"acsard drive --id robot2 {_PLAIN}": DRIVE._replace(but="without the router"),
+    f"acsard call stop --id '*' {_PLAIN}": IN_ONE_VIEW,
     "python3 -m venv .venv && .venv/bin/pip install '.[lan]'": AUTHORITY,
     "acsard lan init --directory fleet": Run("^Wrote "),
     "acsard lan add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),

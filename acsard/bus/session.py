@@ -114,7 +114,8 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     except zenoh.ZError as error:
         raise InUseError(
             f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
-            "may have it: stop that, or give this one its own bus.listen",
+            "may have it: stop that, or give this one an address of its own, by --listen or in "
+            "bus.listen",
         ) from error
 
 

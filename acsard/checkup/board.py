@@ -14,7 +14,7 @@ from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
-from acsard.checkup.restarts import Restarts
+from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
@@ -76,7 +76,12 @@ class Board:
     def open(self, baud_rate: int) -> None:
         """Open the line at this rate; what was half received is forgotten."""
         self.wire.open(baud_rate)
-        self.baud_rate, self.heard, self.restarts = baud_rate, Heard(), Restarts()
+        self.baud_rate, self.heard = baud_rate, Heard()
+        self.forget()
+
+    def forget(self) -> None:
+        """What was heard says nothing of the board that is there now; how it speaks, it does."""
+        self.restarts, self._unanswered_s, self.paused = Restarts(), 0.0, False
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
 
@@ -149,6 +154,7 @@ class Board:
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
+        self.restarts.sent(ZERO, self.now_s)
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """Zeros once, and their answer waited for, a period at the least."""
@@ -197,7 +203,7 @@ class Board:
     # what comes back
 
     def listen(self, seconds: float) -> list[Reply]:
-        """What the MCU answers in the next so many seconds; a runaway in it ends the check."""
+        """What the MCU answers in the next so many seconds; a runaway or new start in it raises."""
         got = []
         for at_ns, data in self.wire.listen(self.wire.now_ns() + ceil(seconds * NS_PER_S)):
             self.heard.take(data)
@@ -205,8 +211,8 @@ class Board:
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
                 self.heard.line(line, reply is not None)
-                if sign := self.restarts.look(line, at_s, reply):
-                    raise StoppedError(self.restarts.finding(self.mcu, sign))
+                if restart := self.restarts.look(line, at_s, reply):
+                    raise RestartedError(restart)
                 if reply is not None:
                     got.append(reply)
         self.replies += got

@@ -32,7 +32,9 @@ TRIES = 5
 
 def baud(board: Board) -> Finding:
     """At which rate it answers; ends the check when at none."""
-    configured = board.baud_rate
+    configured = board.mcu.baud_rate
+    if board.baud_rate != configured:
+        board.open(configured)  # it started anew when another one was tried
     if _knock(board, BOOT_S):  # opening the port resets many boards
         return manual.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard

@@ -6,7 +6,6 @@ What it means is `wheels.py`'s.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 from msgspec import structs
 
@@ -94,14 +93,13 @@ def _patience_s(board: Board, told: list[int]) -> float:
     return limits.PATIENCE_S if rises else limits.MOTOR_S
 
 
-def channels(board: Board, operator: Operator) -> Iterator[Channel]:
-    """Each motor in turn."""
-    for motor in range(4):
-        operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
-        channel = _both_ways(board, motor)
-        if motor == 3 and channel.kind == "dead" and not board.latched:
-            channel = _with_other_comma(board, channel)
-        yield _seen(board, operator, channel)
+def channel(board: Board, operator: Operator, motor: int) -> Channel:
+    """Turn one, and ask what was seen."""
+    operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
+    found = _both_ways(board, motor)
+    if motor == 3 and found.kind == "dead" and not board.latched:
+        found = _with_other_comma(board, found)
+    return _seen(board, operator, found)
 
 
 def _both_ways(board: Board, motor: int) -> Channel:

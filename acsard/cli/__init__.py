@@ -87,8 +87,8 @@ bus address or robot id in use, 77 no permission, 78 bad configuration
 
 try:  acsard run                (the robot, on the built-in simulator)
       acsard drive              (in a second terminal: the keyboard drives it)
-      acsard echo odom -n 1     (in a third: where is it?)
-      acsard top                (all of it on one screen)
+      acsard top                (in a third: all of it on one screen)
+      acsard echo odom --short  (where is it?)
 """
 
 

@@ -74,21 +74,23 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     fleet.stop(robot.session, ids, robot.name)
     wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
 
-    def stop(one: str) -> ServiceReply | None:
+    def stop(one: str) -> ServiceReply | AcsardError:
         try:
             return robot.like(one).call("stop")
-        except AcsardError:  # or it has answered what nobody understands
-            return None
+        except AcsardError as error:  # or it has answered what nobody understands
+            return error
 
     with ThreadPoolExecutor(min(len(wanted), MOST_AT_ONCE)) as calls:
         replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
     for one, reply in replies.items():
-        if reply is None:
-            reply = ServiceReply(False, "NO ANSWER: go and look, or use its switch")
+        if isinstance(reply, AcsardError):
+            told = f"NO ANSWER: go and look, or use its switch ({reply})"
+            reply = ServiceReply(False, told)
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
     if ALL in ids:
         print(f"acsard: {seen(endpoint, len(replies))}", file=sys.stderr)
-    if None in replies.values():
+    if any(isinstance(reply, AcsardError) for reply in replies.values()):
         return int(Exit.UNREACHABLE)
-    return int(Exit.OK if all(r.success for r in replies.values() if r) else Exit.FAILURE)
+    stopped = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
+    return int(Exit.OK if all(stopped) else Exit.FAILURE)

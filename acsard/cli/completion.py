@@ -58,8 +58,19 @@ def main_completion(args: argparse.Namespace) -> int:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
             action.choices = known[verb, action.dest]  # only offered: these parse nothing
-    print(shtab.complete(whole, args.shell))
+    script = shtab.complete(whole, args.shell)
+    if args.shell == "zsh":
+        script = every_word(script)
+    print(script)
     return 0
+
+
+def every_word(script: str) -> str:
+    """The library's zsh script with what may be many offered for each of them.
+
+    It writes `(*)`, which completes the first word and excludes all others; `*` is every word.
+    """
+    return script.replace('  "(*)::', '  "*:').replace('  "(*):', '  "*:')
 
 
 def main_man(args: argparse.Namespace) -> int:

@@ -1,10 +1,10 @@
-"""`acsard echo <topic>`: what is on a key, as JSON lines."""
+"""`acsard echo <topic>`: what is on a key, as JSON lines or, with --short, as lines for people."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from acsard.cli.common import (
     MANY,
@@ -19,6 +19,7 @@ from acsard.messages import text
 
 if TYPE_CHECKING:
     from acsard.client import Client
+    from acsard.messages.encodings import Decoder
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,12 +30,19 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         description="Print each message on a key as one line of JSON, until Ctrl-C. Any key "
         "below the robot's id works, also `cmd/teleop`. With --csv wheels, gyro and place as one "
         "file that `acsard calibrate --log` reads: acsard echo wheel_states imu --csv > drive.csv. "
+        "With --short pose and speeds in words: acsard echo odom -n 1 --short. "
         "Of several robots (--id) each line says whose it is.",
     )
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
     )
-    parser.add_argument(
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument(
+        "--short",
+        action="store_true",
+        help="print a line for people: of odom, state, cmd_vel_out or sim/pose",
+    )
+    form.add_argument(
         "--csv",
         action="store_true",
         help="print rows of a log: of wheel_states, imu, sim/pose or several of them",
@@ -63,6 +71,7 @@ def main(args: argparse.Namespace) -> int:
         raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
     left, topic = args.n, args.topic[0]
     require_followed(topic)
+    decoder = _shortened(topic) if args.short else None
     warn_of_unknown(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         samples = robot.samples(topic, args.timeout)
@@ -73,15 +82,45 @@ def main(args: argparse.Namespace) -> int:
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
         try:
             for sample in samples:
-                line, whose = json_line(*encoded(sample)), robot_of(str(sample.key_expr))
-                shown = of_robot(whose, line) if many else text.json_line(line)
-                print(shown, flush=True)
+                whose = robot_of(str(sample.key_expr)) if many else ""
+                print(_shown(decoder, *encoded(sample), whose), flush=True)
                 left = None if left is None else left - 1
                 if left == 0:
                     return 0
         except KeyboardInterrupt:
             return 0
     return 1
+
+
+def _shortened(key: str) -> Decoder[Any]:
+    """The decoder of a key that has a short form."""
+    from acsard.messages.encodings import Decoder
+    from acsard.messages.schema import MESSAGES
+    from acsard.messages.short import SHORT
+    from acsard.messages.topics import TOPICS, by_key
+
+    kinds = {kind.__name__: kind for kind in SHORT}
+    topic = by_key(key)
+    if topic is None or topic.type not in kinds:
+        known = ", ".join(one.key for one in TOPICS if one.type in kinds)
+        raise ExitError(Exit.USAGE, f"{key} has no short form, only as JSON; these have: {known}")
+    return Decoder(MESSAGES[topic.type])
+
+
+def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
+    """A message as it is printed; what cannot be read is always JSON."""
+    from acsard.messages.encodings import DecodeError
+    from acsard.messages.short import short
+
+    if decoder is not None:
+        try:
+            told = short(decoder.decode(encoding, payload))
+        except DecodeError:
+            pass
+        else:
+            return text.printable(f"{whose}: {told}" if whose else told)
+    line = json_line(encoding, payload)
+    return of_robot(whose, line) if whose else text.json_line(line)
 
 
 def _record(robot: Client, keys: list[str], most: int | None, timeout: float | None) -> int:

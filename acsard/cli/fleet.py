@@ -14,6 +14,7 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
 if TYPE_CHECKING:
+    from acsard.client import Client
     from acsard.top.fleet import Fleet
 
 GATHER_S = 1.5
@@ -47,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         fleet = Fleet(robot, ids, endpoint)
         if args.once or dumb or not sys.stdout.isatty():
-            return _once(fleet)
+            return _once(fleet, robot.like(ids[0]) if tls and ids != (ALL,) else None)
         try:
             from acsard.top import terminal
         except ImportError:
@@ -58,8 +59,8 @@ def main(args: argparse.Namespace) -> int:
     return int(Exit.OK)
 
 
-def _once(fleet: Fleet) -> int:
-    """One table; exit 69 when nobody is there."""
+def _once(fleet: Fleet, asked: Client | None) -> int:
+    """One table; exit 69 when nobody is there: who is `asked` then, whether we may see any."""
     from acsard.top.roster import table
 
     end = time.monotonic() + GATHER_S
@@ -68,7 +69,8 @@ def _once(fleet: Fleet) -> int:
         time.sleep(0.1)
     rows = fleet.rows()
     if not any(row.here or row.state for row in rows):
-        raise ExitError(Exit.UNREACHABLE, fleet.hint())
+        unlisted = "" if asked is None else asked.whoami().unlisted
+        raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), unlisted))))
     width = shutil.get_terminal_size((160, 24)).columns
     print("\n".join(table(rows, width)))
     for told in filter(None, (fleet.seen, fleet.more)):

@@ -28,8 +28,9 @@ what the robot's safety rests on: baud rate, dialect and trailing comma, reply r
 the checked link, each motor and encoder alone, the watchdog, damaged lines. It opens the port
 itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one, then
 together, after you have typed that the wheels are lifted: told 3 rad/s at the most, but a wheel
-whose encoder is dead or reversed can reach full speed. The last lines out are zeros, whatever
-happens, then silence. Exit 0 when nothing fails, 1 when something does.
+whose encoder is dead or reversed can reach full speed. A board that starts anew meanwhile is told,
+and what was being looked at is looked at again. The last lines out are zeros, whatever happens,
+then silence. Exit 0 when nothing fails, 1 when something does.
 """
 
 

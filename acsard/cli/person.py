@@ -14,6 +14,8 @@ from acsard.host.exits import Exit, ExitError
 
 SIMULATOR = "sim"
 
+LEAVES = "q"
+
 
 class Progress:
     """What happens now: a line on the terminal, written over by what comes next; nothing into a
@@ -42,18 +44,18 @@ class Person(Progress):
     """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """One of the answers; the end of the input ends the check."""
+        """One of the answers; q, or the end of the input, ends the check."""
         self.clear()
-        choice = f" [{'/'.join(answers)}]" if len(answers) > 1 else ""
+        choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
         while True:
             print(f"\n{question}{choice} ", end="", file=sys.stderr, flush=True)
             line = sys.stdin.readline()
-            if not line:
-                raise KeyboardInterrupt
             word = line.strip().lower()
+            if not line or word == LEAVES:
+                raise KeyboardInterrupt
             if word in answers:
                 return word
-            print(f"   please type {' or '.join(answers)}", file=sys.stderr)
+            print(f"   please type {' or '.join(answers)}; {LEAVES} leaves", file=sys.stderr)
 
 
 class Nobody(Progress):

@@ -20,9 +20,9 @@ acsard {version}, robot {robot}
   bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
   config  {where}
   try, in a second terminal:
-    acsard drive{reach}              drive it by keyboard
-    acsard echo odom -n 1{reach}     where is it?
-    acsard call stop{reach}          stop it, and keep it stopped until `acsard call clear`
+    acsard drive{reach}                   drive it by keyboard
+    acsard echo odom -n 1 --short{reach}  where is it?
+    acsard call stop{reach}               stop it, and keep it stopped until `acsard call clear`
 """
 
 
@@ -42,6 +42,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--listen",
         metavar="ENDPOINT",
         help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
+    )
+    parser.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help="a router to join, in place of all of bus.connect, e.g. tcp/127.0.0.1:7447",
     )
     parser.add_argument(
         "--record",
@@ -66,6 +71,7 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("robot", "id", args.id),
         ("record", "directory", args.record),
         ("bus", "listen", [args.listen] if args.listen else None),
+        ("bus", "connect", [args.connect] if args.connect else None),
     ):
         if value is not None:
             given.setdefault(section, {})[key] = value

@@ -24,7 +24,7 @@ ROS_NEVER = (
 def chosen(choice: Choice) -> str:
     """Whose command is followed, or why nobody's is."""
     if choice.wait.what == "command":
-        return "no commands: no source has sent one within its timeout"
+        return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 

@@ -112,7 +112,7 @@ def _control_loop(snapshot: Snapshot) -> Row:
 def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
-    message = f"commanded by {outputs.source}" if outputs.source else "no commands"
+    message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
     age_s = snapshot.refused_age_s
     refused = age_s is not None and age_s < REFUSED_S
     if refused:

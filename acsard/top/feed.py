@@ -99,6 +99,7 @@ class Feed:
             self._undecodable,
             hint,
             silence(self._gaps) if self._past else SILENT_S,
+            self._past[-1][0] - self._past[0][0] if self._past else 0.0,
         )
 
     def _newest(self) -> RobotState | None:

@@ -32,6 +32,9 @@ SHORT_WORDS, LONG_WORDS = 21, 56
 
 MOST_REASONS, MOST_PORT = 16, 34
 
+LATE_S = 0.2
+"""By so much one state may come later than another, which stamps do not know."""
+
 LINKS = {"up": "green", "booting": "yellow"}
 
 FIGURES = {
@@ -133,7 +136,7 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
     if state.certificate:
         told = certificate(state)
         titles.append((max(head.cell_len + 2, width - told.cell_len - 4), told))
-    counted = rates(state, before)
+    counted = rates(seen, state, before)
     superseded = state.counters.get("lines_superseded", 0)
     lines = [
         rule(width, titles),
@@ -167,9 +170,12 @@ def certificate(state: RobotState) -> Text:
     return Text(f"certificate {clean(state.certificate)}", style)
 
 
-def rates(state: RobotState, before: RobotState) -> Callable[[str], str]:
+def rates(seen: Seen, state: RobotState, before: RobotState) -> Callable[[str], str]:
     """How often a counter counts, and what it has counted."""
+    # Stamps are exact; where the robot's clock was set, ours tells.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
+    if abs(seconds - seen.passed) > LATE_S:
+        seconds = seen.passed
 
     def counted(name: str) -> str:
         now, then = state.counters.get(name, 0), before.counters.get(name, 0)

@@ -25,3 +25,6 @@ class Seen(Struct, frozen=True):
     hint: str = ""
     silence: float = SILENT_S
     """The age from which on it is a silence, s."""
+    passed: float = 0.0
+    """From `before` to `state` by our own clock, s: about what their stamps say, unless the robot's
+    clock was set meanwhile."""

@@ -81,7 +81,7 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate:
         lines += flow([certificate(state)], width, 2)
-    counted = rates(state, before)
+    counted = rates(seen, state, before)
     told = [Text(f"{what} {counted(name)}") for what, name in LINES]
     superseded = state.counters.get("lines_superseded", 0)
     told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]

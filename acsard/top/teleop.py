@@ -5,7 +5,6 @@ It needs no library: a terminal gets them as a screen (`terminal.py`), all else 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from textwrap import wrap
 from typing import Literal
@@ -13,6 +12,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.messages.schema import RobotState
+from acsard.messages.short import place, speeds
 from acsard.messages.text import printable
 
 NARROWEST = 40
@@ -115,13 +115,7 @@ def asked(seen: Teleop) -> str:
 
 def measured(state: RobotState) -> list[str]:
     """Pose and twist, each with its unit."""
-    return [
-        f"x {_signed(state.x, 3, 8)} m",
-        f"y {_signed(state.y, 3, 8)} m",
-        f"yaw {_signed(math.degrees(state.yaw), 1, 6)}°",
-        f"forward {_signed(state.linear, 2, 5)} m/s",
-        f"turn {_signed(state.angular, 2, 5)} rad/s",
-    ]
+    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
 
 
 def flow(parts: Sequence[str], width: int) -> list[str]:
@@ -145,8 +139,3 @@ def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list
 def _wrapped(look: Look, text: str, width: int) -> list[tuple[Look, str]]:
     kept = wrap(text, width, subsequent_indent="  ", drop_whitespace=True, initial_indent="")
     return [(look, one) for one in kept]
-
-
-def _signed(value: float, decimals: int, width: int) -> str:
-    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
-    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)

@@ -110,7 +110,7 @@ def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
     world.run(1.0)
     assert [event.text for event in told(world, "mode")] == [
         "ready -> driving: commanded by app",
-        "driving -> ready: no commands: no source has sent one within its timeout",
+        "driving -> ready: waiting for a command: no source has sent one within its timeout",
     ]
     assert [event.text for event in told(world, "commander")] == ["nobody -> app (native/app)"]
 

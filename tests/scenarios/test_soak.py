@@ -321,7 +321,7 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
         world.put("wheel_cmd/app", b"\x80")
         world.send(1e300, -1e300, source="stranger")
         world.run(seconds)
-        return _word(world, "no commands")
+        return _word(world, "waiting for a command")
     if kind == "clock":
         world.wall_offset_ns += dice.choice((-1, 1)) * dice.randrange(DAY_NS)
         world.hold(linear, seconds=seconds)

@@ -38,6 +38,9 @@ from tests.system.harness import (
 )
 from tests.system.typed import typed
 
+WAITS = "waiting for a command"
+"""What a robot says that nobody drives."""
+
 VERBS = (
     "run",
     "sim",
@@ -179,7 +182,7 @@ def test_echo_state_says_the_mode_and_why(shared: Daemon, bus: Bus) -> None:
 
     code, state = until(linked, 5.0, "a state with the link up")
     assert (code, state["mode"]) == (0, "ready")
-    assert "no commands" in state["reason"]
+    assert WAITS in state["reason"]
 
 
 def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus) -> None:
@@ -597,7 +600,11 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
             stderr=subprocess.PIPE,
             start_new_session=True,
         ) as program:
-            until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state on the screen")
+            until(
+                lambda: WAITS in terminal.screen,
+                10.0,
+                "the robot's state on the screen",
+            )
             yield terminal, program
 
 
@@ -630,7 +637,7 @@ def without_a_screen(
 ) -> Iterator[tuple[Terminal, Program]]:
     """`acsard drive` at a terminal that can have no screen."""
     with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
-        until(lambda: "no commands" in terminal.screen, 10.0, "the robot's state")
+        until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
         yield terminal, program
 
 
@@ -644,7 +651,7 @@ def screens(terminal: Terminal) -> list[str]:
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """`acsard drive` at a terminal of that width that can have a screen."""
     with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
-        until(lambda: [one for one in screens(terminal) if "no commands" in one], 10.0, "it")
+        until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
 
 
@@ -654,7 +661,7 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
 ) -> None:
     with screened(shared, columns) as (terminal, _):
         frames = screens(terminal)
-    shown = next(frame for frame in frames if "no commands" in frame)
+    shown = next(frame for frame in frames if WAITS in frame)
     told = " ".join(shown.split())
     for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
         assert text in told

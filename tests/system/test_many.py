@@ -17,6 +17,7 @@ import pytest
 import zenoh
 
 from acsard.bus.fleet import ALL, stop
+from tests.pages import blocks
 from tests.system.fleet_router import ROBOT_FILE, certified, router
 from tests.system.harness import (
     Bus,
@@ -156,7 +157,8 @@ def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots
     assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY"]
     assert [row.split()[0] for row in rows] == [ONE, TWO]
     for row in rows:
-        assert re.search(r"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +no commands", row), row
+        waits = "waiting for a command"
+        assert re.search(rf"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +{waits}", row), row
 
 
 @pytest.mark.slow
@@ -182,7 +184,8 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
                 rows = screens(terminal)[-1:]
                 return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
 
-            until(lambda: line(ONE, "no commands") and line(TWO, "no commands"), 10.0, "both")
+            waits = "waiting for a command"
+            until(lambda: line(ONE, waits) and line(TWO, waits), 10.0, "both")
             with Daemon(robots.where, config=third, name="third") as daemon:
                 until(lambda: line("robot3", "ready"), 10.0, "the third, that came later")
                 daemon.signal(signal.SIGKILL)
@@ -224,6 +227,28 @@ def test_nothing_but_stop_goes_to_many(robots: Robots) -> None:
         ended = robots.tool("call", service)
         assert ended.code == 2
         assert "only stop" in ended.err
+
+
+@pytest.mark.slow
+def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> None:
+    (block,) = [one for one in blocks("json5") if "tcp/127.0.0.1:7447" in one.text]
+    endpoint = free_endpoint()
+    (tmp_path / "two.json5").write_text(block.text.replace("tcp/127.0.0.1:7447", endpoint))
+    with ExitStack() as stack:
+        stack.enter_context(Program(acsard("router", "two.json5"), tmp_path))
+        for name in (ONE, TWO):
+            join = ("--id", name, "--listen", free_endpoint(), "--connect", endpoint)
+            stack.enter_context(Program(acsard("run", *join), tmp_path))
+        view = Robots(tmp_path, endpoint, {})
+
+        def both() -> bool:
+            told = view.tool("fleet", "--once").out
+            return all(re.search(rf"^{name} +ready", told, re.M) for name in (ONE, TWO))
+
+        until(both, 60.0, "both in one view")
+        stopped = view.tool("call", "stop")
+        assert stopped.code == 0
+        assert {line.split(":")[0] for line in stopped.out.splitlines()} == {ONE, TWO}
 
 
 @pytest.mark.slow

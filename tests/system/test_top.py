@@ -60,7 +60,8 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
         told = shows(terminal, " READY ", 10.0)
         assert len(told) == SIZE[1]
         assert max(map(len, told)) <= SIZE[0]
-        for text in (daemon.endpoint, "no commands", "SIMULATOR", "teleop", "mcu_round_trip"):
+        shown = ("waiting for a command", "SIMULATOR", "teleop", "mcu_round_trip")
+        for text in (daemon.endpoint, *shown):
             assert any(text in line for line in told), text
 
         with Bus(daemon.endpoint) as bus, bus.commanding(0.5):

@@ -104,6 +104,28 @@ def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[s
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "words", [("call", "stop"), ("fleet", "--once")], ids=lambda words: words[0]
+)
+def test_who_names_many_robots_by_a_certificate_of_no_list_is_told_so(
+    robot: Robot, words: tuple[str, ...]
+) -> None:
+    ended = robot.tool("unlisted", *words, "--id", "acsar,other")
+    assert ended.code == 69
+    told = re.findall("your certificate unlisted is in no role's list", ended.out + ended.err)
+    assert len(told) == (2 if words[0] == "call" else 1)
+
+
+@pytest.mark.slow
+def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_out(
+    robot: Robot,
+) -> None:
+    ended = robot.tool("unlisted", "call", "stop", "--id", "*")
+    assert (ended.code, ended.out) == (69, "")
+    assert "in no role's list: `acsard whoami" in ended.err
+
+
+@pytest.mark.slow
 def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
     with (
         connect(robot.tls, tls=robot.own("unlisted")) as client,

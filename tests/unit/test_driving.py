@@ -220,7 +220,7 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
 
 
 def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    held_up = replace(FOLLOWED, mode="ready", reason="no commands", source="")
+    held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
 
     def says(t: float, last: float, sent: list[float]) -> RobotState:
         return held_up if 0.9 < t < 1.2 else followed(t, last, sent)

@@ -316,7 +316,7 @@ def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zer
         assert out.mode == "ready"
     assert out.applied == REST
     assert out.line == ZERO_LINE
-    assert out.reason.startswith("no commands")
+    assert out.reason.startswith("waiting for a command")
 
 
 def test_a_commander_that_returns_after_its_timeout_drives_on_from_the_speed_left() -> None:

@@ -555,7 +555,7 @@ class RobotMachine(RuleBasedStateMachine):
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
             assert mode == "fault"
         if mode == "ready" and outputs.due:
-            told = ("neutral first: ", "no commands: ")
+            told = ("neutral first: ", "waiting for a command: ")
             assert outputs.reason.startswith(told) or "may be late" in outputs.reason
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")

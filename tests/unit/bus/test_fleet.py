@@ -45,3 +45,8 @@ def test_a_key_is_of_one_robot_and_a_wildcard_of_none(key: str, robot: str) -> N
 def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
     assert "exact keys" in nobody("tls/router.local:7447")
     assert "exact keys" not in nobody("tcp/127.0.0.1:7448")
+
+
+def test_where_certificates_decide_who_is_in_no_list_is_told_how_to_find_out() -> None:
+    assert "in no role's list: `acsard whoami" in nobody("tls/router.local:7447")
+    assert "whoami" not in nobody("tcp/127.0.0.1:7448")

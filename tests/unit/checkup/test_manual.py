@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from acsard.checkup import manual
 from acsard.checkup.limits import WATCHDOG_MOST_S
 from acsard.checkup.manual import MANUAL, find
+from acsard.checkup.outcomes import OUTCOMES
 from acsard.checkup.procedure import STEPS
 from acsard.mcu.contract import WATCHDOG_S
 
@@ -37,7 +37,7 @@ class Seen(float):
 
 
 SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
-        for part in manual.OUTCOMES.split("{")[1:]}  # fmt: skip
+        for part in OUTCOMES.split("{")[1:]}  # fmt: skip
 
 
 def test_the_watchdog_it_advises_is_that_of_the_contract() -> None:

@@ -430,7 +430,7 @@ def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it(
     assert not any(robot.later())
 
 
-def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
+def test_an_mcu_that_restarts_once_while_a_motor_turns_is_checked_to_the_end() -> None:
     class Restarts(Robot):
         restarts = 0
 
@@ -443,6 +443,7 @@ def test_an_mcu_that_restarts_while_a_motor_turns_ends_it() -> None:
     checked = Checked(Restarts())
     assert checked.failed == ["restarts"]
     assert "supply" in checked["restarts"].mend
+    assert checked["damaged lines"].verdict == "PASS"
 
 
 def test_an_echo_is_not_taken_for_a_robot() -> None:

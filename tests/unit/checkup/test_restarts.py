@@ -1,57 +1,196 @@
-"""A board that starts anew in the middle of the check is a finding of its own, whatever it says."""
+"""A board that starts anew in the middle of the check is a finding of its own, whatever it says;
+what was being looked at is looked at again."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import pytest
 
 from acsard.checkup.motion import ZERO, Reply
-from acsard.checkup.restarts import AHEAD_S, ASKED_S, CLOCK, UNANSWERED, Restarts
+from acsard.checkup.procedure import AGAIN, MOST
+from acsard.checkup.restarts import (
+    AHEAD_S,
+    ASKED_S,
+    CLOCK,
+    UNANSWERED,
+    Restart,
+    Restarts,
+    finding,
+)
 from acsard.config.settings import Config
 from acsard.mcu.check import Reading
 from acsard.mcu.session import IDENTITY
-from tests.unit.checkup.robots import Checked, Robot
+from tests.unit.checkup.robots import MS, Checked, Robot, check
 
 NAME = IDENTITY + b"1 counts=3200"
 TEXT = b"Booting v2"
 
 
 class Restarting(Robot):
-    """Starts anew once, at this time."""
+    """Starts anew at these times."""
 
-    def __init__(self, at_s: float, *faults: str) -> None:
+    def __init__(self, at_s: Sequence[float], *faults: str) -> None:
         super().__init__(*faults)
-        self._due_ns: int | None = int(at_s * 1e9)
+        self._due_ns = [int(one * 1e9) for one in at_s]
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        if self._due_ns is not None and self.now_ns() >= self._due_ns:
-            self._due_ns = None
+        if self._due_ns and self.now_ns() >= self._due_ns[0]:
+            self._due_ns.pop(0)
             self.mcu.reset(self.now_ns())
         return super().listen(until_ns)
 
 
-@pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",)], ids=str)
-@pytest.mark.parametrize(
-    ("at_s", "when"),
-    [
-        (1.0, "everything stood"),
-        pytest.param(3.5, "everything stood", marks=pytest.mark.slow),
-        (6.0, "everything stood"),
-        (9.0, "motor "),
-        pytest.param(11.0, "motor ", marks=pytest.mark.slow),
-        pytest.param(15.0, "motor ", marks=pytest.mark.slow),
-        pytest.param(21.0, "", marks=pytest.mark.slow),
-    ],
-)
+MOMENTS = [
+    (1.0, "everything stood"),
+    pytest.param(3.5, "everything stood", marks=pytest.mark.slow),
+    (6.0, "everything stood"),
+    (9.0, "motor "),
+    pytest.param(11.0, "motor ", marks=pytest.mark.slow),
+    pytest.param(15.0, "motor ", marks=pytest.mark.slow),
+    pytest.param(21.0, "", marks=pytest.mark.slow),
+]
+DIALECTS = pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",)], ids=str)
+
+
+@DIALECTS
+@pytest.mark.parametrize(("at_s", "when"), MOMENTS)
 def test_a_board_that_starts_anew_fails_by_that_and_nothing_else_is_blamed(
     faults: tuple[str, ...], at_s: float, when: str
 ) -> None:
-    checked = Checked(Restarting(at_s, *faults))
+    checked = Checked(Restarting([at_s], *faults))
     assert checked.failed == ["restarts"]
+    assert checked["restarts"].figure == "started anew"
     assert f"while {when}" in checked["restarts"].text
     assert "supply" in checked["restarts"].mend
     assert "DTR" in checked["restarts"].mend
     assert not checked.changes.keys() - {"mcu.link_check", "mcu.encoder_counts"}
     assert not checked.left_turning
+
+
+@DIALECTS
+@pytest.mark.parametrize(("at_s", "when"), MOMENTS)
+def test_all_else_is_found_as_if_it_had_not_started_anew(
+    faults: tuple[str, ...], at_s: float, when: str
+) -> None:
+    checked, sound = Checked(Restarting([at_s], *faults)), check(*faults)
+    assert [(one.name, one.verdict) for one in checked.findings if one.name != "restarts"] == (
+        [(one.name, one.verdict) for one in sound.findings]
+    )
+    assert checked.changes == sound.changes
+
+
+@DIALECTS
+def test_new_starts_are_counted_and_told_with_what_was_going_on(faults: tuple[str, ...]) -> None:
+    checked = Checked(Restarting([1.0, 9.0, 20.0], *faults))
+    assert checked.failed == ["restarts"]
+    assert checked["restarts"].figure == "started anew, 3 times"
+    assert "everything stood" in checked["restarts"].text
+    assert "motor " in checked["restarts"].text
+    assert not checked.left_turning
+
+
+@pytest.mark.parametrize("every_s", [1.0, 4.0])
+def test_one_that_starts_anew_again_and_again_is_left_alone_soon(every_s: float) -> None:
+    robot = Restarting([2.0 + every_s * n for n in range(60)])
+    checked = Checked(robot)
+    assert checked.failed == ["restarts"]
+    assert checked.findings[-1].verdict == "SKIPPED"
+    assert "the check ended early: restarts" in checked.findings[-1].text
+    assert len(robot._due_ns) >= 60 - MOST - 5
+    assert not checked.left_turning
+
+
+class Weak(Robot):
+    """Its supply gives in whenever this wheel turns."""
+
+    def __init__(self, wheel: int) -> None:
+        super().__init__()
+        self.wheel, self.starts = wheel, 0
+
+    def send(self, data: bytes) -> None:
+        super().send(data)
+        if abs(self.mcu.vehicle.speeds[self.wheel]) > 2.0:
+            self.starts += 1
+            self.mcu.reset(self.now_ns())
+
+
+def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_for_long() -> None:
+    robot = Weak(1)
+    checked = Checked(robot)
+    assert checked.failed == ["restarts"]
+    assert checked["motor a"].verdict == "PASS"
+    assert robot.starts == 1 + AGAIN
+    found = checked["restarts"]
+    assert found.figure == "started anew, twice"
+    assert "while motor b (front left) turned, twice" in found.text
+    assert found.mend.startswith("a supply for the board alone")
+
+
+class Resetting(Robot):
+    """Its watchdog restarts the whole board when no line comes."""
+
+    silence_ns = 500 * MS
+    spoken_ns = 0
+
+    def send(self, data: bytes) -> None:
+        self.spoken_ns = self.now_ns()
+        super().send(data)
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        got, due_ns = [], self.spoken_ns + self.silence_ns
+        if self.now_ns() < due_ns <= until_ns:
+            got = super().listen(due_ns)
+            self.mcu.reset(self.now_ns(), 200 * MS)
+        return got + super().listen(until_ns)
+
+
+def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
+    checked = Checked(Resetting())
+    assert checked.failed == ["restarts"]
+    assert "let it stop the motors and go on" in checked["restarts"].mend
+    assert "sent nothing for" in checked["restarts"].text
+
+
+def test_a_board_that_does_not_come_back_is_said_not_to_have() -> None:
+    class Dies(Robot):
+        dead = False
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            if not self.dead and self.now_ns() >= 6_000 * MS:
+                self.dead, self.mcu.muted = True, True
+                self.mcu.reset(self.now_ns(), 100 * MS)
+            return super().listen(until_ns)
+
+    checked = Checked(Dies())
+    assert checked.failed == ["restarts"]
+    assert "did not answer again within 3 s" in checked["restarts"].text
+
+
+@pytest.mark.parametrize(
+    ("cause", "mend"),
+    [
+        ("brown-out", "a supply for the board alone"),
+        ("power", "a supply for the board alone"),
+        ("watchdog", "where does the firmware wait"),
+        ("pin", "a second program that opens the port"),
+        ("unknown", "a weak supply"),
+    ],
+)
+def test_what_the_board_says_that_it_booted_for_is_taken(cause: str, mend: str) -> None:
+    restarts = heard(reply(0.0, 0))
+    name = NAME + b" trips=0 reset=" + cause.encode()
+    seen = restarts.look(name, 9.0, None)
+    assert seen is not None
+    assert seen.cause == cause
+    found = finding(Config().mcu, [seen])
+    assert found.mend.startswith(mend)
+    assert f"(reset={cause})" in found.text
+
+
+def test_causes_that_differ_leave_it_open() -> None:
+    starts = [Restart("a sign", cause=one) for one in ("pin", "watchdog")]
+    assert finding(Config().mcu, starts).mend.startswith("a weak supply")
 
 
 def reply(at_s: float, mcu_ms: int) -> Reply:
@@ -62,31 +201,33 @@ def heard(*replies: Reply) -> Restarts:
     """It answered so."""
     restarts = Restarts()
     for one in replies:
-        assert restarts.look(b"", one.at_s, one) == ""
+        assert restarts.look(b"", one.at_s, one) is None
     return restarts
 
 
+def sign(seen: Restart | None) -> str:
+    return "" if seen is None else seen.sign
+
+
 def test_what_it_says_when_the_port_was_opened_is_no_restart() -> None:
-    assert Restarts().look(NAME, 2.0, None) == ""
+    assert Restarts().look(NAME, 2.0, None) is None
 
 
 def test_its_name_is_a_restart_unless_it_was_asked_for() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.asked(1.0)
-    assert restarts.look(NAME, 1.0 + ASKED_S, None) == ""
-    assert restarts.look(NAME, 1.1 + ASKED_S, None) == "it named itself, unasked"
-    why = restarts.look(NAME + b" trips=0 reset=brownout", 9.0, None)
-    assert why == "it named itself, unasked (reset=brownout)"
+    assert restarts.look(NAME, 1.0 + ASKED_S, None) is None
+    assert sign(restarts.look(NAME, 1.1 + ASKED_S, None)) == "it named itself, unasked"
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> None:
     restarts = heard(reply(0.0, 0))
     for _ in range(UNANSWERED - 1):
         restarts.sent(ZERO, 0.0)
-    assert restarts.look(TEXT, 0.1, None) == ""
+    assert restarts.look(TEXT, 0.1, None) is None
     restarts.sent(ZERO, 0.1)
-    assert restarts.look(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) == ""  # damaged, no text
-    assert "text" in restarts.look(TEXT, 0.2, None)
+    assert restarts.look(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None  # damaged, no text
+    assert "text" in sign(restarts.look(TEXT, 0.2, None))
 
 
 @pytest.mark.parametrize("start_ms", [0, 40_000, CLOCK - 5_000])
@@ -109,19 +250,23 @@ def test_a_clock_that_began_again_is_a_restart(before_ms: int) -> None:
     restarts = heard(reply(10.0, before_ms))
     again = reply(12.1, 100)
     gone_ms = (100 - before_ms) % CLOCK
-    assert ("began again" in restarts.look(b"", again.at_s, again)) == (gone_ms > 4100)
+    assert ("began again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
 
 
-def test_it_is_told_what_turned_when_it_was_heard_last() -> None:
+def test_it_is_told_what_turned_and_for_how_long_nothing_was_sent_when_it_was_heard_last() -> None:
     restarts = heard(reply(10.0, 0))
-    mcu = Config().mcu
-    assert "while everything stood" in restarts.finding(mcu, "a sign").text
+    seen = restarts.look(NAME, 20.0, None)
+    assert seen is not None
+    assert (seen.turned, seen.silent_s) == (ZERO, 0.0)
     restarts.sent((3.0, 0.0, 0.0, 0.0), 10.1)
     restarts.sent(ZERO, 11.0)
-    assert "while motor a (front right) turned" in restarts.finding(mcu, "a sign").text
+    seen = restarts.look(NAME, 11.5, None)
+    assert seen is not None
+    assert seen.turned == (3.0, 0.0, 0.0, 0.0)
+    assert seen.silent_s == pytest.approx(0.9)
 
 
 def test_nobody_asks_once_the_check_has_ended() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.watched = False
-    assert restarts.look(NAME, 9.0, None) == ""
+    assert restarts.look(NAME, 9.0, None) is None

@@ -63,7 +63,7 @@ def test_every_motor_is_announced_before_it_turns() -> None:
             said.append(text)
 
     with Robot("plain_only").board() as board:
-        found = list(turning.channels(board, Listener()))
+        found = [turning.channel(board, Listener(), motor) for motor in range(4)]
         comma = dialect.comma(board, found[-1].kind == "dead")
     assert [text.split()[1] for text in said] == list("abcd")
     assert [channel.kind for channel in found] == ["right"] * 4

@@ -7,9 +7,11 @@ import math
 import msgspec
 import pytest
 
-from acsard.cli.echo import json_line
-from acsard.messages.encodings import Format, encode, encoding_name
-from acsard.messages.schema import Twist, Vector3
+from acsard.cli import main
+from acsard.cli.echo import _shown, json_line
+from acsard.host.exits import Exit
+from acsard.messages.encodings import Decoder, Format, encode, encoding_name
+from acsard.messages.schema import Header, Twist, TwistStamped, Vector3
 from tests.unit.messages.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
@@ -85,3 +87,27 @@ def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, paylo
 )
 def test_echo_survives_any_payload(payload: bytes) -> None:
     assert json_line("", payload).isprintable()
+
+
+def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["echo", "tf", "--short"]) == Exit.USAGE
+    told = capsys.readouterr().err
+    assert "tf has no short form" in told
+    assert all(key in told for key in ("odom", "state", "cmd_vel_out", "sim/pose"))
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+@pytest.mark.parametrize("whose", ["", "robot1"])
+def test_a_short_line_says_whose_it_is_of_many(form: Format, whose: str) -> None:
+    twist = TwistStamped(Header(), Twist(Vector3(0.5), Vector3(z=0.2)))
+    payload = encode(twist, form)
+    line = _shown(Decoder(TwistStamped), encoding_name(form, "TwistStamped"), payload, whose)
+    assert line == f"{whose}{': ' if whose else ''}forward +0.50 m/s  turn +0.20 rad/s"
+
+
+def test_what_cannot_be_shortened_is_shown_as_the_json_it_is() -> None:
+    decoder = Decoder(TwistStamped)
+    assert _shown(decoder, "", b'{"a": 1}', "") == '{"a":1}'
+    assert msgspec.json.decode(_shown(decoder, "", b"\xff", "")) == {"undecodable": repr(b"\xff")}

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
+from acsard.checkup import procedure
 from acsard.cli import mcu
 from acsard.cli.exits import code_of
 from acsard.cli.person import Person, ended_by_signals
@@ -27,6 +28,7 @@ from acsard.host.errors import NoPortError
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
+from tests.unit.checkup.robots import Robot
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
@@ -185,8 +187,8 @@ def test_a_person_is_asked_until_the_answer_is_one(
     assert Person().ask("which?", ("fr", "rl")) == "rl"
     out, err = capsys.readouterr()
     assert out == ""
-    assert "which? [fr/rl]" in err
-    assert "please type fr or rl" in err
+    assert "which? [fr/rl/q]" in err
+    assert "please type fr or rl; q leaves" in err
 
 
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
@@ -231,10 +233,24 @@ def test_progress_does_not_go_into_a_pipe(
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
-def test_the_end_of_the_input_ends_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+@pytest.mark.parametrize("typed", ["", "q\n", "what?\nQ\n"])
+def test_q_and_the_end_of_the_input_end_the_check(
+    typed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
     with pytest.raises(KeyboardInterrupt):
         Person().ask("lifted?", ("lifted",))
+
+
+def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("q\n"))
+    robot = Robot()
+    with pytest.raises(KeyboardInterrupt):
+        procedure.run(robot, Person(), robot.config, lambda finding: None)
+    assert "q or Ctrl-C leaves" in capsys.readouterr().err
+    assert not any(robot.later())
 
 
 @pytest.mark.parametrize(

@@ -23,16 +23,22 @@ def test_without_options_nothing_is_overridden() -> None:
 
 def test_the_options_are_the_keys_of_the_configuration() -> None:
     given = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7",
-                     "--listen", "tcp/127.0.0.1:1")  # fmt: skip
+                     "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/[::1]:2")  # fmt: skip
     config = parse(b"", given)
     assert (config.mcu.port, config.mcu.baud_rate) == ("/dev/x", 57600)
     assert config.robot.id == "r7"
     assert config.bus.listen == ("tcp/127.0.0.1:1",)
+    assert config.bus.connect == ("tcp/[::1]:2",)
 
 
 @pytest.mark.parametrize(
     ("words", "table"),
-    [(["--port", "x"], "mcu"), (["--id", "x"], "robot"), (["--listen", "tcp/[::1]:1"], "bus")],
+    [
+        (["--port", "x"], "mcu"),
+        (["--id", "x"], "robot"),
+        (["--listen", "tcp/[::1]:1"], "bus"),
+        (["--connect", "tcp/[::1]:1"], "bus"),
+    ],
 )
 def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> None:
     given = given_by(*words)

@@ -20,8 +20,8 @@ def test_the_mode_it_starts_in_is_no_event() -> None:
 
 def test_another_mode_is_told_once_with_why() -> None:
     told = Told(Mode.WAITING)
-    assert told.changes(Mode.READY, NOBODY, "no commands") == [
-        Event("mode", "no commands", kind="waiting -> ready")
+    assert told.changes(Mode.READY, NOBODY, "waiting for a command") == [
+        Event("mode", "waiting for a command", kind="waiting -> ready")
     ]
     assert told.changes(Mode.READY, NOBODY, "another reason") == []
 
@@ -44,7 +44,7 @@ def test_another_commander_is_told_with_the_one_before() -> None:
 def test_who_drives_on_after_a_rest_is_no_other_commander() -> None:
     told = Told(Mode.READY)
     told.changes(Mode.DRIVING, by("app", "joe"), "")
-    told.changes(Mode.READY, NOBODY, "no commands")
+    told.changes(Mode.READY, NOBODY, "waiting for a command")
     (event,) = told.changes(Mode.DRIVING, by("app", "joe"), "")
     assert event.name == "mode"
 

@@ -58,7 +58,7 @@ def test_every_wait_has_its_sentence_above() -> None:
 @pytest.mark.parametrize(
     ("choice", "text"),
     [
-        (Choice(), "no commands: no source has sent one within its timeout"),
+        (Choice(), "waiting for a command: no source has sent one within its timeout"),
         (
             Choice(wait=Wait("proof", "app", 2.0)),
             "app may be late: its delays must be steady for 2 s if its clock is new here, for "

@@ -154,7 +154,7 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
         "commands": "7",
         "command_stale": "3",
     }
-    assert row("commands", outputs=replace(OUTPUTS, source="")).message == "no commands"
+    assert row("commands", outputs=replace(OUTPUTS, source="")).message == "waiting for a command"
 
 
 def test_commands_are_a_warning_while_a_source_is_refused_and_say_why() -> None:

@@ -42,7 +42,7 @@ BEFORE = replace(
     counters={"lines": 1200, "lines_sent": 1201, "commands": 200, "missed_periods": 3},
 )
 INFO = Info("acsar", "0.1.0", 7, "/dev/acsar", False, 100.0, [], [])
-SEEN = Seen("acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves")
+SEEN = Seen("acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves", passed=1.05)
 
 
 def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:

@@ -90,6 +90,16 @@ def test_asked_twice_it_has_two_to_take_rates_from(robot: Robot) -> None:
     assert (feed.seen().before, feed.seen().state) == (BEFORE, STATE)
 
 
+def test_what_passed_between_two_states_is_told_by_our_own_clock(robot: Robot) -> None:
+    feed = feed_of(robot)
+    assert feed.seen().passed == 0.0
+    feed.ask()
+    robot.now += 0.8
+    robot.state = at(9000)
+    feed.ask()
+    assert feed.seen().passed == pytest.approx(0.8)
+
+
 @pytest.mark.parametrize("sec", [999, 1001])
 def test_of_the_answer_and_what_came_meanwhile_the_later_counts(robot: Robot, sec: int) -> None:
     feed = feed_of(robot)

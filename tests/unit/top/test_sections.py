@@ -7,7 +7,7 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from acsard.messages.schema import Figure, SourceState
+from acsard.messages.schema import Figure, SourceState, Time
 from acsard.runtime.figures import NAMES
 from acsard.top.sections import FIGURES
 from tests.unit.top.screens import (
@@ -71,8 +71,17 @@ def test_rates_are_taken_between_two_states() -> None:
     assert "in 100.0/s of 1,300" in line_with("superseded")
     assert "out 100.0/s of 1,301" in line_with("superseded")
     assert "20.0/s of 220" in line_with("commands  ")
-    assert "-/s of 1,300" in line_with("superseded", replace(SEEN, before=None))
+    assert "-/s of 1,300" in line_with("superseded", replace(SEEN, before=None, passed=0.0))
     assert "-/s of 1,200" in line_with("superseded", replace(SEEN, state=BEFORE, before=STATE))
+
+
+@pytest.mark.parametrize("set_by", [3600, -3600, 1, -1])
+@pytest.mark.parametrize("width", [80, 60])
+def test_a_robot_s_clock_that_is_set_changes_no_rate(set_by: int, width: int) -> None:
+    stepped = replace(STATE, stamp=Time(1000 + set_by, 0))
+    told = "\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width))
+    assert "100.0/s of 1,300" in told
+    assert "20.0/s of 220" in told
 
 
 def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:

@@ -1,0 +1,65 @@
+"""Where the robot is and how it moves, as a person reads it; pure.
+
+Covariances, stamps and frames are for programs: those have the JSON.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from acsard.messages.schema import Odometry, Pose, PoseStamped, RobotState, Twist, TwistStamped
+from acsard.messages.text import printable
+
+
+def place(x: float, y: float, yaw: float) -> list[str]:
+    """A pose, each figure with its unit: m, m, rad."""
+    return [
+        f"x {_signed(x, 3, 8)} m",
+        f"y {_signed(y, 3, 8)} m",
+        f"yaw {_signed(math.degrees(yaw), 1, 6)}°",
+    ]
+
+
+def speeds(linear: float, angular: float) -> list[str]:
+    """A twist, each figure with its unit: m/s, rad/s."""
+    return [f"forward {_signed(linear, 2, 5)} m/s", f"turn {_signed(angular, 2, 5)} rad/s"]
+
+
+def short(message: object) -> str:
+    """The message in a line; only of a type in `SHORT`."""
+    return "  ".join(SHORT[type(message)](message))
+
+
+def _odometry(odom: Odometry) -> list[str]:
+    return [*_pose(odom.pose.pose), *_twist(odom.twist.twist)]
+
+
+def _state(state: RobotState) -> list[str]:
+    why = state.reason.removeprefix(f"{state.mode}: ")
+    told = printable(f"{state.mode}: {why}")
+    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), told]
+
+
+def _pose(pose: Pose) -> list[str]:
+    yaw = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
+    return place(pose.position.x, pose.position.y, math.remainder(yaw, math.tau))
+
+
+def _twist(twist: Twist) -> list[str]:
+    return speeds(twist.linear.x, twist.angular.z)
+
+
+def _signed(value: float, decimals: int, width: int) -> str:
+    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
+    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
+
+
+SHORT: dict[type, Callable[[Any], list[str]]] = {
+    Odometry: _odometry,
+    RobotState: _state,
+    PoseStamped: lambda message: _pose(message.pose),
+    TwistStamped: lambda message: _twist(message.twist),
+}
+"""What has a short form, and how it is made."""

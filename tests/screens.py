@@ -1,0 +1,42 @@
+"""What `acsard drive`, `top`, `fleet` and `echo --short` show at 40, 80 and 160 columns, as text.
+
+python -m tests.screens
+"""
+
+from __future__ import annotations
+
+import sys
+
+from msgspec.structs import replace
+
+from acsard.drive.arbiter import Choice
+from acsard.drive.words import chosen
+from acsard.messages.short import short
+from acsard.top.roster import table
+from acsard.top.teleop import lines
+from tests.unit.top import test_roster, test_teleop
+from tests.unit.top.screens import BEFORE, SEEN, STATE, lines_of
+
+WIDTHS = (40, 80, 160)
+
+WAITING = replace(
+    STATE, mode="ready", reason=f"ready: {chosen(Choice())}", linear=0.0, angular=0.0, source=""
+)
+"""The same robot when nobody drives it."""
+
+
+def screens(width: int) -> dict[str, list[str]]:
+    """By verb."""
+    robots = [test_roster.ROW, replace(test_roster.ROW, robot_id="robot2", state=WAITING)]
+    return {
+        "drive": [text for _, text in lines(replace(test_teleop.SEEN, state=WAITING), width)],
+        "top": lines_of(replace(SEEN, state=WAITING, before=BEFORE), width),
+        "fleet": table(robots, width),
+        "echo state --short": [short(STATE), short(WAITING)],
+    }
+
+
+if __name__ == "__main__":
+    for width in WIDTHS:
+        for verb, shown in screens(width).items():
+            sys.stdout.write("\n".join([f"--- acsard {verb}, {width} columns", *shown, ""]))

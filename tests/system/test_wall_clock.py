@@ -1,0 +1,86 @@
+"""A wall clock that is set while a tool runs, here or at the robot, changes nothing it shows."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator, Sequence
+
+import pytest
+
+from tests.system.harness import Daemon, Finished, acsard, finish, until
+
+pytestmark = pytest.mark.slow
+
+SET_AGAIN = """\
+import sys, time
+
+true_ns, began = time.time_ns, time.monotonic()
+
+def told_ns():
+    times = int(5 * (time.monotonic() - began))
+    return true_ns() + times * (-1) ** times * 3600 * 10**9
+
+time.time_ns, time.time = told_ns, lambda: told_ns() / 1e9
+from acsard.cli import main
+sys.argv = sys.argv[3:]
+sys.exit(main())
+"""
+
+SET = (sys.executable, "-c", SET_AGAIN)
+"""Before the words of `acsard`: on a machine whose clock is set five times a second, by hours."""
+
+
+class Place:
+    """A robot, and a tool beside it; the clock of one of them is set again and again."""
+
+    def __init__(self, daemon: Daemon, before: Sequence[str]) -> None:
+        self._daemon, self._before = daemon, before
+
+    def tool(self, *words: str) -> Finished:
+        typed = acsard(*words, "--connect", self._daemon.endpoint)
+        return finish([*self._before, *typed], self._daemon.config.parent)
+
+
+@pytest.fixture(scope="module", params=["tool", "robot"])
+def place(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Place]:
+    here = {"tool": ((), SET), "robot": (SET, ())}
+    robot, tool = here[request.param]
+    with Daemon(tmp_path_factory.mktemp("clock"), before=robot) as daemon:
+        yield Place(daemon, tool)
+
+
+def test_top_says_how_long_ago_it_heard_of_it_and_how_often_lines_come(place: Place) -> None:
+    def rates() -> list[float]:
+        told = place.tool("top", "--once").out
+        assert re.search(r"heard \d+\.\d s ago", told), told
+        return [float(one) for one in re.findall(r"(\d+\.\d)/s of", told)]
+
+    found = until(rates, 20.0, "how often lines come")
+    assert 1 < max(found) < 1000
+
+
+def test_fleet_says_how_long_ago_it_heard_of_it(place: Place) -> None:
+    told = place.tool("fleet", "--once").out
+    heard = re.search(r"^acsar .* (\d+\.\d) s ", told, re.M)
+    assert heard, told
+    assert "SILENT" not in told
+
+
+def test_hz_says_how_often_it_comes(place: Place) -> None:
+    (line,) = place.tool("hz", "odom", "-n", "1", "--json").out.splitlines()
+    figures = json.loads(line)
+    assert figures["hz"] > 1
+    assert 0 <= figures["gap_min_ms"] <= figures["gap_max_ms"] < 60_000
+
+
+def test_echo_ends_after_so_long_a_silence_and_not_before(place: Place) -> None:
+    ended = place.tool("echo", "state", "-n", "12", "--timeout", "5")
+    assert ended.code == 0
+    assert len(ended.out.splitlines()) == 12
+    ended = place.tool("echo", "imu", "--timeout", "0.5")
+    assert (ended.code, ended.out) == (1, "")
+    assert 0.5 < ended.seconds < 60
