@@ -142,7 +142,8 @@ class Robot:
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
-        self._hear(inputs, events)
+        if inputs.commands or inputs.refusals:
+            self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         self._life.fire(Trigger.NO_COMMAND if self._choice.twist is None else Trigger.COMMAND)
         news = self._news()
@@ -224,6 +225,8 @@ class Robot:
         now_ns = inputs.now.mono_ns
         if self._gyro is not None:
             self._gyro.hear(inputs.gyro)
+        if not feedback:
+            return ()
         return tuple(
             [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
         )
@@ -263,6 +266,8 @@ class Robot:
             self._fault(trip, inputs.now.mono_ns, events)
         if inputs.leaving and self._life.mode is not Mode.LEAVING:
             self._life.fire(Trigger.LEAVE)
+        if not inputs.requests:
+            return ()
         return tuple([self._answer(r, inputs.now.mono_ns, events) for r in inputs.requests])
 
     def _answer(self, request: Request, now_ns: int, events: list[Event]) -> Answer:

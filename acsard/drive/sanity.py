@@ -84,12 +84,12 @@ class _Wheel:
         if slowing or not fast:
             self.slowest = abs(speed)
         moving = size > SLACK and expected * told > 0
-        apart = abs(speed - expected) > SLACK + 0.3 * most
+        constant = constant and self.driven and speed != 0.0
         return (
             moving and abs(speed) < 0.1 * size,
             moving and speed * expected < 0 and abs(speed) > 0.3 * size,
             fast and not slowing,
-            self.driven and constant and speed != 0.0 and apart,
+            constant and abs(speed - expected) > SLACK + 0.3 * most,
         )
 
 

@@ -105,7 +105,8 @@ class Link:
     def judge(self, now_ns: int, may_rise: bool) -> None:
         """Bring it up to date; `may_rise` unless there is a reason against trust just now."""
         silent = self.silent(now_ns)
-        if silent and self.state == "up":
-            self.sign("silent")
+        if self.state == "up":
+            if silent:
+                self.sign("silent")
         elif self._good_in_row >= GOOD_LINES and may_rise and not silent:
             self.sign("trusted")

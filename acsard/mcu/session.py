@@ -99,7 +99,7 @@ class McuSession:
         if port_open:
             for piece in received:
                 feedback += self._read(piece)
-            more = self._lines.too_long - self.rejects["too_long"]
+            more = self._lines.too_long - self.rejects.get("too_long", 0)
             if more > 0:
                 self._reject("too_long", more)
                 self._bad()
@@ -217,6 +217,8 @@ class McuSession:
         """An event for the link and one for the check, when they have changed."""
         link, check = self.link, self.negotiation
         before, self._announced = self._announced, (link, check.in_force, bool(check.trouble))
+        if self._announced == before:
+            return
         if link != before[0]:
             text = self.words() if self._damaged else self.lateness.words(link)
             good = link in ("up", "booting")
@@ -292,7 +294,7 @@ class McuSession:
             self.restarted = True
         silent = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
-        more = self._timeline.leaps - self.rejects["count_leap"]
+        more = self._timeline.leaps - self.rejects.get("count_leap", 0)
         if more > 0:
             self._reject("count_leap", more)
         if self._timeline.restarted:

@@ -195,7 +195,7 @@ async def _control(
             control.leaving = departure.begun_ns is not None
             period = ticker.take(now.mono_ns)
             manager.step(control.step(now, period))
-            if departure.over(now.mono_ns, control.at_rest):
+            if control.leaving and departure.over(now.mono_ns, control.at_rest):
                 return None
             return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
 
