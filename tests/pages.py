@@ -205,6 +205,9 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.screens": Shown("prints what tests/unit/top and others assert"),
+    ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
+        "installs into venvs of other Pythons, for who has them"
+    ),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",

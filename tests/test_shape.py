@@ -40,6 +40,7 @@ PURE_AMONG_SHELLS = (
     "record.bag",
     "record.batch",
     "record.columns",
+    "record.earlier",
     "record.layout",
     "record.merge",
     "record.published",

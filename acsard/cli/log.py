@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli import log_export, log_report
 from acsard.cli.common import load
+from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -151,7 +152,8 @@ def replay_one(args: argparse.Namespace) -> int:
 
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
-    tally, trouble = live(recording, other)
+    with telling(recording) as tell:
+        tally, trouble = live(recording, other, tell)
     print(verdict(tally))
     if tally.first is not None:
         print("\n".join([*differs(tally.first, recording.about.mono_ns), *otherwise(tally)]))

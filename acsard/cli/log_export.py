@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import load
+from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.record.export import Kind, Progress
+    from acsard.record.export import Kind
     from acsard.record.file import Recording
 
 DESCRIPTION = """\
@@ -59,16 +59,13 @@ def export_one(
     )
     other = None if args.config is None else load(args.config)[1]
     try:
-        done = export(
-            recording, new, kind, other, Span(begin, end), _progress(recording), args.force
-        )
+        with telling(recording) as tell:
+            done = export(recording, new, kind, other, Span(begin, end), tell, args.force)
     except OSError as error:
         denied = isinstance(error, PermissionError)
         raise ExitError(
             Exit.NO_PERMISSION if denied else Exit.FAILURE, f"cannot write {new}: {error.strerror}"
         ) from None
-    finally:
-        _clear()
     print(f"{done.count} {'rows' if kind == 'csv' else 'messages'} in {new}")
     return done.trouble
 
@@ -78,23 +75,3 @@ def _name(path: Path, kind: Kind) -> Path:
     from acsard.record.export import SUFFIX
 
     return Path(path.name.partition(".")[0] + SUFFIX[kind])
-
-
-def _progress(recording: Recording) -> Progress:
-    """Tells on a terminal how far it has come."""
-    from acsard.record.file import closing
-
-    began_ns, last = recording.about.wall_ns, closing(recording.path)
-    whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
-
-    def tell(wall_ns: int) -> None:
-        if sys.stderr.isatty():
-            text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s"
-            print(text, end="", file=sys.stderr, flush=True)
-
-    return tell
-
-
-def _clear() -> None:
-    if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -9,11 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
 if TYPE_CHECKING:
+    from acsard.record.again import Onlooker
     from acsard.record.file import Recording
+    from acsard.report.course import Course
 
 DESCRIPTION = """\
 Draw what happened as one HTML file that needs no network. Needs the library plotly; without it, it
@@ -69,12 +72,8 @@ def report_one(
     about, looked = recording.about, Onlooker(recording)
     course = Course(looked.config, words.seconds(args.begin), words.seconds(args.end))
     try:
-        with beside(new, args.force) as part:
-            for step, outputs, robot in looked.steps():
-                course.step(step, outputs, robot)
-                if course.over:
-                    deque(recording.messages(), maxlen=0)  # only what is missing of it
-                    break
+        with beside(new, args.force) as part, telling(recording) as tell:
+            _follow(recording, looked, course, tell)
             if course.began is None:
                 message = f"{recording.path} has no step of that time to draw"
                 raise ExitError(Exit.FAILURE, message)
@@ -96,3 +95,18 @@ def report_one(
         ) from None
     print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
     return notes(course, origin)
+
+
+def _follow(
+    recording: Recording, looked: Onlooker, course: Course, tell: Callable[[int], None]
+) -> None:
+    """All steps that count, into `course`."""
+    from acsard.record.again import EVERY
+
+    for number, (step, outputs, robot) in enumerate(looked.steps()):
+        if number % EVERY == 0:
+            tell(step.inputs.now.wall_ns)
+        course.step(step, outputs, robot)
+        if course.over:
+            deque(recording.messages(), maxlen=0)  # only what is missing of it
+            return

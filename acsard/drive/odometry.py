@@ -219,7 +219,7 @@ class Odometry:
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             if step.on_trial:
-                on_trial += sum([angle for _, angle in arcs]) - step.turn
+                on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
         if gyro is not None and on_trial:
             self._path.turn(-gyro.taken_back(on_trial))
@@ -232,7 +232,7 @@ class Odometry:
         rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces]
         moved = [self._kinematics.twist(one) for one in rolled]
         if gyro is not None:
-            return [(sum([one.linear for one in moved]), gyro.angle)]
+            return [(math.fsum([one.linear for one in moved]), gyro.angle)]
         return [(one.linear, one.angular) for one in moved]
 
     def _move(

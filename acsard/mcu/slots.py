@@ -244,9 +244,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
-    spread = sum((slot - middle) ** 2 for slot in slots)
+    spread = math.fsum((slot - middle) ** 2 for slot in slots)
     rows = zip(slots, times, strict=True)
-    return sum((slot - middle) * (time - centre) for slot, time in rows) / spread
+    return math.fsum((slot - middle) * (time - centre) for slot, time in rows) / spread
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:

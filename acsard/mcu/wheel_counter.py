@@ -87,7 +87,7 @@ class WheelCounter:
     def owed(self, period: float) -> float:
         """rad that rounding has cost while the counts were unknown; asked for once."""
         told, self._told = self._told or {}, None
-        return sum(
+        return math.fsum(
             times * (round(speed / self.quantum) * self.angle - speed * period)
             for speed, times in told.items()
             if on(speed, self.quantum)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -19,6 +19,16 @@ from acsard.robot import Robot
 from acsard.values import Outputs
 
 HUNDREDTHS = 100.0
+
+Progress = Callable[[int], None]
+"""Called now and then with the wall-clock time that it has come to, ns."""
+
+EVERY = 1024
+"""Steps from one call of it to the next."""
+
+
+def quietly(wall_ns: int) -> None:
+    """Progress that nobody looks at."""
 
 
 class Lived(NamedTuple):
@@ -45,7 +55,7 @@ def steps(recording: Recording) -> Iterator[Step]:
     for topic, _, data in recording.messages():
         if topic == "steps":
             try:
-                batch = decode(data, reason)
+                batch = decode(data, reason, recording.about.format)
             except BatchError:
                 recording.damaged += 1
                 continue
@@ -95,12 +105,14 @@ class Course:
             raise RecordingError(f"{path} has no whole second of steps")
 
 
-def live(recording: Recording, other: Config | None = None) -> Lived:
+def live(recording: Recording, other: Config | None = None, progress: Progress = quietly) -> Lived:
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
     course = Course(recording, other)
     replay = Replay(course.config, course.robot, course.last)
     with course.living():
-        for step in course.steps():
+        for number, step in enumerate(course.steps()):
+            if number % EVERY == 0:
+                progress(step.inputs.now.wall_ns)
             replay.step(step)
     return Lived(replay.tally, course.trouble)
 

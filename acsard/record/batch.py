@@ -6,25 +6,30 @@ The shape of the bytes is `layout.py`'s. All that is in a `Step` comes back exac
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
 
 import msgspec
 
+from acsard.record import earlier
 from acsard.record.columns import pack, unpack
 from acsard.record.layout import (
     AT_ONCE,
+    FORMAT,
     LEAVING,
     LEFT,
     LINE,
     NOTHING,
     OPEN,
+    SAME,
     SUPERSEDED,
     TICK,
     Batch,
+    Lane,
     Rare,
     Shape,
+    Spread,
+    Standing,
 )
-from acsard.record.steps import Micropose, Said, Status, Step, Taken, checksum, micropose, status_of
+from acsard.record.steps import Said, Status, Step, Taken, checksum, micropose, status_of
 from acsard.values import (
     AcsardError,
     Inputs,
@@ -32,54 +37,55 @@ from acsard.values import (
     Received,
 )
 
-SAME = "\x00"
-"""In place of a reason: as before."""
-
 
 class BatchError(AcsardError):
     """These bytes are no batch of steps."""
 
 
 _decoder = msgspec.msgpack.Decoder(Batch)
+_decoder_of_1 = msgspec.msgpack.Decoder(earlier.Batch1)
 
 
 # encode
 
 
 def encode(first: int, taken: Sequence[Taken], reason: str | None = None) -> bytes:
-    """The bytes of these steps, the first of them number `first`; at least one.
+    """The bytes of these steps, the first of them number `first`; 1 to 256 of them.
 
     `reason` is the last one of the batch before, where there is one in the same file: long words
     that stay the same for hours.
     """
-    start = _first_instant(taken[0].inputs)
-    offset_ns = start.wall_ns - start.mono_ns
+    inputs, outputs, _ = taken[0]
+    start = _first_instant(inputs)
     estimates = [e for t in taken for e in t.outputs.estimates]
     poses = [micropose(e) for e in estimates]
     reads = [(t.inputs.now, read) for t in taken for read in t.inputs.received]
     shapes: dict[Shape, int] = {}
-    kinds = [shapes.setdefault(_shape(t), len(shapes)) for t in taken]
-    ticks, others = _instants(taken, start.mono_ns)
+    ticks, others = (
+        _lane([t for t in taken if t.inputs.tick == tick], start, shapes) for tick in (True, False)
+    )
+    status = status_of(outputs)
+    standing = Standing(inputs.opened, inputs.port_trouble, _brief(status, reason))
     return msgspec.msgpack.encode(
         Batch(
             first=first,
             mono_ns=start.mono_ns,
-            offset_ns=offset_ns,
+            offset_ns=start.wall_ns - start.mono_ns,
+            standing=standing,
             shapes=tuple(shapes),
-            count=len(taken),
-            kinds=pack(kinds),
-            ticks=pack(ticks),
-            others=pack(others),
-            offsets=pack(_offsets(taken, offset_ns)),
+            ticks=ticks,
+            others=others,
+            order=_order(taken),
+            offsets=pack(_offsets(taken, start.wall_ns - start.mono_ns)),
             ages=pack([now.mono_ns - read.at.mono_ns for now, read in reads]),
             lengths=pack([len(read.data) for _, read in reads]),
             received=b"".join([read.data for _, read in reads]),
             written=b"".join([t.outputs.line or b"" for t in taken]),
-            xs=_differences([pose[0] for pose in poses]),
-            ys=_differences([pose[1] for pose in poses]),
-            yaws=_differences([pose[2] for pose in poses]),
+            xs=pack([pose[0] for pose in poses]),
+            ys=pack([pose[1] for pose in poses]),
+            yaws=pack([pose[2] for pose in poses]),
             checksum=checksum(estimates, 0),
-            rare=tuple(_rare(taken, reason)),
+            rare=tuple(_rare(taken, status)),
         )
     )
 
@@ -102,44 +108,33 @@ def _shape(taken: Taken) -> Shape:
     return Shape(flags, len(inputs.received), len(taken.outputs.estimates), len(line or b""))
 
 
-def _instants(taken: Sequence[Taken], start_ns: int) -> tuple[list[int], list[int]]:
-    ticks, others = [], []
-    last = last_tick = start_ns
-    for t in taken:
-        now_ns = t.inputs.now.mono_ns
-        if t.inputs.tick:
-            ticks.append(now_ns - last_tick)
-            last_tick = now_ns
-        else:
-            others.append(now_ns - last)
-        last = now_ns
-    return ticks, others
+def _lane(taken: list[Taken], start: Instant, shapes: dict[Shape, int]) -> Lane:
+    """Those steps; `shapes` gets the shapes that are new."""
+    kinds = bytes([shapes.setdefault(_shape(t), len(shapes)) for t in taken])
+    return Lane(kinds, pack([t.inputs.now.mono_ns - start.mono_ns for t in taken]))
+
+
+def _order(taken: Sequence[Taken]) -> bytes:
+    keys = [(t.inputs.now.mono_ns, not t.inputs.tick) for t in taken]
+    return b"" if keys == sorted(keys) else bytes([t.inputs.tick for t in taken])
 
 
 def _offsets(taken: Sequence[Taken], offset_ns: int) -> list[int]:
-    found = []
-    for t in taken:
-        for at in (*[read.at for read in t.inputs.received], t.inputs.now):
-            now_ns = at.wall_ns - at.mono_ns
-            found.append(now_ns - offset_ns)
-            offset_ns = now_ns
-    return found
+    return [
+        at.wall_ns - at.mono_ns - offset_ns
+        for t in taken
+        for at in (*[read.at for read in t.inputs.received], t.inputs.now)
+    ]
 
 
-def _differences(values: list[int]) -> bytes:
-    return pack([b - a for a, b in zip([0, *values], values, strict=False)])
-
-
-def _rare(taken: Sequence[Taken], reason: str | None) -> Iterator[tuple[int, Rare]]:
-    opened: int | None = None
-    trouble: str | None = None
-    status: Status | None = None
+def _rare(taken: Sequence[Taken], status: Status) -> Iterator[tuple[int, Rare]]:
+    opened, trouble = taken[0].inputs.opened, taken[0].inputs.port_trouble
     for index, (inputs, outputs, left) in enumerate(taken):
         now = status_of(outputs)
         rare = Rare(
             opened=inputs.opened if inputs.opened != opened else None,
             trouble=inputs.port_trouble if inputs.port_trouble != trouble else None,
-            status=_brief(now, reason) if now != status else None,
+            status=_brief(now, status[1]) if now != status else None,
             left=left if left is not None and left != outputs.line else b"",
             missed=inputs.missed,
             guard_trip=inputs.guard_trip,
@@ -150,7 +145,7 @@ def _rare(taken: Sequence[Taken], reason: str | None) -> Iterator[tuple[int, Rar
             heard=inputs.events,
             told=outputs.events,
         )
-        opened, trouble, status, reason = inputs.opened, inputs.port_trouble, now, now[1]
+        opened, trouble, status = inputs.opened, inputs.port_trouble, now
         if rare != NOTHING:
             yield index, rare
 
@@ -163,34 +158,76 @@ def _brief(status: Status, reason: str | None) -> Status:
 # decode
 
 
-def decode(data: bytes, reason: str = "") -> list[Step]:
+def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
     """The steps again; raises `BatchError` for bytes that are none.
 
-    `reason` is the last one of the batch before.
+    `reason` is the last one of the batch before, `form` the format of the file.
     """
     try:
-        batch = _decoder.decode(data)
-        return list(_steps(batch, reason))
+        if form == earlier.FORMAT:
+            spread = earlier.spread(_decoder_of_1.decode(data))
+        else:
+            spread = _spread(_decoder.decode(data))
+        return list(_steps(spread, reason))
     except (msgspec.DecodeError, ValueError, IndexError, StopIteration, RuntimeError) as error:
         raise BatchError(f"not a batch of steps: {error}") from None
 
 
-def _steps(batch: Batch, reason: str) -> Iterator[Step]:
-    shapes = _shapes(batch)
-    instants = _instants_of(batch, shapes)
-    data = _cut(batch.received, unpack(batch.lengths, sum(shape.reads for shape in shapes)))
-    lines = _cut(batch.written, [shape.line for shape in shapes])
-    poses = _poses(batch, shapes)
-    rares = dict(batch.rare)
-    opened, trouble, status = 0, "", ("", "", "", "")
-    for index, (shape, (ats, now)) in enumerate(zip(shapes, instants, strict=True)):
-        flags, rare = shape.flags, rares.get(index, NOTHING)
+def _spread(batch: Batch) -> Spread:
+    if min([n for shape in batch.shapes for n in shape], default=0) < 0:
+        raise ValueError("a number below 0")
+    placed = _placed(batch)
+    shapes = [batch.shapes[kind] for _, _, kind in placed]
+    reads = sum(shape.reads for shape in shapes)
+    poses = sum(shape.poses for shape in shapes)
+    columns = [unpack(column, poses) for column in (batch.xs, batch.ys, batch.yaws)]
+    return Spread(
+        first=batch.first,
+        standing=batch.standing,
+        shapes=shapes,
+        times=[batch.mono_ns + ns for ns, _, _ in placed],
+        offsets=[batch.offset_ns + n for n in unpack(batch.offsets, reads + len(shapes))],
+        ages=unpack(batch.ages, reads),
+        lengths=unpack(batch.lengths, reads),
+        received=batch.received,
+        written=batch.written,
+        poses=[(x, y, yaw) for x, y, yaw in zip(*columns, strict=True)],
+        checksum=batch.checksum,
+        rare=dict(batch.rare),
+    )
+
+
+def _times(lane: Lane) -> list[int]:
+    return unpack(lane.times, len(lane.kinds))
+
+
+def _placed(batch: Batch) -> list[tuple[int, bool, int]]:
+    """Of each step when it was, whether it is no tick, and its kind."""
+    ticks, others = (
+        [(ns, late, kind) for ns, kind in zip(_times(lane), lane.kinds, strict=True)]
+        for late, lane in ((False, batch.ticks), (True, batch.others))
+    )
+    if not batch.order:
+        return sorted([*ticks, *others], key=lambda one: one[:2])
+    if batch.order.count(0) != len(others) or len(batch.order) != len(ticks) + len(others):
+        raise ValueError("an order of other steps")
+    lanes = iter(others), iter(ticks)
+    return [next(lanes[bool(tick)]) for tick in batch.order]
+
+
+def _steps(spread: Spread, reason: str) -> Iterator[Step]:
+    data = _cut(spread.received, spread.lengths)
+    lines = _cut(spread.written, [shape.line for shape in spread.shapes])
+    poses, instants = iter(spread.poses), _instants(spread)
+    opened, trouble, brief = spread.standing
+    status = _whole(brief, reason)
+    last = len(spread.shapes) - 1
+    for index, (shape, (ats, now)) in enumerate(zip(spread.shapes, instants, strict=True)):
+        flags, rare = shape.flags, spread.rare.get(index, NOTHING)
         opened = opened if rare.opened is None else rare.opened
         trouble = trouble if rare.trouble is None else rare.trouble
         if rare.status is not None:
-            mode, told, link, source = rare.status
-            reason = reason if told == SAME else told
-            status = mode, reason, link, source
+            status = _whole(rare.status, status[1])
         line = next(lines)
         inputs = Inputs(
             now=now,
@@ -216,42 +253,20 @@ def _steps(batch: Batch, reason: str) -> Iterator[Step]:
             status=status,
             poses=tuple([next(poses) for _ in range(shape.poses)]),
             events=rare.told,
-            checksum=batch.checksum if index == batch.count - 1 else None,
+            checksum=spread.checksum if index == last else None,
         )
-        yield Step(batch.first + index, inputs, said, begins=index == 0)
+        yield Step(spread.first + index, inputs, said, begins=index == 0)
 
 
-def _shapes(batch: Batch) -> list[Shape]:
-    """Of every step."""
-    if min([n for shape in batch.shapes for n in shape], default=0) < 0:
-        raise ValueError("a number below 0")
-    kinds = unpack(batch.kinds, batch.count)
-    if min(kinds, default=0) < 0:
-        raise ValueError("no such kind of step")
-    return [batch.shapes[kind] for kind in kinds]
+def _whole(brief: Status, reason: str) -> Status:
+    mode, told, link, source = brief
+    return mode, reason if told == SAME else told, link, source
 
 
-def _times(batch: Batch, shapes: list[Shape]) -> Iterator[int]:
-    ticks = sum(1 for shape in shapes if shape.flags & TICK)
-    tick_deltas = iter(unpack(batch.ticks, ticks))
-    deltas = iter(unpack(batch.others, batch.count - ticks))
-    last = last_tick = batch.mono_ns
-    for shape in shapes:
-        if shape.flags & TICK:
-            last = last_tick = last_tick + next(tick_deltas)
-        else:
-            last += next(deltas)
-        yield last
-
-
-def _instants_of(batch: Batch, shapes: list[Shape]) -> Iterator[tuple[list[Instant], Instant]]:
+def _instants(spread: Spread) -> Iterator[tuple[list[Instant], Instant]]:
     """Of each step: when its reads were, and it itself."""
-    reads = sum(shape.reads for shape in shapes)
-    ages = iter(unpack(batch.ages, reads))
-    deltas = unpack(batch.offsets, reads + batch.count)
-    offsets = accumulate(deltas, initial=batch.offset_ns)
-    next(offsets)
-    for now_ns, shape in zip(_times(batch, shapes), shapes, strict=True):
+    ages, offsets = iter(spread.ages), iter(spread.offsets)
+    for now_ns, shape in zip(spread.times, spread.shapes, strict=True):
         times = [now_ns - next(ages) for _ in range(shape.reads)]
         instants = [Instant(ns, ns + next(offsets)) for ns in (*times, now_ns)]
         yield instants[:-1], instants[-1]
@@ -264,13 +279,3 @@ def _cut(data: bytes, lengths: list[int]) -> Iterator[bytes]:
     for length in lengths:
         yield data[at : at + length]
         at += length
-
-
-def _poses(batch: Batch, shapes: list[Shape]) -> Iterator[Micropose]:
-    count = sum(shape.poses for shape in shapes)
-    columns = [accumulate(unpack(column, count)) for column in (batch.xs, batch.ys, batch.yaws)]
-    return (_three(*pose) for pose in zip(*columns, strict=True))
-
-
-def _three(x: int, y: int, yaw: int) -> Micropose:
-    return x, y, yaw

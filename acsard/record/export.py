@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple, Protocol
 
@@ -13,7 +12,7 @@ from acsard import __version__
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record import bag, table
-from acsard.record.again import Course
+from acsard.record.again import EVERY, Course, Progress, quietly
 from acsard.record.beside import beside, synced
 from acsard.record.file import About, Recording
 from acsard.record.published import Published, Publisher
@@ -28,12 +27,6 @@ Kind = Literal["mcap", "csv", "rosbag2"]
 
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
 """What a name is made with where none is given."""
-
-Progress = Callable[[int], None]
-"""Called now and then with the wall-clock time that it has come to, ns."""
-
-EVERY = 1024
-"""Steps from one call of it to the next."""
 
 
 class Span(NamedTuple):
@@ -147,7 +140,7 @@ def export(
     kind: Kind,
     other: Config | None = None,
     span: Span = WHOLE,
-    progress: Progress = lambda wall_ns: None,
+    progress: Progress = quietly,
     force: bool = False,
 ) -> Done:
     """Write `new`, a file or, of `rosbag2`, a directory.

@@ -26,6 +26,8 @@ from mcap.writer import IndexType, Writer
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
+from acsard.record import earlier
+from acsard.record.layout import FORMAT
 from acsard.record.story import NEWS, Told, summary
 from acsard.values import NS_PER_S
 
@@ -35,8 +37,8 @@ CHUNK_BYTES = 32 * 1024
 MODE = 0o640
 """The service's group may read it."""
 
-FORMAT = "1"
-"""Of the messages in it; another number is another meaning."""
+FORMATS = (earlier.FORMAT, FORMAT)
+"""Of the messages in it: those that are read here."""
 
 MAGIC = b"\x89MCAP0\r\n"
 """Begins every file of this kind, whatever it is called."""
@@ -101,7 +103,7 @@ class Writing:
     def _open(self, about: About) -> None:
         os.fchmod(self._file.fileno(), MODE)  # whatever the umask takes away
         self._writer = Writer(
-            self._file, CHUNK_BYTES, index_types=IndexType.ALL ^ IndexType.MESSAGE
+            self._file, CHUNK_BYTES, index_types=IndexType.ATTACHMENT | IndexType.METADATA
         )
         self._writer.start("acsard", f"acsard {about.version}")
         meta = msgspec.to_builtins(about)
@@ -221,10 +223,10 @@ class Recording:
             about = msgspec.convert({**found, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
             raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
-        if about.format != FORMAT:
+        if about.format not in FORMATS:
             raise RecordingError(
-                f"{self.path} has the format {about.format}, this acsard reads {FORMAT}: "
-                f"it was written by acsard {about.version}"
+                f"{self.path} has the format {about.format}, this acsard reads {FORMAT} "
+                f"and before: it was written by acsard {about.version}"
             )
         return about
 

@@ -30,8 +30,8 @@ from acsard.values import NS_PER_S, Event, Inputs, Outputs, Recording
 MOST = 4096
 """Steps that wait for the thread: a disk may take 10 s, at 100 Hz, before any is lost."""
 
-FLUSH_S = 0.9
-"""Between two chunks; with the sync there is one each second."""
+FLUSH_S = 0.98
+"""Between two chunks; with what it takes to write one, there is one each second."""
 
 RETRY_ROUNDS = 5
 """Between two tries of a disk that refused."""

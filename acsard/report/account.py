@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -18,6 +20,8 @@ Clock = Callable[[float, bool], str]
 """A time, s since 1970, as the clocks here tell it, with the day or without."""
 
 MOST_REASONS = 8
+
+NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
 """s; what a point stands for is said from there on."""
@@ -107,14 +111,22 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(course: Course) -> list[tuple[str, str, str, float]]:
-    """Source, what it did but drive, why, and for how many s: the longest first."""
-    seconds: dict[tuple[str, str, str], float] = defaultdict(float)
+    """Source, what it did but drive, why, and for how many s: the longest first.
+
+    Sentences that differ by a number are one, as the longest of them says it.
+    """
+    found: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in course.commanders.bands.items():
         for span in band.spans():
             if span.kind != "drives":
-                seconds[name, span.kind, span.words] += span.end - span.begin
-    longest = sorted(seconds.items(), key=lambda one: -one[1])
-    return [(*key, total) for key, total in longest[:MOST_REASONS]]
+                alike = NUMBER.sub("#", span.words)
+                seconds = found.setdefault((name, span.kind, alike), defaultdict(float))
+                seconds[span.words] += span.end - span.begin
+    told = [
+        (name, does, max(each, key=each.__getitem__), math.fsum(each.values()))
+        for (name, does, _), each in found.items()
+    ]
+    return sorted(told, key=lambda one: -one[3])[:MOST_REASONS]
 
 
 def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:

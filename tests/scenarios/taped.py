@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -83,6 +84,17 @@ class Tape:
                     writing.event(told(event, outputs.now.wall_ns))
             writing.flush()
         writing.finish()
+
+
+def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
+    """Where each chunk's record of a file begins and ends, by the format's own words."""
+    found, at = [], 8
+    while at < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        if opcode == 6:
+            found.append((at, at + 9 + length))
+        at += 9 + length
+    return found
 
 
 def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:

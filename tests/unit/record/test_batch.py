@@ -122,6 +122,14 @@ def test_a_second_at_rest_takes_little() -> None:
     assert len(zstandard.compress(encode(0, batch))) < 3 * len(batch)
 
 
+def test_steps_at_one_time_come_back_in_their_order() -> None:
+    tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
+    outputs = Robot(Config()).step(tick)
+    for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
+        steps = decode(encode(0, [Taken(one, outputs, None) for one in inputs]))
+        assert [step.inputs for step in steps] == inputs
+
+
 def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
     whole, dice = encode(0, TAKEN[:100]), random.Random(1)
     for _ in range(500):

@@ -4,37 +4,91 @@ from __future__ import annotations
 
 import random
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.record.columns import pack, unpack
+from acsard.record.columns import Column, pack, unpack
 
-NUMBERS = st.integers(-(1 << 61), (1 << 61) - 1)
+NUMBERS = st.integers(-(1 << 61), (1 << 61) - 1) | st.integers(-9, 9)
+
+COUNT = 200
+
+
+def noise(most: int) -> list[int]:
+    dice = random.Random(1)
+    return [dice.randint(-most, most) for _ in range(COUNT)]
+
+
+def walk() -> list[int]:
+    at, found = 0, []
+    for step in noise(31):
+        at += 5000 + step
+        found.append(at)
+    return found
 
 
 @given(st.lists(NUMBERS, max_size=50))
 def test_numbers_come_back(values: list[int]) -> None:
+    written = msgspec.msgpack.encode(pack(values))
+    assert unpack(msgspec.msgpack.decode(written, type=Column), len(values)) == values
+
+
+@pytest.mark.parametrize(
+    ("values", "places"),
+    [
+        pytest.param([10**10 + n for n in (*noise(31)[1:], 20_000)], 0, id="around a value"),
+        pytest.param(walk(), 1, id="each from the one before"),
+        pytest.param(
+            [
+                10_000 * i + (21, 13, 37, 10, 49, 26, 18, 32)[i % 8] * 100 + n
+                for i, n in enumerate(noise(15))
+            ],
+            8,
+            id="in a rhythm",
+        ),
+        pytest.param([10_003 * i + n for i, n in enumerate(noise(31))], 0, id="along a line"),
+    ],
+)
+def test_what_is_near_to_what_is_expected_takes_a_byte_each(values: list[int], places: int) -> None:
+    column = pack(values)
+    assert column.places == places
+    assert len(column.bits) < COUNT
+    assert len(pack([1000 * value for value in values]).bits) == len(column.bits)
+
+
+@pytest.mark.parametrize("values", [[7] * COUNT, [1000 * n - 9 for n in range(COUNT)], [1 << 60]])
+def test_what_is_exactly_as_expected_takes_none(values: list[int]) -> None:
+    assert pack(values).bits == b""
     assert unpack(pack(values), len(values)) == values
 
 
-def test_what_hardly_differs_takes_a_byte_each() -> None:
-    dice = random.Random(1)
-    values = [10_000_000_000 + dice.randint(-60, 60) for _ in range(200)]
-    assert len(pack(values)) < 200 + 30
-    assert len(pack([1000 * value for value in values])) == len(pack(values))
-    assert len(pack([7] * 200)) < 30
+def test_one_that_is_far_off_makes_the_others_hardly_longer() -> None:
+    values = noise(31)
+    far = [*values[:-1], 1 << 40]
+    assert len(pack(far).bits) < len(pack(values).bits) + 16
 
 
 @given(st.lists(NUMBERS, min_size=2, max_size=9), st.integers(1, 8))
 def test_a_column_of_another_length_is_refused(values: list[int], more: int) -> None:
-    data = pack(values)
-    if len(data) > 17:
-        with pytest.raises(ValueError, match="column"):
-            unpack(data, len(values) + more)
-    with pytest.raises(ValueError, match="column"):
-        unpack(data + b"\x00", len(values))
-    with pytest.raises(ValueError, match="column"):
-        unpack(data[:5], len(values))
-    with pytest.raises(ValueError, match="column"):
-        unpack(pack([7] * 200), 1 << 60)
+    column = pack(values)
+    if column.bits:
+        for other in (len(values) + more, len(values) - 1):
+            if other:
+                with pytest.raises(ValueError, match=r"column|substring"):
+                    unpack(column, other)
+        with pytest.raises(ValueError, match=r"column|substring"):
+            unpack(replace(column, bits=column.bits[:-1]), len(values))
+
+
+@pytest.mark.parametrize("what", [{"places": 3}, {"places": -1}, {"order": 65}, {"order": -2}])
+def test_what_there_is_not_is_refused(what: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=r"there are not|there is not"):
+        unpack(replace(pack(noise(9)), **what), COUNT)
+
+
+def test_more_numbers_than_there_can_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="too many"):
+        unpack(pack([7] * COUNT), 1 << 60)

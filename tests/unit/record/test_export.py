@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
 from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -25,7 +24,7 @@ from acsard.record.beside import beside
 from acsard.record.export import Kind, Span, export, measured
 from acsard.record.file import Recording
 from acsard.ros.channels import CHANNELS
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 
 SECONDS = 2.0
@@ -250,18 +249,10 @@ def test_who_may_read_it_is_what_the_umask_says(mask: int, path: Path, tmp_path:
     assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == 0o777 & ~mask
 
 
-def chunks(path: Path) -> list[ChunkIndex]:
-    """Where they are."""
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    return summary.chunk_indexes
-
-
 def test_of_a_recording_that_was_cut_what_is_whole_is_written(path: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
-    last = chunks(path)[-1]
-    cut.write_bytes(path.read_bytes()[: last.chunk_start_offset + last.chunk_length // 2])
+    begin, end = chunks(path.read_bytes())[-1]
+    cut.write_bytes(path.read_bytes()[: (begin + end) // 2])
     recording = Recording(cut)
     done = export(recording, tmp_path / "new.mcap", "mcap")
     assert not recording.whole
@@ -273,9 +264,9 @@ def test_of_a_recording_that_was_cut_what_is_whole_is_written(path: Path, tmp_pa
 
 
 def test_steps_that_are_missing_end_it_and_are_told(path: Path, tmp_path: Path) -> None:
-    chunk = chunks(path)[-2]
     data = bytearray(path.read_bytes())
-    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    begin, end = chunks(data)[-2]
+    data[(begin + end) // 2] ^= 0xFF
     holed = tmp_path / "holed.mcap"
     holed.write_bytes(data)
     done = export(Recording(holed), tmp_path / "new.csv", "csv")

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import random
-import struct
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from msgspec.structs import replace
 
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record.again import config_of, live, steps
 from acsard.record.file import MODE, Closing, Recording, closing, rewrite
 from acsard.record.steps import status_of
-from tests.scenarios.taped import BATCH, Tape
+from acsard.values import Instant
+from tests.scenarios.taped import BATCH, Tape, chunks
 from tests.scenarios.world import World
 
 
@@ -32,17 +33,6 @@ def whole(tape: Tape, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("record") / "whole.mcap"
     tape.write(path, Config())
     return path
-
-
-def chunks(data: bytes) -> list[tuple[int, int]]:
-    """Where each chunk's record begins and ends, by the format's own words."""
-    found, at = [], 8
-    while at < len(data) - 8:
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        if opcode == 6:
-            found.append((at, at + 9 + length))
-        at += 9 + length
-    return found
 
 
 def numbers(path: Path) -> list[int]:
@@ -70,6 +60,36 @@ def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
     assert got.count("steps") == -(-len(tape.taken) // BATCH)
     assert summary.statistics.message_count == len(got)
     assert config.name == "acsard.toml"
+
+
+def on_a_machine(tape: Tape) -> None:
+    """Times as a quiet machine has them: a step some ten us late, a read seen some us later."""
+    dice = random.Random(1)
+    for at, taken in enumerate(tape.taken):
+        late = 1000 * round(dice.expovariate(1 / 30))
+        mono, wall = taken.inputs.now.mono_ns + late, taken.inputs.now.wall_ns + late
+        now = Instant(mono, wall + 1000 * dice.randint(0, 1))
+        reads = tuple(
+            replace(read, at=Instant(mono - age, wall - age))
+            for read in taken.inputs.received
+            if (age := 1000 * dice.randint(5, 15))
+        )
+        tape.taken[at] = taken._replace(inputs=replace(taken.inputs, now=now, received=reads))
+
+
+def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
+    tape, sizes = Tape(), []
+    world = World(recorder=tape)
+    world.run(3.0)
+    del tape.taken[:-BATCH]
+    for seconds in (0.0, 20.0):
+        world.run(seconds)
+        path = tmp_path / f"{seconds}.mcap"
+        on_a_machine(tape)
+        tape.write(path, Config())
+        sizes.append((path.stat().st_size, len(tape.taken)))
+    (little, few), (much, many) = sizes
+    assert (much - little) / (many - few) * 200 * 86_400 < 60e6  # 200 steps a second
 
 
 def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> None:

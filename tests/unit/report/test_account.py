@@ -62,6 +62,15 @@ def test_the_longest_reason_comes_first() -> None:
     assert all(first[3] >= other[3] for other in rest)
 
 
+def test_sentences_that_differ_by_a_number_are_one_reason_as_the_longest_says_it() -> None:
+    course, _ = course_of(lambda world: world.run(0.1))
+    band = course.commanders.bands["app"]
+    for n, t in enumerate((1.0, 1.5, 3.5)):
+        band.add(t, "waits", f"lines come 0.1{n} s apart")
+    band.end(4.0)
+    assert reasons(course) == [("app", "waits", "lines come 0.11 s apart", 3.0)]
+
+
 def test_times_are_said_as_people_do() -> None:
     assert [lasted(s) for s in (0.04, 59.94, 60.0, 3599.7, 86400.0)] == [
         "0.0 s", "59.9 s", "1 min 0 s", "1 h 0 min", "24 h 0 min",

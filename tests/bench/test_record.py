@@ -1,0 +1,101 @@
+"""What the black box costs the loop: processor and lateness, recording on and off in turn.
+
+pytest -s -m bench tests/bench/test_record.py
+
+Ten rounds of two daemons, one after the other, each driven at 20 commands a second; the one that
+comes first changes; then one at rest. Five minutes. The processor's time is the kernel's own
+account, of all threads.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from statistics import median, stdev
+from typing import NamedTuple
+
+import pytest
+
+from tests.system.harness import Bus, Daemon
+
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(900)]
+
+ROUNDS, SPAN_S, SETTLES_S, REST_S = 10, 9.0, 1.0, 30.0
+
+MORE = 0.4
+"""Points of a core that recording may take."""
+
+
+class Cost(NamedTuple):
+    processor: float
+    """% of a core."""
+    p50: float
+    p99: float
+    """us from when a period was due to its step."""
+    missed: int
+    bytes_: float
+    """Of recordings, a second."""
+
+
+def processor_s(pid: int) -> float:
+    """Of all threads there are now, to the ns."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(task.read_text().split()[0]) for task in tasks) / 1e9
+
+
+def size(where: Path) -> int:
+    return sum(path.stat().st_size for path in where.rglob("*.mcap*"))
+
+
+def cost(where: Path, records: bool) -> Cost:
+    """Of one daemon that drives."""
+    where.mkdir(parents=True)
+    words = ["--record", str(where / "record")] if records else []
+    with Daemon(where, words=words) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with bus.commanding(0.3):
+            time.sleep(SETTLES_S)
+            used, written, began = processor_s(daemon.pid), size(where), time.monotonic()
+            time.sleep(SPAN_S)
+            used, span = processor_s(daemon.pid) - used, time.monotonic() - began
+            written = size(where) - written
+            state = bus.state()
+    late = state["figures"]["period_lateness"]["since_start"]
+    missed = int(state["counters"].get("missed_periods", 0))
+    return Cost(100 * used / span, late["p50"], late["p99"], missed, written / span)
+
+
+def told(name: str, costs: list[Cost]) -> str:
+    middle = [median(column) for column in zip(*costs, strict=True)]
+    return (
+        f"{name}: {middle[0]:.2f} % of a core, late p50 {middle[1]:.0f} us, p99 {middle[2]:.0f} us "
+        f"(from {min(c.p99 for c in costs):.0f} to {max(c.p99 for c in costs):.0f}), "
+        f"{sum(c.missed for c in costs)} periods missed, {middle[4] * 0.0864:.0f} MB a day"
+    )
+
+
+def test_recording_costs_little_and_makes_no_period_late(tmp_path: Path) -> None:
+    costs: dict[bool, list[Cost]] = {False: [], True: []}
+    for number in range(ROUNDS):
+        for records in (False, True) if number % 2 else (True, False):
+            costs[records].append(cost(tmp_path / f"{number}-{records}", records))
+    off, on = costs[False], costs[True]
+    more = [b.processor - a.processor for a, b in zip(off, on, strict=True)]
+    print(f"\n{told('without', off)}\n{told('recording', on)}")
+    print(f"recording takes {median(more):+.2f} points of a core (each +- {stdev(more):.2f})")
+    assert median(more) < MORE + 2 * stdev(more) / ROUNDS**0.5
+    # Within what two like it differ by, on this machine now.
+    noise = max(one.p99 for one in off) - min(one.p99 for one in off)
+    assert median(one.p99 for one in on) <= median(one.p99 for one in off) + noise
+
+
+def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
+    words = ["--record", str(tmp_path / "record")]
+    with Daemon(tmp_path, words=words) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        time.sleep(SETTLES_S)
+        written, began = size(tmp_path), time.monotonic()
+        time.sleep(REST_S)
+        rate = (size(tmp_path) - written) / (time.monotonic() - began)
+    print(f"\nat rest: {rate:.0f} bytes a second, {rate * 0.0864:.0f} MB a day")
+    assert rate * 86_400 < 60e6

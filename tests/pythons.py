@@ -1,0 +1,118 @@
+"""`python -m tests.pythons PYTHON...`: recordings of this Python are lived again by others.
+
+Ten minutes through every fault of the simulator are recorded by the Python that runs this, plain
+and on the checked link with counts and a gyro, each from its start and from a state in its middle.
+Each PYTHON (its path) then replays them and `tests/recordings`, in a venv of its own that has what
+the service is installed from, and records ten minutes that this one replays. A line for each file;
+it ends with 0 when every line, mode and pose is the same, to the last bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from acsard.config.settings import Config
+from tests.scenarios.taped import Tape, drive_through_faults
+from tests.scenarios.world import World
+
+ROOT = Path(__file__).resolve().parents[1]
+
+SECONDS = 600.0
+
+PLAIN = Config()
+FULL = replace(
+    PLAIN,
+    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    odometry=replace(PLAIN.odometry, gyro=True),
+)
+
+VERDICT = re.compile(r"([\d ]+) of \1 lines the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes$")
+"""Of all, and no word of what is the same to the um only."""
+
+
+def record(where: Path, seconds: float) -> list[Path]:
+    """The drives, by this Python."""
+    made = []
+    for name, config in (("plain", PLAIN), ("full", FULL)):
+        tape = Tape(every=50_000)
+        world = World(config, recorder=tape)
+        world.bus.wanted = set()
+        drive_through_faults(world, seconds)
+        for first in (0, *list(tape.states)[:1]):
+            path = where / f"{name}-{first}-{sys.version_info[0]}.{sys.version_info[1]}.mcap"
+            tape.write(path, config, first)
+            made.append(path)
+    return made
+
+
+def installed(python: str, where: Path) -> str:
+    """The Python of a new venv."""
+    subprocess.run([python, "-m", "venv", where], check=True)
+    pip = [str(where / "bin/pip"), "install", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "-r", str(ROOT / "deploy/systemd/requirements.lock")], check=True)
+    return str(where / "bin/python")
+
+
+def run(python: str, *words: str) -> str:
+    """What it prints, of acsard as it is here."""
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [python, *words], cwd=ROOT, env=env, text=True, check=False,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    return done.stdout.strip()
+
+
+def replays(python: str, paths: Sequence[Path]) -> bool:
+    """Does it live all of them again as they were? Says so of each."""
+    version, same = run(python, "-V"), True
+    for path in paths:
+        said = run(python, "-m", "acsard", "log", "replay", str(path))
+        print(f"{version:14} {path.name:20} {said}", flush=True)
+        same = same and VERDICT.match(said) is not None
+    return same
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.pythons", description=__doc__)
+    parser.add_argument("pythons", nargs="*", metavar="PYTHON")
+    parser.add_argument("--seconds", type=float, default=SECONDS)
+    parser.add_argument("--record", type=Path, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.record:
+        record(asked.record, asked.seconds)
+        return 0
+    short = sorted(ROOT.glob("tests/recordings/*.mcap"))
+    with tempfile.TemporaryDirectory(prefix="pythons-") as name:
+        where = Path(name)
+        mine = record(where, asked.seconds)
+        same = replays(sys.executable, mine)
+        for number, python in enumerate(asked.pythons):
+            other, theirs = installed(python, where / f"venv-{number}"), where / str(number)
+            same = replays(other, [*short, *mine]) and same
+            theirs.mkdir()
+            said = run(
+                other,
+                "-m",
+                "tests.pythons",
+                "--record",
+                str(theirs),
+                "--seconds",
+                str(asked.seconds),
+            )
+            print(said, end="")
+            same = replays(sys.executable, sorted(theirs.glob("*.mcap"))) and same
+    return 0 if same else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

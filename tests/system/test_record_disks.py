@@ -1,0 +1,152 @@
+"""The black box on real disks that refuse: full, read-only, 2 s a sync. The loop does not notice.
+
+Beside the daemon on the bad disk runs one that records nothing: what the machine costs both is not
+the disk's. Needs root, who may mount.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.system import bystander
+from tests.system.harness import Bus, Daemon, Periods, environment, until
+from tests.system.test_record import files, replayed
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount"),
+]
+
+SPAN_S = 5.0
+
+SLOW = """\
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <unistd.h>
+
+int fsync(int fd)
+{
+    int (*sync)(int) = (int (*)(int))dlsym(RTLD_NEXT, "fsync");
+    int book = open(getenv("SYNCS"), O_WRONLY | O_CREAT | O_APPEND, 0600);
+    if (book >= 0 && write(book, ".", 1) == 1)
+        close(book);
+    sleep(2);
+    return sync(fd);
+}
+"""
+"""Each sync of a process takes 2 s, and leaves a dot in the file $SYNCS."""
+
+
+@contextmanager
+def disk(where: Path, *options: str) -> Iterator[Path]:
+    """A tmpfs of its own at `where/disk`; skips where nothing may be mounted."""
+    path = where / "disk"
+    path.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", ",".join(options), "acsard-test", str(path)]
+    mounted = subprocess.run(words, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f"cannot mount: {mounted.stderr.strip()}")
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+@contextmanager
+def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus, Bus]]:
+    """A daemon that records there, its bus, and that of one that records nothing."""
+    other = where / "other"
+    other.mkdir()
+    with (
+        Daemon(where, words=["--record", str(record)], **how) as daemon,  # type: ignore[arg-type]
+        Daemon(other) as plain,
+        Bus(daemon.endpoint) as bus,
+        Bus(plain.endpoint) as beside,
+    ):
+        bus.linked()
+        beside.linked()
+        yield daemon, bus, beside
+
+
+def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
+    """Both drive for a while: as many periods are missed as beside it, but for the machine's."""
+    began, buses = time.monotonic(), (bus, beside)
+    with bus.commanding(0.3), beside.commanding(0.3):
+        first = [one.state() for one in buses]
+        time.sleep(SPAN_S)
+        last = [one.state() for one in buses]
+    late = bystander.lost(began)
+    bad, quiet = (Periods.between(a, b).missed for a, b in zip(first, last, strict=True))
+    print(f"\n{name}: {bad} periods missed, {quiet} beside it, in {SPAN_S:g} s")
+    assert bad <= quiet + 100 * late + 2  # one sync in the loop would cost 200
+
+
+def says(bus: Bus, text: str) -> None:
+    """`state` says of the recording what is wrong, or nothing for "any more"."""
+    until(lambda: (told := bus.state()["recording"]) == text or (text and text in told), 30.0, text)
+
+
+def lived_again(where: Path, record: Path) -> None:
+    """Every file of it."""
+    found = files(record.parent)
+    assert found
+    assert sum(replayed(where, path) for path in found) > 50
+
+
+def test_a_disk_that_is_full_is_said_and_costs_only_records(tmp_path: Path) -> None:
+    with disk(tmp_path, "size=256k") as path:
+        ballast = path / "ballast"
+        ballast.write_bytes(bytes(220 * 1024))
+        with both(tmp_path, path / "record") as (daemon, bus, beside):
+            with bus.commanding(0.3):
+                says(bus, "No space left on device")
+            misses_what_the_other_misses("full", bus, beside)
+            says(bus, "No space left on device")
+            assert any(event["level"] == "warning" for event in daemon.events("recording"))
+            ballast.unlink()
+            says(bus, "")
+            daemon.process.terminate()
+            assert daemon.ended(5.0) == 0
+        lived_again(tmp_path, path / "record")
+
+
+def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:
+    with disk(tmp_path, "size=1m", "ro") as path:
+        with both(tmp_path, path / "record") as (daemon, bus, beside):
+            says(bus, "Read-only file system")
+            misses_what_the_other_misses("read-only", bus, beside)
+            subprocess.run(["mount", "-o", "remount,rw", str(path)], check=True)
+            says(bus, "")
+            with bus.commanding(0.3):
+                time.sleep(1.0)
+            daemon.process.terminate()
+            assert daemon.ended(5.0) == 0
+        lived_again(tmp_path, path / "record")
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
+    source, library, syncs = (tmp_path / name for name in ("slow.c", "slow.so", "syncs"))
+    source.write_text(SLOW)
+    words = ["gcc", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"]
+    subprocess.run(words, check=True)
+    env = environment(LD_PRELOAD=str(library), SYNCS=str(syncs))
+    with both(tmp_path, tmp_path / "record", env=env) as (daemon, bus, beside):
+        until(lambda: syncs.exists(), 5.0, "a sync")
+        before = syncs.stat().st_size
+        misses_what_the_other_misses("2 s a sync", bus, beside)
+        assert syncs.stat().st_size > before
+        assert bus.state()["recording"] == ""
+        daemon.process.terminate()
+        daemon.ended(5.0)
+    lived_again(tmp_path, tmp_path / "record")
