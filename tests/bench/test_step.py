@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
+from contextlib import ExitStack
 from statistics import median
 from time import thread_time_ns
 
@@ -102,6 +103,9 @@ class Run:
 
     def __init__(self, config: Config) -> None:
         self.world = made = World(config)
+        # By its own clock, so that it divides by what its period should be and counts show.
+        self.reports = ExitStack()
+        self.reports.enter_context(made.mcu.unprompted(0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
         made.bus.wanted = {"odom"}
