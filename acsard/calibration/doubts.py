@@ -20,6 +20,15 @@ UNLIKE = 0.5
 UNITS = 8.0
 """Times too much or too little that only another unit explains."""
 
+FAR_SIZE = 2e-3
+"""So little no other unit of the wheels makes of a way."""
+
+FASTEST_TURN = 12.0
+"""rad/s; who turns twice a second drives no odometry: that is in degrees."""
+
+LEAST_CHI = 0.4
+"""Effective over configured track: wheels that skid make it larger, never so much smaller."""
+
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 """What a multiplier may be."""
 
@@ -49,7 +58,7 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
         raise RefusedError(
             f"{source} does not follow what the wheels do: is it of the upright axis (yaw, not "
             "roll or pitch), of the same drive, on the same clock within 2 s, and did the wheels "
-            "touch the ground?"
+            "touch the ground? And are the wheels' columns speeds, not angles?"
         )
 
 
@@ -108,18 +117,32 @@ _ALSO = {
 }
 
 
-def turn_units(source: str, turn: float, base: Base) -> None:
+def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
+    """A robot can turn so fast; raises `RefusedError` for degrees. `turned`: rad in each row.
+
+    Where the wheels are in another unit too, one may hide the other.
+    """
+    rate = float(np.percentile(np.abs(turned) / seconds, 90))
+    if rate > FASTEST_TURN:
+        raise RefusedError(
+            f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
+            "and see that the wheel speeds are in rad/s, not deg/s, rpm or mm/s"
+        )
+
+
+def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     """The robot turns about as far as the wheels say; raises `RefusedError` for other units.
 
-    `turn`: what it turns, over what the configured wheels and track say.
+    `turn`: what it turns, over what the configured wheels and track say; `bare`: over what wheel
+    radius and separation say.
     """
-    if 1 / UNITS < turn < UNITS:
+    if 1 / UNITS < turn < UNITS and bare < 1 / LEAST_CHI:
         return
     may = (
         f"{source} is in degrees (multiply by pi / 180), or the wheel speeds are in m/s (divide "
         f"by the wheel radius)"
         if turn > 1
-        else "the wheel speeds are in deg/s, rpm or counts (rad/s are needed)"
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (rad/s are needed)"
     )
     raise RefusedError(
         f"the robot turns {turn:.3g} times as far as its wheels say: {may}, or drive.wheel_radius "
@@ -136,7 +159,10 @@ def way_units(size: float, base: Base) -> None:
     may = (
         "the wheel speeds are in m/s (divide by the wheel radius), or the positions in mm or cm"
         if size > 1
-        else "the wheel speeds are in deg/s, rpm or counts (rad/s are needed)"
+        else "the positions are latitude and longitude, or in km (x ahead and y to the left, in m, "
+        "are needed)"
+        if size < FAR_SIZE
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (rad/s are needed)"
     )
     raise RefusedError(
         f"the robot goes {size:.3g} times as far as its wheels say: {may}, or drive.wheel_radius "

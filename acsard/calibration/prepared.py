@@ -15,6 +15,7 @@ from acsard.calibration.doubts import (
     RefusedError,
     heading_follows,
     places_follow,
+    turn_rates,
     turn_units,
     turns_the_right_way,
     way_units,
@@ -53,6 +54,11 @@ def prepared(
     every = rows = heading.rows(headings, driven, angles, parts)
     if headings is not None and headings.drifts and len(every.turned):
         rows = heading.level(every)
+    if headings is not None and not len(rows.turned):
+        raise RefusedError(
+            f"{headings.source} tells nothing while the wheels turn: record both at the same time, "
+            "with times of one clock"
+        )
     rolls_enough(rows)
     spots = places.spots(driven, angles, parts)
     grids = [places.grid(*pair) for pair in zip(driven, angles, strict=True)] if spots else []
@@ -80,6 +86,8 @@ def prepared(
         mean, size = float(sides.mean()), float(start[[LEFT, RIGHT]].mean())
         start[[LEFT, RIGHT]] = size * sides / mean
         start[TURN] = mean / size
+    if headings is not None:
+        turn_rates(headings.source, rows.turned, rows.seconds)
     _units(headings, start, base, begun is not None)
     return Prepared(parts, every, spots, grids, sources, start)
 
@@ -88,5 +96,6 @@ def _units(headings: Headings | None, start: Floats, base: Base, sized: bool) ->
     size, was = float(start[[LEFT, RIGHT]].mean()), base.start()
     if sized:
         way_units(size, base)
-    turn = size * start[TURN] / (was[[LEFT, RIGHT]].mean() * was[TURN])
-    turn_units(headings.source if headings else "the positions' yaw", float(turn), base)
+    bare = size * float(start[TURN])
+    turn = bare / float(was[[LEFT, RIGHT]].mean() * was[TURN])
+    turn_units(headings.source if headings else "the positions' yaw", turn, bare, base)

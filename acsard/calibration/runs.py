@@ -30,6 +30,20 @@ SLOWEST_S = 2.0
 LEAST_ROWS = 20
 """Wheel samples of a run, and of a log."""
 
+PAUSE_S = 60.0
+"""Without a wheel sample for so long one drive has ended, and another begun."""
+
+ENOUGH_S, REPEATED = 0.2, 4.0
+"""Between wheel samples of different times, and samples to each of these: with more of both, times
+were rounded away."""
+
+MOST_RUNS = 1000
+"""In a log: more are no drives."""
+
+TOGETHER, TOLD, APART = 50, 0.15, 0.8
+"""Rows that are summed up before front and rear of a side are compared, and the shares of their way
+by which they may differ untold, and at all."""
+
 
 class Run(Struct, frozen=True):
     """One drive: times in s since `start`, in order and each only once."""
@@ -63,35 +77,79 @@ def runs(table: Table) -> Log:
     notes = list(table.notes)
     columns = dict(table.columns)
     t = columns["t"]
-    columns["left"], columns["right"] = _sides(columns)
+    columns["left"], columns["right"] = _sides(columns, notes)
+    if len(table.names) > MOST_RUNS:
+        raise LogError(
+            f"column run has {len(table.names)} different names: it tells drives apart, not rows"
+        )
     timed = np.isfinite(t)
     if lost := int((~timed).sum()):
         notes.append(f"{lost} of {len(t)} rows have no time and are left out")
     found: list[Run] = []
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
+        of = f"run {name}: " if name else ""
         parts = _restarts(t, rows, columns)
         if len(parts) > 1:
-            of = f"run {name}: " if name else ""
             notes.append(f"{of}the time begins anew {len(parts) - 1} times: as many runs more")
+        _in_seconds(name, t, parts, columns)
+        whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
+        if len(parts) > whole:
+            notes.append(
+                f"{of}the wheels are silent for over {PAUSE_S:g} s {len(parts) - whole} times: "
+                "as many runs more"
+            )
         for at, part in enumerate(parts):
             label = name or str(len(found) + 1)
             made = _run(label if at == 0 or not name else f"{name}.{at + 1}", columns, part, notes)
             if made is not None:
                 found.append(made)
     if not found:
+        empty = [
+            name for name in ("t", *FOUR, *TWO)
+            if name in table.columns and not np.isfinite(table.columns[name]).any()
+        ]  # fmt: skip
         raise LogError(
-            f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
+            f"column {empty[0]} has a number in no row: record the wheels while the robot drives"
+            if empty
+            else f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
             "record the wheels at 5 Hz or more while the robot drives"
         )
     return Log(tuple(found), tuple(dict.fromkeys(notes)))
 
 
-def _sides(columns: dict[str, Floats]) -> tuple[Floats, Floats]:
+def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats]:
     if set(TWO) <= set(columns):
         return columns["left"], columns["right"]
+    for front, rear in (("fl", "rl"), ("fr", "rr")):
+        apart = _apart(columns, front, rear)
+        if apart > TOLD:
+            notes.append(
+                f"{front} and {rear} differ by {apart:.0%} of their way: their mean counts"
+            )
     fr, fl, rl, rr = (columns[name] for name in FOUR)
     return (fl + rl) / 2, (fr + rr) / 2
+
+
+def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
+    """The share of their way by which both wheels of a side, that roll over one floor, differ;
+    raises `LogError` where they cannot."""
+    seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
+    starts = np.arange(0, int(seen.sum()), TOGETHER)
+    if not len(starts):
+        return 0.0
+    a, b = (np.add.reduceat(columns[name][seen], starts) for name in (front, rear))
+    apart, way = np.abs(a - b).sum(), np.maximum(np.abs(a), np.abs(b)).sum()
+    if apart <= APART * way:
+        return float(apart / way) if way else 0.0
+    least, most = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
+    sizes = sorted(float(np.abs(one).sum()) for one in (a, b))
+    raise LogError(
+        f"{least} hardly turns while {most} does: name the wheels that are right left and right, "
+        "without the others"
+        if sizes[0] < (1 - APART) * sizes[1]
+        else f"{front} and {rear} turn opposite ways: a sign is wrong, or columns are swapped"
+    )
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
@@ -110,6 +168,44 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
+def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
+    """Of the rows that have both sides, in order, repeated ones too."""
+    held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
+    return np.sort(t[rows[held]])
+
+
+def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
+    """Times are in seconds, and fine enough; raises `LogError`."""
+    for rows in parts:
+        times = _wheel_times(t, rows, columns)
+        if len(times) < LEAST_ROWS:
+            continue
+        once = np.unique(times)
+        period = float(np.median(np.diff(once))) if len(once) > 1 else np.inf
+        if len(times) > REPEATED * len(once) and period > ENOUGH_S:
+            raise LogError(
+                f"run {name or 1}: {len(times)} rows of wheel speeds have {len(once)} different "
+                "times: t was rounded, write it with 3 decimals of a second"
+            )
+        if period > SLOWEST_S:
+            raise LogError(
+                f"run {name or 1}: {period:g} s between two rows of wheel speeds: t is in seconds "
+                "(divide ms by 1000, ns by 1e9), and the wheels are needed at 5 Hz or more"
+            )
+
+
+def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
+    """The rows of each drive: a stamp of another day must not make one of a thousand hours."""
+    times = _wheel_times(t, rows, columns)
+    ends = np.flatnonzero(np.diff(times) > PAUSE_S)
+    if not len(ends):
+        return [rows]
+    drive = np.searchsorted((times[ends] + times[ends + 1]) / 2, t[rows])
+    order = np.argsort(drive, kind="stable")
+    begins = np.searchsorted(drive[order], np.arange(1, len(ends) + 1))
+    return list(np.split(rows[order], begins))
+
+
 def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) -> Run | None:
     names = ("left", "right"), ("yaw_rate",), ("yaw",), ("x", "y")
     wheels, gyro, yaw, place = (_stream(columns, rows, n, name, notes) for n in names)
@@ -118,12 +214,6 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
             notes.append(f"run {name} has {len(wheels[0])} rows of wheel speeds and is left out")
         return None
     start = float(wheels[0][0])
-    period = float(np.median(np.diff(wheels[0])))
-    if period > SLOWEST_S:
-        raise LogError(
-            f"run {name}: {period:g} s between two rows of wheel speeds: t is in seconds (divide "
-            "ms by 1000, ns by 1e9), and the wheels are needed at 5 Hz or more"
-        )
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
     points = (x - x[:1]) + 1j * (y - y[:1])
     return Run(

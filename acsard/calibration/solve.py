@@ -38,6 +38,10 @@ LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
 more; where they are fine, more blocks do."""
 
 
+PERFECT = 1e-3
+"""Share of what was driven by which a sensor differs from the wheels at the least: floors and
+sensors are not so good."""
+
 PLENTY = 100
 """Blocks after which others are not worth the time."""
 
@@ -143,6 +147,7 @@ def _calibration(
         float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
     )  # fmt: skip
     notes += _cuts(log.runs, angles)
+    notes += _too_good(headings, made, fitted, base)
     notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))
     return Calibration(
         " and ".join(late), drives, configured(base), result, " and ".join(scale),
@@ -161,6 +166,29 @@ def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
             f"the positions jump {jumps} times (outliers, or a source that found itself "
             "elsewhere): nothing is taken across that"
         )
+
+
+def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base) -> Iterator[str]:
+    """What agrees with the wheels as no sensor does, a sentence each."""
+    rows = made.rows
+    if headings is not None:
+        off = rows.turned - turning.turned(rows, base, fitted.parameters)
+        off -= np.median(off / rows.seconds) * rows.seconds
+        if float(off @ off) < PERFECT**2 * float(rows.turned @ rows.turned):
+            yield _own(headings.source)
+    if made.spots:
+        along = [places.path(one, base, fitted.parameters) for one in made.grids]
+        reach = max(float(np.ptp(spot.place.real) + np.ptp(spot.place.imag)) for spot in made.spots)
+        if places.spread(made.spots, along, fitted.parameters) < PERFECT * reach:
+            yield _own("the positions")
+
+
+def _own(what: str) -> str:
+    return (
+        f"no sensor agrees with the wheels so well as {what}: if that was made of the same wheels, "
+        "like the odometry of a driver, this tells how the driver is set and nothing of the robot; "
+        "take a gyro, SLAM, GPS or motion capture"
+    )
 
 
 def _follow(

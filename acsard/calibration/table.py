@@ -26,9 +26,14 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
 COLUMNS = (*NUMBERS, "run")
 
-BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e12, "yaw_rate": 1e4, "yaw": 1e7}
+BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Greater ones are no measurement (rad/s, s, rad, m); degrees must come through to be told."""
+"""Greater ones are no measurement (rad/s, s, rad, m); degrees and ns must come through to be
+told."""
+
+RATES = frozenset((*FOUR, *TWO, "yaw_rate"))
+SPIKE, FEW_SPIKES, SLOW = 10.0, 0.02, 0.02
+"""Times what all but this share of the rates over so many rad/s stay below: a misread number."""
 
 MISSING = frozenset(("", "nan", "null", "none", "na", "n/a", "-"))
 
@@ -36,6 +41,9 @@ FEW, SHARE = 3, 0.01
 """Rows that may be unreadable: as many as this, or this share of all."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
+
+
+AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
@@ -71,7 +79,7 @@ def _text(data: bytes) -> str:
         if data.startswith(mark):
             return data.decode(coding, errors="replace")
     if b"\0" in data[:4096]:
-        raise LogError("it is not text (a recording of ROS, perhaps): export it as CSV first")
+        raise LogError(f"it is not text (a recording of ROS, perhaps): {AS_CSV}")
     return data.decode("utf-8-sig", errors="replace")
 
 
@@ -127,6 +135,8 @@ def _columns(header: list[str], number: int) -> list[str]:
         raise LogError(f"{where}: column {min(twice)} is there twice; leave one out")
     wheels = FOUR if set(FOUR) <= set(header) else TWO
     wanted = ["t", *wheels]
+    if len(header) == 1 and "t" in header[0].split():
+        raise LogError(f"{where}: the names stand without commas between: write {EXAMPLE}")
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
             f"{where}: no column {', '.join(missing)}{_near(missing, header)}; it must name t, "
@@ -147,6 +157,8 @@ def _columns(header: list[str], number: int) -> list[str]:
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
     """What may have been meant."""
     others = [name for name in header if name and name not in COLUMNS]
+    if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
+        return f" (is {times[0][:40]} it? rename it t, in s)"
     near = [one for name in names for one in nearest(name, others)]
     return f" (is {near[0]} it? rename it)" if near else ""
 
@@ -235,11 +247,19 @@ def _bounded(columns: dict[str, Floats]) -> Iterator[str]:
     """Make what cannot be a measurement missing, in place; what was."""
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
-            wild = np.abs(values) > BOUNDS.get(name, PLACE_BOUND)
+            wild = np.abs(values) > min(BOUNDS.get(name, PLACE_BOUND), _spike(name, values))
         if wild.any():
             example = float(values[wild][0])
             values[wild] = math.nan
             yield f"{_cells(int(wild.sum()))} of {name} left out as impossible, like {example:g}"
+
+
+def _spike(name: str, values: Floats) -> float:
+    """What no rate is that all others are far below; rad/s."""
+    sizes = np.abs(values[np.isfinite(values) & (np.abs(values) > SLOW)])
+    if name not in RATES or len(sizes) < 1 / FEW_SPIKES:
+        return math.inf
+    return SPIKE * float(np.quantile(sizes, 1 - FEW_SPIKES))
 
 
 def _rows(count: int) -> str:

@@ -123,10 +123,11 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
 def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
-    from acsard.calibration.table import read
-    from acsard.record.export import measured
-    from acsard.record.file import MAGIC, Recording
+    from acsard.calibration.table import AS_CSV, LogError, read
+    from acsard.record.file import MAGIC
 
+    if log.is_dir():
+        raise LogError(f"it is a directory (a bag of ROS, perhaps): {AS_CSV}")
     try:
         if log.stat().st_size > MOST_BYTES:
             raise ExitError(Exit.FAILURE, f"{log} is over 1 GiB: cut it, ten minutes are plenty")
@@ -136,8 +137,25 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
             Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
         ) from None
     if data.startswith(MAGIC):
-        data = measured(Recording(log))
+        data = _measured(log)
     return calibrate(runs(read(data)), drive, tape)
+
+
+def _measured(log: Path) -> bytes:
+    """The table of a recording of ours; raises `LogError` for what is none, or has no gyro."""
+    from acsard.calibration.table import AS_CSV, LogError
+    from acsard.host.errors import RecordingError
+    from acsard.record.export import measured
+    from acsard.record.file import Recording
+
+    try:
+        recording = Recording(log)
+    except RecordingError as error:
+        raise LogError(f"{error}; {AS_CSV}") from None
+    try:
+        return measured(recording)
+    except RecordingError as error:
+        raise LogError(str(error)) from None
 
 
 def _distance(text: str) -> Tape:

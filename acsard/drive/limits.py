@@ -131,8 +131,9 @@ def _approach(
         slope = slope if slope * wanted > 0 else 0.0  # left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
-        # The slope may not fall faster than jerk either, as far as the goal is not passed.
-        most = max(most, abs(slope) - step)
+        # The slope may not fall faster than jerk either, as far as the goal is not passed; nor is
+        # it steeper for jerk's sake than it may be: it braked, or what it may be was lowered.
+        most = min(axis.acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
     # Landing exactly: wanted * dt need not give the difference back in floating point.
     return (target if used == wanted else speed + used * dt), used

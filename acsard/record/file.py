@@ -219,7 +219,7 @@ class Recording:
                 break
         try:
             if config is None:
-                raise ValueError("its beginning is missing")
+                raise ValueError("its beginning is missing, or it is another program's MCAP")
             about = msgspec.convert({**found, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
             raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None

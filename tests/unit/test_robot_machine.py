@@ -747,6 +747,12 @@ def test_settings_for_a_robot_at_rest_wait_until_the_lines_that_say_so_have_gone
     assert not answer.success
 
 
+def test_a_softer_acceleration_holds_at_once_whatever_the_jerk_was() -> None:
+    machine = RobotMachine()
+    machine.start(config=CONFIGS[3], rolling=True)
+    machine.a_limit_is_set(name="linear_acceleration", share=0.3)
+
+
 def test_a_stall_before_the_first_answer_of_a_new_port_is_made_up_for_once() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=True)

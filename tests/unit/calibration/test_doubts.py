@@ -9,6 +9,7 @@ import pytest
 
 from acsard.calibration.doubts import RefusedError, in_range, remarks
 from tests.unit.calibration.cut import BASE, calibrated, usual
+from tests.unit.calibration.robots import Drive
 
 DRIVE = usual()
 WRONG = {
@@ -22,6 +23,21 @@ WRONG = {
     "m/s": replace(DRIVE, left=DRIVE.left * 0.05, right=DRIVE.right * 0.05),
     "rpm": replace(DRIVE, left=DRIVE.left * 9.55, right=DRIVE.right * 9.55),
     "mm": replace(DRIVE, place=DRIVE.place * 1000),
+    "both degrees": replace(
+        DRIVE,
+        gyro=np.degrees(DRIVE.gyro),
+        left=np.degrees(DRIVE.left),
+        right=np.degrees(DRIVE.right),
+    ),
+    "degrees, rpm": replace(
+        DRIVE, gyro=np.degrees(DRIVE.gyro), left=DRIVE.left * 9.55, right=DRIVE.right * 9.55
+    ),
+    "degrees, mm/s": replace(
+        DRIVE, gyro=np.degrees(DRIVE.gyro), left=DRIVE.left * 50, right=DRIVE.right * 50
+    ),
+    "m/s, large": replace(DRIVE, left=DRIVE.left * 0.165, right=DRIVE.right * 0.165),
+    "latitude": replace(DRIVE, place=DRIVE.place * 9e-6),
+    "another clock": replace(DRIVE, gyro_t=DRIVE.gyro_t + 1.7e9),
     "later": replace(DRIVE, gyro_t=DRIVE.gyro_t + 5.0),
 }
 
@@ -47,6 +63,13 @@ WRONG = {
         ("rpm", True, False, "rpm"),
         ("rpm", False, True, "rpm"),
         ("mm", False, True, "mm or cm"),
+        ("both degrees", True, False, "yaw_rate is in degrees"),
+        ("degrees, rpm", True, False, "yaw_rate is in degrees"),
+        ("degrees, mm/s", True, False, "yaw_rate is in degrees"),
+        ("m/s, large", True, False, "wheel speeds are in m/s"),
+        ("latitude", False, True, "latitude and longitude"),
+        ("another clock", True, False, "times of one clock"),
+        ("another clock", True, True, "times of one clock"),
         ("later", True, False, "does not follow what the wheels do"),
     ],
 )
@@ -54,6 +77,25 @@ def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: s
     with pytest.raises(RefusedError) as refused:
         calibrated(WRONG[what].csv(gyro=gyro, places=places))
     assert words in str(refused.value)
+
+
+def odometry(robot: Drive) -> Drive:
+    """With what its own driver makes of the wheels as positions, and as a turn rate."""
+    turn = (robot.right - robot.left) * 0.05 / 0.45
+    yaw = np.cumsum(turn) * 0.01
+    ahead = np.exp(1j * (yaw - turn * 0.005))
+    way = np.asarray(np.cumsum((robot.left + robot.right) / 2 * 0.05 * ahead), np.complex128)
+    return replace(
+        robot, gyro_t=robot.t, gyro=turn, place_t=robot.t[::10], place=way[::10] * 0.01
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
+def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
+    log = odometry(DRIVE).csv(gyro=gyro, places=places)
+    assert any("made of the same wheels" in note for note in calibrated(log).notes)
+    usual_log = DRIVE.csv(gyro=gyro, places=places)
+    assert not any("same wheels" in note for note in calibrated(usual_log).notes)
 
 
 def test_positions_of_another_drive_are_refused() -> None:

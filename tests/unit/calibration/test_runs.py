@@ -63,9 +63,84 @@ def test_milliseconds_are_told_from_seconds() -> None:
         of(rows(0, step=10.0))
 
 
+@pytest.mark.parametrize("per_second", [1e6, 1e9])
+def test_stamps_in_ns_and_us_since_1970_are_told_from_seconds(per_second: float) -> None:
+    lines = [f"{(1.7e9 + i / 100) * per_second:.0f},{i},{i},{i}," for i in range(100)]
+    with pytest.raises(LogError, match="t is in seconds"):
+        of(lines)
+
+
+@pytest.mark.parametrize("form", ["{:g}", "{:.0f}"])
+def test_times_that_were_rounded_away_are_told(form: str) -> None:
+    lines = [f"{form.format(1.7e9 + i / 100)},{i},{i},{i}," for i in range(3000)]
+    with pytest.raises(LogError, match="write it with 3 decimals"):
+        of(lines)
+
+
+def test_a_stamp_of_1970_makes_no_drive_of_fifty_years() -> None:
+    names, ends, notes = of(["0,0,0,0,", *rows(1.7e9, 500)])
+    assert names == ["1"]
+    assert ends == pytest.approx([4.99])
+    assert any("1 rows of wheel speeds" in note for note in notes)
+
+
+def test_a_pause_of_a_day_parts_two_drives() -> None:
+    names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
+    assert names == ["1", "2"]
+    assert ends == pytest.approx([4.99, 2.99])
+    assert any("silent for over 60 s 1 times" in note for note in notes)
+
+
+def test_a_column_without_any_number_is_named() -> None:
+    with pytest.raises(LogError, match="column right has a number in no row"):
+        of([f"{i},1,,{i}," for i in range(100)])
+
+
+FOUR = "t,fr,fl,rl,rr,yaw_rate\n"
+
+
+@pytest.mark.parametrize(
+    ("wheels", "words"),
+    [
+        ("0,9,9,9", "fr hardly turns while rr does"),
+        ("9,9,-9,9", "fl and rl turn opposite ways"),
+        ("9,9,-9,-9", "turn opposite ways"),
+        ("9,9,0.1,9", "rl hardly turns while fl does"),
+    ],
+)
+def test_front_and_rear_that_contradict_each_other_are_told(wheels: str, words: str) -> None:
+    text = FOUR + "".join(f"{i / 100},{wheels},0\n" for i in range(500))
+    with pytest.raises(LogError, match=words):
+        runs(read(text.encode()))
+
+
+def test_front_and_rear_that_differ_are_told() -> None:
+    text = FOUR + "".join(f"{i / 100},9,9,9,7,0\n" for i in range(500))
+    assert any("fr and rr differ by 22%" in n for n in runs(read(text.encode())).notes)
+
+
+def test_a_run_for_each_row_is_none() -> None:
+    with pytest.raises(LogError, match="tells drives apart, not rows"):
+        of([f"{i / 100},{i},{i},{i},{i}" for i in range(2000)])
+
+
+def test_wheels_of_few_counts_do_not_contradict_each_other() -> None:
+    rng, step = np.random.default_rng(1), 2 * np.pi / 16
+    angles = np.linspace(0, 40, 1001)[:, None] + rng.uniform(0, 1, 4)
+    wheels = np.diff(np.floor(angles / step), axis=0) * step / 0.01
+    text = FOUR + "".join(
+        f"{i / 100},{','.join(map(str, row))},0\n" for i, row in enumerate(wheels)
+    )
+    log = runs(read(text.encode()))
+    assert len(log.runs) == 1
+    assert not log.notes
+
+
 def test_a_log_without_wheels_is_refused() -> None:
-    with pytest.raises(LogError, match="no run has 20 rows"):
+    with pytest.raises(LogError, match="column left has a number in no row"):
         of([f"{i},,,{i}," for i in range(100)])
+    with pytest.raises(LogError, match="no run has 20 rows"):
+        of([f"{i},{i},{i},{i},{i}" for i in range(100)])
 
 
 def test_four_wheels_are_the_means_of_two_sides() -> None:

@@ -51,6 +51,8 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"t,left,right\n1,2,3\n", "nothing to compare the wheels with"),
         (b"t,fr,fl,rr,yaw_rate\n1,2,3,4,5\n", "no column left, right"),
         (b"t,left,right,yawrate\n1,2,3,4\n", "is yawrate it?"),
+        (b"timestamp,left,right,yaw_rate\n1,2,3,4\n", "is timestamp it? rename it t"),
+        (b"t left right yaw_rate\n1 2 3 4\n", "without commas"),
         (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left is there twice"),
         (HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is no number'),
         (HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
@@ -78,6 +80,16 @@ def test_what_is_no_measurement_counts_as_missing_and_is_told() -> None:
     table = read(HEADER + b"1,1e300,inf,nan\n2,1,1,1\n")
     assert np.isnan(table.columns["left"][0])
     assert np.isnan(table.columns["right"][0])
+    assert len(table.notes) == 2
+
+
+def test_a_spike_counts_as_missing_and_a_fast_drive_does_not() -> None:
+    lines = [f"{i},{i % 10},{i % 10},0.1" for i in range(200)]
+    lines[70] = "70,900,5,-40"
+    table = read(HEADER + "\n".join(lines).encode())
+    assert np.flatnonzero(np.isnan(table.columns["left"])).tolist() == [70]
+    assert np.flatnonzero(np.isnan(table.columns["yaw_rate"])).tolist() == [70]
+    assert not np.isnan(table.columns["right"]).any()
     assert len(table.notes) == 2
 
 

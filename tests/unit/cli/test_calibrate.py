@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from acsard.cli import calibrate
 from acsard.config.parsing import parse
@@ -98,6 +99,29 @@ def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
     args = parser.parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
     with pytest.raises(ExitError, match="correct --log"):
         args.main(args)
+
+
+@pytest.mark.parametrize("what", ["a bag", "an MCAP of others"])
+def test_what_ros_records_is_told_to_be_exported(
+    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "bag"
+    if what == "a bag":
+        log.mkdir()
+    else:
+        with log.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("ros2", "libmcap")
+            schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", b"")
+            channel = writer.register_channel("/odom", "cdr", schema)
+            writer.add_message(channel, 1, b"\0\1\0\0", 1)
+            writer.finish()
+    parser = argparse.ArgumentParser()
+    calibrate.add(parser.add_subparsers())
+    args = parser.parse_args(["calibrate", "--json", "--log", str(log)])
+    with pytest.raises(ExitError, match="export it as CSV"):
+        args.main(args)
+    assert "export it as CSV" in json.loads(capsys.readouterr().out)["refused"]
 
 
 @pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])

@@ -373,6 +373,28 @@ def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_oversh
         assert min(start, goal) - EPS <= after <= max(start, goal) + EPS
 
 
+def test_with_jerk_an_acceleration_that_is_lowered_on_the_way_holds_at_once() -> None:
+    one = limiter(JERKY)
+    followed(one, Twist(1.0, 0.0), 30)
+    one.use(msgspec.structs.replace(JERKY, linear_acceleration=0.3))
+    before = one.twist.linear
+    assert one.follow(Twist(1.0, 0.0), DT).linear <= before + 0.3 * DT + EPS
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_with_jerk_what_braked_hard_through_zero_speeds_up_no_faster_than_it_may(
+    sign: float,
+) -> None:
+    harder = msgspec.structs.replace(JERKY, linear_deceleration=2.51)
+    one = moving(sign, 0.0, harder)
+    for _ in range(200):
+        before = one.twist.linear
+        now = one.follow(Twist(-sign, 0.0), DT).linear
+        if before * sign <= 0.0:
+            assert abs(now - before) <= harder.linear_acceleration * DT + EPS
+    assert one.twist.linear == pytest.approx(-sign)
+
+
 def test_jerk_is_no_limit_when_it_is_zero() -> None:
     limits = msgspec.structs.replace(FREE, linear_jerk=0.0)
     assert limiter(limits).follow(Twist(1.0, 0.0), DT).linear == pytest.approx(0.01)

@@ -277,11 +277,11 @@ def drive(case: Case, seed: int, seconds: float) -> Host:
     if case.prompted:
         _prompted(host)
     else:
-        _reporting(host)
+        reporting(host)
     return host
 
 
-def _reporting(host: Host) -> None:
+def reporting(host: Host) -> None:
     """The MCU makes a line every period of its own clock, and divides by the nominal one."""
     arrivals: deque[tuple[float, bytes]] = deque()
     period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))

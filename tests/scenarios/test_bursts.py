@@ -1,0 +1,65 @@
+"""Bursts of lost lines in a drive of 450 m, from the simulated wheels to `state`, with counts.
+
+pytest -s -m soak tests/scenarios/test_bursts.py
+
+What plain lines make of the same is in `unit/mcu/test_bursts.py`.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from acsard.config.settings import Config, McuConfig, SimConfig
+from tests.scenarios.world import World
+
+COUNTS = 3200
+EVERY_S = 30.0
+
+
+def drive(seed: int, seconds: float) -> tuple[float, float, int]:
+    """m by which the pose is off in the end, m that were driven, and lines that were lost."""
+    mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
+    made = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))
+    chance = random.Random(seed)
+    made.run(1.5)
+    made.drive(0.0, 0.0, 0.2)
+    burst, lost = chance.uniform(1.0, min(EVERY_S, seconds) / 2), 0
+    begun = made.now_ns
+    while (now := (made.now_ns - begun) / 1e9) < seconds:
+        linear, angular = chance.uniform(0.6, 1.0), chance.uniform(-1.0, 1.0)
+        if now >= burst:
+            length, before = (
+                chance.choice((0.1, 0.2, 0.3, 0.4, 0.5)),
+                made.loop.robot.session.good_lines,
+            )
+            with made.mcu.lost_replies(1):
+                made.hold(linear, angular, length)
+            lost += round(100 * length) - (made.loop.robot.session.good_lines - before)
+            burst += chance.uniform(0.8, 1.2) * EVERY_S
+            made.drive(linear, angular, 0.5)
+        made.hold(linear, angular, chance.uniform(0.5, 3.0))
+    made.hold(0.0, 0.0, 1.5)
+    told, true = made.state, made.mcu.vehicle.pose
+    return math.dist((told.x, told.y), (true.x, true.y)), made.loop.robot.travelled, lost
+
+
+@pytest.mark.parametrize(
+    ("seconds", "seeds"),
+    [
+        pytest.param(30.0, 1, marks=pytest.mark.slow, id="20 m"),
+        pytest.param(620.0, 5, marks=[pytest.mark.soak, pytest.mark.timeout(600)], id="450 m"),
+    ],
+)
+def test_with_the_mcu_s_counts_bursts_cost_a_centimetre_at_most(seconds: float, seeds: int) -> None:
+    drives = [drive(seed, seconds) for seed in range(seeds)]
+    off, metres, lost = (sum(column) / seeds for column in zip(*drives, strict=True))
+    print(
+        f"\nbursts of 0.1 to 0.5 s, counts: {1e3 * off:.1f} mm off after {metres:.0f} m, "
+        f"{lost:.0f} lines lost"
+    )
+    assert lost > 10
+    assert metres > 0.6 * seconds
+    assert off <= 0.01
