@@ -9,7 +9,7 @@ const SPAN = 60000;
 const ROOM = 44;
 
 // Dash and shift of each line, px. Drawn in this order, of four that lie on each other each is seen.
-const LOOKS = [[[], 0], [[8, 8], 0], [[2, 6], 0], [[2, 14], 4]];
+const LOOKS = [[[], 0], [[12, 12], 0], [[4, 8], 0], [[5, 19], 5]];
 
 export class Plot {
   #canvas;
