@@ -282,6 +282,11 @@ COMMANDS: dict[str, How] = {
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
+    "acsard web --connect tls/router.local:7447 --tls clients/robot1 --id robot1": Elsewhere(
+        "tests/system/test_web_others.py",
+        "test_another_robot_is_followed_and_stopped_and_only_that",
+        "by a router on loopback",
+    ),
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
     # deploy/ros2

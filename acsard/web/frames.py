@@ -85,6 +85,7 @@ class Call(_Frame, frozen=True):
     call: Short
     id: int | Short = 0
     payload: dict[str, Any] = {}
+    robot: Short = ""
 
 
 class Ping(_Frame, frozen=True):

@@ -117,6 +117,18 @@ _RECORDING: Described = {
     },
 }
 
+_REPORT: Described = {
+    "type": "object",
+    "required": ["report"],
+    "properties": {
+        "report": {"type": "string", "enum": ["drawing", "busy", "ready", "failed"]},
+        "text": {"type": "string", "description": "why it failed, or what to wait for"},
+        "percent": {"type": "integer"},
+        "seconds": {"type": "number", "description": "since it was begun"},
+        "href": {"type": "string", "description": "where it is, from the page on"},
+    },
+}
+
 _SETTING: Described = {
     "type": "object",
     "required": ["key", "value", "what", "when"],
@@ -162,6 +174,29 @@ _OTHERS: Described = {
             "parameters": [_NAME],
             "responses": {
                 "200": _answer("MCAP.", {}, "application/octet-stream"),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/api/recordings/{name}/report": {
+        "post": {
+            "summary": "draws its report, or says how far that is: ask again; for who is at least "
+            "operator",
+            "parameters": [_NAME],
+            "responses": {
+                "200": _answer("It is at `href`.", _REPORT),
+                "202": _answer("It is being drawn, or another one is.", _REPORT),
+                "503": _answer("It cannot be drawn, and why.", _REPORT),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/report/{name}": {
+        "get": {
+            "summary": "the report, once it is drawn; for who is at least operator",
+            "parameters": [_NAME],
+            "responses": {
+                "200": _answer("A page.", {"type": "string"}, "text/html"),
                 "default": _TROUBLE,
             },
         }

@@ -74,7 +74,7 @@ class Viewer:
         self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts)
-        self._keys = Keys(self._out, robots, self._start)
+        self._keys = Keys(self._out, robots, self._start, who.token or who.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
@@ -192,7 +192,7 @@ class Viewer:
 
     async def _answer(self, frame: Call) -> None:
         try:
-            reply = await self._calls.call(self.who, frame.call, frame.payload)
+            reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
             ok, text = reply.success, reply.message
         except RefusedError as error:
             self._counts.refuse("role" if error.role else "malformed")
@@ -245,7 +245,7 @@ class Viewer:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
-            self._out.say({"fleet": self._fleet.rows()})
+            self._out.say({"fleet": self._fleet.rows(), "note": self._fleet.note})
         return now + LOOK_S
 
     def _start(

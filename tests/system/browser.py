@@ -32,11 +32,12 @@ NAME = socket.gethostname()
 class Page(Program):
     """`acsard web` beside a daemon: by HTTP, and by HTTPS as others reach it."""
 
-    def __init__(self, daemon: Daemon, where: Path, *words: str) -> None:
+    def __init__(self, daemon: Daemon, where: Path, *words: str, **more: str) -> None:
+        """`more` is for its environment."""
         plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
         self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{NAME}:{secure}"
         self.state, self.tls = where / "state", where / "tls"
-        self.env = environment(XDG_STATE_HOME=str(self.state))
+        self.env = environment(XDG_STATE_HOME=str(self.state), **more)
         self.told = ["--config", str(daemon.config), "--address", self.here]
         if self.tls.is_dir():
             self.told += ["--address", f"https://127.0.0.1:{secure}", "--tls", str(self.tls)]
@@ -57,11 +58,13 @@ class Page(Program):
         """A token."""
         return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
 
-    def client(self, token: str = "") -> aiohttp.ClientSession:
-        """A program that comes from elsewhere, with or without a token."""
+    def client(self, token: str = "", address: str = "127.0.0.1") -> aiohttp.ClientSession:
+        """A program that comes from elsewhere, with or without a token, by one of our addresses."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         told = {"Authorization": f"Bearer {token}"} if token else {}
-        connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0)
+        connector = aiohttp.TCPConnector(
+            resolver=_Here(), ssl=trusted, limit=0, local_addr=(address, 0)
+        )
         return aiohttp.ClientSession(connector=connector, headers=told)
 
     def refused(self) -> dict[str, float]:

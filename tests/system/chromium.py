@@ -38,8 +38,8 @@ PHONE, DESKTOP = (390, 844), (1280, 800)
 class Browser:
     """One page in a process of its own; calls come from the test's thread."""
 
-    def __init__(self, where: Path) -> None:
-        self._where = where
+    def __init__(self, where: Path, *options: str) -> None:
+        self._where, self._options = where, options
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self._number = 0
@@ -52,7 +52,13 @@ class Browser:
     def start(self) -> None:
         """Until it can be spoken to."""
         assert CHROMIUM is not None
-        words = [CHROMIUM, *OPTIONS, f"--user-data-dir={self._where}", "about:blank"]
+        words = [
+            CHROMIUM,
+            *OPTIONS,
+            *self._options,
+            f"--user-data-dir={self._where}",
+            "about:blank",
+        ]
         self.process = subprocess.Popen(
             words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )
@@ -178,10 +184,10 @@ class Browser:
 
 
 @contextmanager
-def browsing() -> Iterator[Browser]:
-    """A browser of its own, killed in the end."""
+def browsing(*options: str) -> Iterator[Browser]:
+    """A browser of its own, killed in the end; `options` are of its command line."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as where:
-        browser = Browser(Path(where))
+        browser = Browser(Path(where), *options)
         try:
             browser.start()
             yield browser

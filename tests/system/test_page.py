@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from tests.system.browser import Page
+from acsard.lan.authority import Authority
+from tests.system.browser import NAME, Page
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until
@@ -426,3 +428,109 @@ def test_what_strangers_write_is_text(page: Phone) -> None:
     page.shows("happened", "refused")
     assert page.browser.js("document.querySelectorAll('#happened img').length") == 0
     assert page.browser.js("document.title") == "acsar"
+
+
+def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
+    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [NAME], 1)
+    settings = {"record": {"directory": str(tmp_path / "record")}}
+    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
+    with Daemon(tmp_path, config=settings) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as server, browsing(*there) as browser:
+            page = Phone(daemon, bus, server, browser)
+            browser.size(*PHONE)
+            browser.open(f"{server.away}/#token={server.invite('viewer', 'tv')}")
+            page.shows("role", "viewer")
+            page.shows("mode", "READY")
+            off = "one => [one.disabled || one.getAttribute('aria-disabled') === 'true', one.title]"
+            told = browser.js(f"[...document.querySelectorAll('[data-least]')].map({off})")
+            assert len(told) >= 6
+            assert {tuple(one) for one in told} == {(True, "for who is operator; you are viewer")}
+            page.shows("barred", "for who is operator; you are viewer")
+            page.shows("told", "you may watch and stop")
+            browser.tap("tab-events")
+            page.shows("recordings", "download and report are for who is operator")
+            assert (
+                browser.js("document.querySelectorAll('#recordings a, #recordings button').length")
+                == 0
+            )
+            browser.tap("stop")
+            until(lambda: bus.state()["mode"] == "stopped", 5.0, "a viewer stops")
+            page.shows("reason", "an operator clears it")
+
+
+REPORT = """(() => {
+    const tried = {};
+    try { tried.cookie = document.cookie; } catch (error) { tried.cookie = error.name; }
+    try { tried.opener = String(window.opener); } catch (error) { tried.opener = error.name; }
+    return fetch('API', {credentials: 'include'}).then(one => one.status, error => error.name)
+        .then(told => ({...tried, fetched: told, origin: self.origin}));
+})()"""
+
+
+def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_nor_interface(
+    tmp_path: Path, browser: Browser
+) -> None:
+    settings = {"record": {"directory": str(tmp_path / "record")}}
+    with Daemon(tmp_path, config=settings) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as server:
+            page = Phone(daemon, bus, server, browser)
+            browser.size(*PHONE)
+            browser.open(server.here)
+            page.shows("mode", "READY")
+            browser.tap("tab-events")
+            page.shows("recordings", "Report")
+            button = "document.querySelector('#recordings button')"
+            assert "Report of 000001" in browser.js(f"{button}.getAttribute('aria-label')")
+            browser.js(f"{button}.click()")
+            page.shows("recordings", "being drawn")
+            opened = "document.querySelector('#recordings a[target=_blank]')"
+            until(lambda: browser.js(f"Boolean({opened})"), 60.0, "a report")
+            # In the place of our page, since one page is what the test looks at.
+            browser.open(browser.js(f"{opened}.href"))
+            drawn = "document.querySelectorAll('.js-plotly-plot').length"
+            until(lambda: browser.js(drawn) == 7, 30.0, "pictures")
+            told = browser.js(REPORT.replace("API", f"{server.here}/api/whoami"))
+            assert told["cookie"] == "SecurityError"
+            assert told["fetched"] == "TypeError"
+            assert told["origin"] == "null"
+
+
+def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page: Phone) -> None:
+    browser = page.browser
+    browser.size(*DESKTOP, touch=False)
+    browser.tap("tab-status")
+    rows = "[...document.querySelectorAll('#plot-wheels + .legend > span')]"
+    legend = f"{rows}.map(one => one.textContent)"
+    values = r"^(front right|front left|rear left|rear right) .?\d+\.\d\d$"
+    until(lambda: all(re.match(values, one) for one in browser.js(legend)), 10.0, "values")
+    assert len(browser.js(legend)) == 4
+    # Standing still all four are zero: each has its colour somewhere on the line.
+    until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
+
+
+SEEN = """(() => {
+    const canvas = document.getElementById('plot-wheels'), paper = canvas.getContext('2d');
+    const {width, height} = canvas, style = getComputedStyle(document.documentElement);
+    const {data} = paper.getImageData(0, 0, width, height), found = new Set();
+    for (let n = 0; n < data.length; n += 4)
+        if (data[n + 3] === 255) found.add([data[n], data[n + 1], data[n + 2]].join());
+    const wanted = [0, 1, 2, 3].map(n => {
+        paper.fillStyle = style.getPropertyValue(`--w${n}`).trim();
+        const [, r, g, b] = /#(..)(..)(..)/.exec(paper.fillStyle);
+        return [r, g, b].map(one => parseInt(one, 16)).join();
+    });
+    return new Set(wanted.filter(one => found.has(one))).size;
+})()"""
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+def test_the_signs_of_the_map_are_explained(page: Phone, size: tuple[int, int]) -> None:
+    page.browser.size(*size, touch=size == PHONE)
+    for name, word in (("recentre", "Follow"), ("erase", "Erase")):
+        button = f"document.getElementById({name!r})"
+        label = page.browser.js(f"{button}.getAttribute('aria-label')")
+        assert label == page.browser.js(f"{button}.title")
+        assert label.startswith(word)
+        assert (word in page.browser.js(f"{button}.innerText")) is (size == DESKTOP)

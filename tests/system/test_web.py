@@ -161,6 +161,60 @@ def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemo
     run(story)
 
 
+async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
+    """The first recording, and what becomes of its report."""
+    async with session.get("/api/recordings") as answer:
+        name = (await answer.json())[0]["name"]
+    async with asyncio.timeout(2 * PATIENCE_S):
+        while True:
+            async with session.post(f"/api/recordings/{name}/report") as answer:
+                told = await answer.json()
+            if answer.status != 202:
+                return name, {"status": answer.status, **told}
+            assert told["report"] == "drawing"
+            await asyncio.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
+    page: Page, bus: Bus
+) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            name, told = await drawn(session)
+            assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
+            bodies = set()
+            for packing in ("gzip", "identity"):
+                asked = {"Accept-Encoding": packing}
+                async with session.get(f"/report/{name}", headers=asked) as answer:
+                    policy = answer.headers["Content-Security-Policy"]
+                    bodies.add(await answer.text())
+            (body,) = bodies
+            assert body.startswith("<!DOCTYPE html>")
+            assert "Plotly" in body
+            assert "sandbox allow-scripts;" in policy
+            assert "allow-same-origin" not in policy
+            assert "default-src 'none'" in policy
+
+    run(story)
+
+
+@pytest.mark.slow
+def test_without_its_library_a_report_is_refused_with_what_to_type(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
+
+    async def story() -> None:
+        async with aiohttp.ClientSession(without.here) as session:
+            _, told = await drawn(session)
+            assert (told["status"], told["report"]) == (503, "failed")
+            assert re.search("needs the library plotly; run: .*pip install.*report", told["text"])
+
+    with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
+        run(story)
+
+
 @pytest.mark.slow
 def test_the_example_of_the_page_drives_as_pasted(page: Page, bus: Bus) -> None:
     text = (ROOT / "deploy/web/README.md").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import socket
 import time
@@ -15,9 +16,10 @@ import pytest
 from yarl import URL
 
 from acsard.lan.authority import Authority
+from acsard.web.limits import CONNECTIONS_OF_TOKEN
 from acsard.web.requests import BODY_S
 from tests.system.browser import NAME, Page, hands, run
-from tests.system.harness import PATIENCE_S, Bus, Daemon, resident_kb
+from tests.system.harness import PATIENCE_S, Bus, Daemon, resident_kb, until
 
 pytestmark = pytest.mark.network
 
@@ -151,6 +153,15 @@ TABLE: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
     "a token in JSON that is none": (
         "away", "/token", {"method": "POST", "data": b"{\xff",
         "headers": {"Content-Type": "application/json"}}, 400, "malformed"),
+    "a viewer who has a recording drawn": (
+        "away", "/api/recordings/x.mcap/report", {"token": "viewer", "method": "POST"}, 403,
+        "role"),
+    "a viewer at a report": ("away", "/report/x.mcap", {"token": "viewer"}, 403, "role"),
+    "another page's link to a report": (
+        "here", "/report/x.mcap", {"headers": {"Sec-Fetch-Site": "cross-site"}}, 403, "origin"),
+    "a report that nobody drew": ("here", "/report/x.mcap", {}, 404, "path"),
+    "a report of a file upwards": (
+        "here", "/api/recordings/..%2f..%2fetc%2fpasswd/report", {"method": "POST"}, 404, "path"),
     "a path upwards": ("here", "/page/../app.py", {}, 404, "path"),
     "a path upwards, encoded": ("here", "/page/%2e%2e%2fapp.py", {}, 404, "path"),
     "a recording upwards": ("here", "/api/recordings/..%2f..%2fetc%2fpasswd", {}, 404, "path"),
@@ -295,6 +306,97 @@ def test_an_address_has_room_for_twenty_pages(page: Page, bus: Bus) -> None:
             assert caught.value.status == 503
 
     run(story)
+
+
+def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(
+    page: Page, bus: Bus, operator: str
+) -> None:
+    shared = page.invite("viewer", "class")
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            opened = 0
+            for n in range(CONNECTIONS_OF_TOKEN + 5):
+                session = page.client(shared, f"127.0.0.{2 + n % 5}")
+                await stack.enter_async_context(session)
+                with suppress(aiohttp.WSServerHandshakeError):
+                    await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
+                    opened += 1
+            assert opened == CONNECTIONS_OF_TOKEN
+            async with hands(page, operator) as ours:
+                assert (await ours.call("stop"))["ok"]
+
+    run(story)
+
+
+def test_one_who_follows_all_that_he_can_leaves_others_theirs(
+    page: Page, bus: Bus, viewer: str, operator: str
+) -> None:
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            refused = 0
+            for n in range(8):
+                greedy = await stack.enter_async_context(hands(page, viewer))
+                for k in range(30):
+                    await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
+                await greedy.say(subscribe="state")
+                await greedy.say(ping=n)
+                await greedy.find(lambda said: "pong" in said)
+                refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
+            assert refused == 7  # of 50 the second connection had the last 20
+            ours = await stack.enter_async_context(hands(page, operator))
+            await ours.say(subscribe="state", robot="r9")
+            await ours.say(subscribe="state")
+            await ours.state(lambda state: state["mode"])
+            await ours.say(ping=1)
+            await ours.find(lambda said: "pong" in said)
+            assert not [one for one in ours.heard if "refused" in one]
+
+    run(story)
+
+
+def test_what_is_no_request_is_refused_in_words_like_the_rest(page: Page, bus: Bus) -> None:
+    counted = page.refused()
+    port = int(page.here.rpartition(":")[2])
+    for said, reason, words in [
+        (b"GET /api/state HTTP/1.1\r\n\r\n", "host", "no `Host`"),
+        (b"\x16\x03\x01\x00\x00 hello\r\n\r\n", "malformed", "no HTTP request"),
+    ]:
+        with socket.create_connection(("127.0.0.1", port), 30.0) as held:
+            held.sendall(said)
+            head, _, body = held.makefile("rb").read().partition(b"\r\n\r\n")
+        assert head.split()[1] == b"400", head
+        assert b"application/json" in head
+        assert b"nosniff" in head
+        assert words in json.loads(body)["error"]
+        assert page.refused()[reason] == counted.get(reason, 0) + 1
+    assert "Traceback" not in page.stderr
+
+
+def test_what_is_refused_is_a_line_a_second_in_the_log_by_reason_and_never_with_a_token(
+    page: Page, bus: Bus
+) -> None:
+    def lines() -> list[dict[str, Any]]:
+        told = [json.loads(line) for line in list(page.err) if line.startswith("{")]
+        return [one for one in told if one["event"] == "page_refused"]
+
+    def counted(reason: str) -> int:
+        texts = " ".join(one["text"] for one in lines())
+        return sum(int(count) for count in re.findall(rf"(\d+) {reason}", texts))
+
+    before, told, begun = counted("bad token"), len(lines()), time.monotonic()
+    guessed = "guessed-" + "x" * 35
+
+    async def story() -> None:
+        async with page.client(guessed) as session:
+            for _ in range(5):
+                async with session.get(f"{page.away}/api/state") as answer:
+                    assert answer.status in (401, 429)
+
+    run(story)
+    until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all are told")
+    assert len(lines()) - told <= time.monotonic() - begun + 1.0
+    assert "guessed" not in page.stderr
 
 
 def test_who_announces_a_body_and_keeps_it_is_sent_away(page: Page, daemon: Daemon) -> None:
