@@ -1,6 +1,7 @@
 // The page: one link, one hand, and the views.
 
 import { Drive, SOURCE } from "./drive.js";
+import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
@@ -16,6 +17,7 @@ const LATCHED = ["stopped", "fault"];
 const link = new Link();
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const plots = {
   speed: new Plot($("plot-speed"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.1, high: 0.3 }),
@@ -42,6 +44,7 @@ function open(name) {
   followed("fleet", 2, view === "robots");
   if (view === "events") listed();
   if (view === "set") configured();
+  if (view === "set") guided();
   map.redraw();
 }
 
@@ -52,6 +55,7 @@ function followed(key, rate, wanted) {
 
 async function stop() {
   drive.release();
+  guide.leave();
   const told = await link.call("stop");
   views.alarm(told.ok ? "" : `STOP: ${told.text}`);
 }
@@ -93,6 +97,10 @@ async function configured() {
   const rows = await got("api/settings");
   if (rows.error) return views.text("set-told", rows.error);
   settings.show(rows);
+}
+
+async function guided() {
+  guide.choices(await got("api/guide"));
 }
 
 function limited() {
@@ -175,6 +183,7 @@ link.addEventListener("key:events", ({ detail }) => views.happened($("happened")
 link.addEventListener("path", ({ detail }) => map.trail(detail.path));
 link.addEventListener("fleet", ({ detail }) => views.cards($("cards"), detail.fleet));
 link.addEventListener("refused", ({ detail }) => {
+  if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
   const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
   views.text("told", why || detail.reason);
 });
