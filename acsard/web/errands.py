@@ -6,15 +6,17 @@ of a few, or a plain key.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 
 from msgspec import Struct
 
 from acsard.calibration.guided.needs import NEEDS
 from acsard.web.frames import Begin, FrameError
-from acsard.web.openapi import PLAIN
 
 POSITIONS = "positions"
+
+KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/-]{0,79}\Z")
 
 
 class Reach(Struct, frozen=True):
@@ -48,7 +50,7 @@ def _way(begin: Begin) -> list[str]:
         raise FrameError("begin", f"way is one of {', '.join(NEEDS)}")
     if (begin.way == POSITIONS) != bool(begin.positions):
         raise FrameError("begin", "positions is the key that they come on, with the way positions")
-    if begin.positions and not PLAIN.match(begin.positions):
+    if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "positions is a key like sim/pose: letters, digits, _ / -")
     options = {"way": begin.way, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]

@@ -139,8 +139,7 @@ class Guide:
 
     async def _live(self, errand: _Errand, asked: Begin) -> None:
         try:
-            ports = [one.port for one in (await self.choices()).ports]
-            code, text = await errand.run(words(asked, self._reach, ports))
+            code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
         except (FrameError, OSError, TimeoutError) as error:
             code, text = int(Exit.USAGE), str(error) or "the list of serial ports does not come"
         finally:
@@ -148,6 +147,11 @@ class Guide:
         meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
         errand.say({"guide": {"ended": code, "meaning": meaning, "text": text}})
         self._tell_all()
+
+    async def _ports(self, asked: Begin) -> list[str]:
+        if asked.begin != "check":
+            return []
+        return [one.port for one in (await self.choices()).ports]
 
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():
@@ -265,4 +269,6 @@ class _Errand:
 
     def _words(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()
+        if self.left and lines[-1:] == ["KeyboardInterrupt"]:
+            return ""  # it was about to start
         return "\n".join(line.removeprefix("acsard: ") for line in lines).strip()

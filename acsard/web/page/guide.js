@@ -17,6 +17,7 @@ export class Guide {
   #running = false; // ours
   #question = null;
   #rides = false; // a leg: a key stops it
+  #busy = ""; // who else goes through one
 
   constructor(link) {
     this.#link = link;
@@ -40,7 +41,7 @@ export class Guide {
 
   /** What may be begun, as `api/guide` says; or why nothing. */
   choices({ ways, ports, note, error }) {
-    text("guide-note", error ?? note);
+    text("guide-note", [error ?? note, this.#busy].filter(Boolean).join(" "));
     for (const id of ["check-card", "calibrate-card"]) $(id).hidden = Boolean(error);
     if (error) return;
     options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
@@ -80,7 +81,8 @@ export class Guide {
 
   #runs({ running, by, yours }) {
     for (const id of ["check", "calibrate"]) $(id).disabled = Boolean(running);
-    text("guide-note", running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "");
+    this.#busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
+    text("guide-note", this.#busy);
     if (!running || !yours) return;
     this.#running = true;
     $("errands").hidden = true;

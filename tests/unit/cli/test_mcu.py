@@ -231,6 +231,12 @@ def test_progress_does_not_go_into_a_pipe(
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
+def test_yes_and_a_program_that_asks_are_not_both(tmp_path: Path) -> None:
+    with pytest.raises(ExitError, match="--json-lines") as end:
+        called(tmp_path, "--port", "sim", "--yes", "--json-lines")
+    assert end.value.code == Exit.USAGE
+
+
 def test_the_end_of_the_input_ends_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     with pytest.raises(KeyboardInterrupt):
