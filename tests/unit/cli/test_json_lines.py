@@ -6,9 +6,10 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
@@ -21,7 +22,7 @@ from acsard.cli.json_lines import LINE_BYTES, JsonAttendant, JsonLines, JsonPers
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
-Answers = Sequence[object]
+Talking = TypeVar("Talking", bound=JsonLines)
 
 
 class Program:
@@ -30,13 +31,10 @@ class Program:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked, self._to_child = os.pipe()
         self._from_child, told = os.pipe()
-        self._ends = [os.fdopen(asked), os.fdopen(told, "w")]
-        monkeypatch.setattr("sys.stdin", self._ends[0])
-        monkeypatch.setattr("sys.stdout", self._ends[1])
+        self._asked, self._told = os.fdopen(asked), os.fdopen(told, "w")
+        monkeypatch.setattr("sys.stdin", self._asked)
         self.said: list[dict[str, Any]] = []
         self.answers: list[object] = []
-        self.behind = b""
-        """Goes out with each answer, at once."""
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
 
@@ -44,20 +42,25 @@ class Program:
         lines = b"".join(json.dumps(one).encode() + b"\n" for one in messages)
         os.write(self._to_child, raw + lines)
 
+    @contextmanager
+    def hears(self, person: Talking) -> Iterator[Talking]:
+        """All that this one tells on standard output."""
+        with redirect_stdout(self._told), person:
+            yield person
+
     def hang_up(self) -> None:
         os.close(self._to_child)
         self._to_child = -1
 
     def close(self) -> None:
-        for end in self._ends:
+        for end in (self._asked, self._told):
             end.close()
         self._thread.join()
-        os.close(self._from_child)
         if self._to_child >= 0:
             self.hang_up()
 
     def _live(self) -> None:
-        with os.fdopen(os.dup(self._from_child)) as lines:
+        with os.fdopen(self._from_child) as lines:
             for line in lines:
                 said = json.loads(line)
                 self.said.append(said)
@@ -66,13 +69,12 @@ class Program:
                     if callable(value):
                         value(said["question"])
                     else:
-                        answer = {"answer": said["question"], "value": value}
-                        self.say(answer, raw=b"")
-                        if self.behind:
-                            os.write(self._to_child, self.behind)
+                        self.say({"answer": said["question"], "value": value})
 
     def told(self, name: str) -> list[Any]:
-        """What came under this name."""
+        """All that came under this name; nothing comes any more."""
+        self._told.close()
+        self._thread.join()
         return [one[name] for one in self.said if name in one]
 
 
@@ -85,7 +87,7 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
 
 def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Program) -> None:
     program.answers = ["far", 0.1, -2, None, "1,75"]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         assert person.number(DISTANCE) == 1.75
     assert program.told("question") == [1, 2, 3, 4, 5]
     assert program.told("wrong") == ["a number of m from 0.5 to 3"] * 4
@@ -96,14 +98,14 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Progra
 
 def test_no_value_is_what_is_usual(program: Program) -> None:
     program.answers = [None]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         assert person.number(OPTIONAL) == 0.0
     assert program.said[0]["usual"] == 0.0
 
 
 def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program: Program) -> None:
     program.answers = ["go", "start"]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         program.say({"key": True})
         person.start("Go.", by_key=True)
         assert person.keys(0.05) == ""
@@ -117,7 +119,7 @@ def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:
         program.say({"answer": number, "value": "start"}, {"key": True})
 
     program.answers = [both]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         person.start("Go.")
         assert person.keys(5.0) == " "
         assert person.keys(0.01) == ""
@@ -130,7 +132,7 @@ def test_what_is_no_answer_to_what_is_asked_leaves_the_question_open(program: Pr
         program.say({"answer": number, "value": "start", "more": 1})
 
     program.answers = [noise]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         person.start("Go.")
     assert program.told("question") == [1]
 
@@ -141,13 +143,13 @@ def interrupted(program: Program, do: Callable[[], object]) -> None:
 
 
 def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Program) -> None:
-    with JsonPerson() as person:
+    with program.hears(JsonPerson()) as person:
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
 
 
 def test_a_line_without_an_end_ends_it(program: Program) -> None:
-    with JsonPerson() as person:
+    with program.hears(JsonPerson()) as person:
 
         def flood(number: int) -> None:
             for _ in range(LINE_BYTES // 4096 + 1):
@@ -163,7 +165,7 @@ def test_silence_ends_what_moves_and_signs_of_life_do_not(
     monkeypatch.setattr(json_lines, "HEARD_S", 0.25)
     monkeypatch.setattr(json_lines, "LISTEN_S", 0.02)
     program.answers = ["start"]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         person.start("Go.")
         for _ in range(10):
             program.say({})
@@ -182,21 +184,19 @@ def test_a_question_waits_for_a_person_for_as_long_as_he_takes(
         threading.Timer(0.3, program.say, [{"answer": number, "value": 1.0}]).start()
 
     program.answers = ["start", late]
-    with JsonAttendant() as person:
+    with program.hears(JsonAttendant()) as person:
         person.start("Go.")
         assert person.number(DISTANCE) == 1.0
 
 
 def test_what_is_found_is_told_as_it_is_made_with_how_far_it_is(program: Program) -> None:
-    with JsonPerson() as person:
+    with program.hears(JsonPerson()) as person:
         person.begin("port sim", simulated=True)
         person.say("a motor turns")
         for _ in range(20):
             person.found(Finding("baud rate", "PASS", "115200 baud"))
-    program.close = lambda: None  # type: ignore[method-assign]
-    Program.close(program)
-    assert program.said[0] == {"subject": "port sim", "simulated": True}
     assert program.told("doing") == ["a motor turns"]
+    assert program.said[0] == {"subject": "port sim", "simulated": True}
     assert program.told("finding")[0]["figure"] == "115200 baud"
     shares = program.told("progress")
     assert shares == sorted(shares)
@@ -213,7 +213,7 @@ def test_the_lines_are_written_when_that_is_wanted(
     file = tmp_path / "acsard.toml"
     file.write_text("# mine\n")
     program.answers = [answer]
-    with JsonLines() as lines:
+    with program.hears(JsonLines()) as lines:
         assert lines.offer(str(file), OFFERED) == (answer == "write")
     assert str(file) in program.said[0]["words"]
     assert file.read_text().startswith("# mine\n")
@@ -226,11 +226,9 @@ def test_what_cannot_be_written_is_not_asked_for_and_says_why(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
     monkeypatch.setattr("acsard.cli.common.PLACES", (Path("acsard.toml"),))
-    with JsonLines() as lines:
+    with program.hears(JsonLines()) as lines:
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")
-    Program.close(program)
-    program.close = lambda: None  # type: ignore[method-assign]
     assert program.told("question") == []
     first, second = program.told("told")
     assert "no configuration file" in first
