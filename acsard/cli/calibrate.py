@@ -78,6 +78,8 @@ def main(args: argparse.Namespace) -> int:
     """Calibrate and tell."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
+    if args.yes:
+        raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
     from acsard.cli.json_lines import JsonAttendant
 
     with JsonAttendant() as lines:

@@ -105,8 +105,6 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         )
     if args.positions_at and not args.positions:
         raise UsageError("--positions-at says where --positions KEY is; give that as well")
-    if args.yes and args.json_lines:
-        raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(
             "calibrate drives the robot, and a person at the terminal starts and stops it: run it "

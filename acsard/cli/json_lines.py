@@ -93,7 +93,8 @@ class JsonLines:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._left = True
+        with self._news:
+            self._left = True
         self._reader.join()
 
     # out
@@ -204,12 +205,12 @@ class JsonLines:
             self._news.notify_all()
 
     def _end(self, why: str) -> None:
-        if self._left:
-            return
-        print(f"acsard: {why}", file=sys.stderr, flush=True)
         main = threading.main_thread().ident
         assert main is not None
-        signal.pthread_kill(main, signal.SIGINT)
+        with self._news:
+            if not self._left:
+                print(f"acsard: {why}", file=sys.stderr, flush=True)
+                signal.pthread_kill(main, signal.SIGINT)
 
 
 class JsonAttendant(JsonLines):
