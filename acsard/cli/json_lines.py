@@ -158,7 +158,8 @@ class JsonLines:
                 self._open = question.question
                 self._tell(question)
                 while self._open:
-                    self._news.wait()
+                    # Not for ever: a signal just before it begins to wait would not wake it.
+                    self._news.wait(LISTEN_S)
             try:
                 got = read(self._answer.value)
             except ValueError as error:

@@ -176,10 +176,14 @@ def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
 def test_who_is_not_heard_any_more_drives_no_more(page: Page, bus: Bus) -> None:
     async def story() -> None:
         async with guiding(page, pings=False) as guided:
-            await guided.begin("calibrate", way="umbmark")
-            await guided.answer(await guided.asks("How wide"), 300)
-            await guided.starts()
-            end = await guided.ended()
+            for _ in range(4):  # a busy machine may end it before
+                await guided.begin("calibrate", way="umbmark")
+                await guided.answer(await guided.asks("How wide"), 300)
+                await guided.starts()
+                end = await guided.ended()
+                if "nothing was heard" in end["text"]:
+                    break
+                await guided.says(lambda said: said.get("running") == "")
             assert f"nothing was heard for {HEARD_S:g} s" in end["text"]
             await beside(bus.at_rest)
 
