@@ -96,6 +96,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         listen,
         args.tls or config.bus.tls,
         tokens.place(),
+        args.config or "",
         next_port=args.held,
         held=args.held,
     )

@@ -19,6 +19,7 @@ from acsard.web.files import PAGE, Files
 from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
+from acsard.web.guide import Guide
 from acsard.web.hand import Hand
 from acsard.web.limits import FULL, Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
@@ -75,10 +76,12 @@ class Page:
         vault: Vault,
         names: frozenset[str],
         gate: Gate,
+        guide: Guide,
         page: Path = PAGE,
     ) -> None:
         """`names` are those by which the robot is reached from elsewhere, lower case."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
+        self._guide = guide
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
         self._files, self._reports = Files(page), Reports()
         self._programs = Programs(robots, calls, counts, self._reports)
@@ -101,6 +104,7 @@ class Page:
                 web.get("/report/{name}", self._report),
                 web.get("/api/whoami", self._whoami),
                 web.get("/api/settings", self._settings),
+                web.get("/api/guide", self._guided),
                 web.post("/api/srv/{verb}", self._service),
                 web.get("/api/{key:.+}", self._value),
                 web.get("/metrics", self._metrics),
@@ -230,7 +234,7 @@ class Page:
             keep_little(request)
             viewer = Viewer(
                 served, request, who, self._robots, self._hand, self._calls, self._fleet,
-                self._counts,
+                self._guide, self._counts,
             )  # fmt: skip
             self._viewers.add(viewer)
             try:
@@ -255,6 +259,9 @@ class Page:
 
     async def _settings(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.settings(_who(request))
+
+    async def _guided(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.guide(_who(request), self._guide)
 
     async def _value(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.value(_who(request), request.match_info["key"])

@@ -143,6 +143,25 @@ _SETTING: Described = {
     },
 }
 
+_CHOICES: Described = {
+    "type": "object",
+    "properties": {
+        "ways": {
+            "type": "object",
+            "description": "of calibrating, and what each needs",
+            "additionalProperties": {"type": "string"},
+        },
+        "ports": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {"port": {"type": "string"}, "what": {"type": "string"}},
+            },
+        },
+        "note": {"type": "string", "description": "what cannot be done here, and what to type"},
+    },
+}
+
 _OTHERS: Described = {
     "/api/whoami": {
         "get": {
@@ -157,6 +176,13 @@ _OTHERS: Described = {
                 "200": _answer("A list.", {"type": "array", "items": _SETTING}),
                 "default": _TROUBLE,
             },
+        }
+    },
+    "/api/guide": {
+        "get": {
+            "summary": "what the WebSocket takes to begin: ways to calibrate, ports to check; for "
+            "a maintainer",
+            "responses": {"200": _answer("Choices.", _CHOICES), "default": _TROUBLE},
         }
     },
     "/api/recordings": {

@@ -19,6 +19,7 @@ from acsard.values import AcsardError
 from acsard.web import metrics, openapi, recordings, settings
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
+from acsard.web.guide import Guide
 from acsard.web.reports import POLICY, Reports, State
 from acsard.web.robots import Robots
 from acsard.web.streams import as_json
@@ -65,6 +66,14 @@ class Programs:
         assert isinstance(told.body, bytes)
         rows = settings.rows(msgspec.json.decode(told.body))
         return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
+
+    async def guide(self, who: Who, guide: Guide) -> web.Response:
+        """What may be begun: a check of the board, a calibration."""
+        if not who.may("maintainer"):
+            self._counts.refuse("role")
+            raise TroubleError(403, f"checks and calibrations are for maintainers, not {who.role}")
+        body = msgspec.json.encode(await guide.choices())
+        return web.Response(body=body, content_type="application/json")
 
     async def value(self, who: Who, key: str) -> web.Response:
         """The last value of a key."""

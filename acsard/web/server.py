@@ -28,9 +28,11 @@ from acsard.host.parent import end_with_parent
 from acsard.web.app import Page
 from acsard.web.calls import Calls
 from acsard.web.counts import Counts
+from acsard.web.errands import Reach
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
+from acsard.web.guide import Guide
 from acsard.web.hand import SOURCE, Hand
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
@@ -91,6 +93,8 @@ class Wanted(Struct, frozen=True):
     """The directory of the robot's certificate, for who comes from elsewhere."""
     state: Path
     """The directory of the tokens."""
+    file: str = ""
+    """The configuration file that was named; "" is none."""
     next_port: bool = False
     """Take a later port where one is taken."""
     held: bool = False
@@ -154,7 +158,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
     hand = Hand(lambda: robots.client, counts)
     calls, fleet = Calls(robots), Fleet(robots)
     vault, gate = Vault(wanted.state), Gate(counts)
-    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, wanted.page)
+    guide = Guide(_reach(wanted), wanted.config.mcu.port)
+    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, guide, wanted.page)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S,
@@ -162,6 +167,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
     async with AsyncExitStack() as stack:
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
+        stack.push_async_callback(guide.close)
         places = [_bound(one, wanted.next_port) for one in wanted.listen]
         for one, bound in places:
             server = await asyncio.get_running_loop().create_server(
@@ -247,6 +253,11 @@ def _connected(address: Address) -> Client:
     """The way to the daemon; blocks."""
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, SOURCE, address.tls)
+
+
+def _reach(wanted: Wanted) -> Reach:
+    address = wanted.address
+    return Reach(wanted.file, address.endpoint, address.robot_id, address.tls)
 
 
 def _about(wanted: Wanted) -> About:

@@ -46,15 +46,18 @@ export class Link extends EventTarget {
     return true;
   }
 
+  /** The same whatever waits before it: what stops something. */
+  urge(message) {
+    if (this.open) this.#socket.send(JSON.stringify(message));
+  }
+
   /** Ask for a service (of another `robot`, if it is named); the answer, or why there is none. */
   call(verb, payload, robot) {
     const id = ++this.#number;
     return new Promise((done) => {
       const given = setTimeout(() => this.#answer({ answer: id, ok: false, text: "no answer within 3 s" }), 3000);
       this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
-      const message = { call: verb, payload, id, robot };
-      // Not by `send`: a stop goes whatever waits before it.
-      if (this.open) this.#socket.send(JSON.stringify(message));
+      if (this.open) this.urge({ call: verb, payload, id, robot });
       else this.#answer({ answer: id, ok: false, text: "no connection to the robot" });
     });
   }
@@ -93,7 +96,7 @@ export class Link extends EventTarget {
       if (message.pong === this.#asked) this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {

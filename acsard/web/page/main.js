@@ -1,6 +1,7 @@
 // The page: one link, one hand, and the views.
 
 import { Drive, SOURCE } from "./drive.js";
+import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
@@ -20,6 +21,7 @@ const LATCHED = ["stopped", "fault"];
 const link = new Link();
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "wished", colour: "--wished" }];
@@ -49,6 +51,7 @@ function open(name) {
   followed("fleet", 2, view === "robots");
   if (view === "events") listed();
   if (view === "set") configured();
+  if (view === "set") guided();
   map.redraw();
 }
 
@@ -59,6 +62,7 @@ function followed(key, rate, wanted) {
 
 async function stop() {
   drive.release();
+  guide.leave();
   const told = await link.call("stop", undefined, OTHER);
   views.alarm(told.ok ? "" : `STOP: ${told.text}`);
 }
@@ -100,6 +104,10 @@ async function configured() {
   const rows = await got("api/settings");
   if (rows.error) return views.text("set-told", rows.error);
   settings.show(rows);
+}
+
+async function guided() {
+  guide.choices(await got("api/guide"));
 }
 
 function limited() {
@@ -201,6 +209,7 @@ link.addEventListener("fleet", ({ detail }) => {
   views.text("fleet-note", detail.note);
 });
 link.addEventListener("refused", ({ detail }) => {
+  if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
   const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
   views.text("told", why || detail.reason);
 });
