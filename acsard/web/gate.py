@@ -8,6 +8,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from aiohttp.abc import AbstractAccessLogger
+from aiohttp.web import BaseRequest, StreamResponse
+
 from acsard.web.counts import Counts
 from acsard.web.limits import Places
 
@@ -18,6 +21,9 @@ REQUEST_S = 10.0
 """Whoever has not sent the whole head of a request by then is sent away."""
 
 Factory = Callable[[], asyncio.Protocol]
+
+NO_REQUEST = "UNKNOWN", 400
+"""Method and status by which aiohttp answers what it cannot read as HTTP."""
 
 
 class Gate:
@@ -43,6 +49,17 @@ class Gate:
 
     def closed(self, transport: asyncio.BaseTransport) -> None:
         self._doors.pop(transport, None)
+
+
+def counting(counts: Counts) -> type[AbstractAccessLogger]:
+    """What aiohttp is to tell of each request: it counts those that reach no handler of ours."""
+
+    class Counting(AbstractAccessLogger):
+        def log(self, request: BaseRequest, response: StreamResponse, time: float) -> None:
+            if (request.method, response.status) == NO_REQUEST:
+                counts.refuse("malformed")
+
+    return Counting
 
 
 class _Door(asyncio.Protocol):

@@ -29,7 +29,7 @@ from acsard.web.calls import Calls
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
-from acsard.web.gate import Gate
+from acsard.web.gate import Gate, counting
 from acsard.web.hand import SOURCE, Hand
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
@@ -154,8 +154,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
     vault, gate = Vault(wanted.state), Gate(counts)
     page = Page(robots, hand, calls, fleet, counts, vault, names, gate, wanted.page)
     runner = web.AppRunner(
-        page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
-        shutdown_timeout=LEAVE_S,
+        page.app, access_log_class=counting(counts), handle_signals=False,
+        keepalive_timeout=IDLE_S, shutdown_timeout=LEAVE_S,
     )  # fmt: skip
     async with AsyncExitStack() as stack:
         await runner.setup()
