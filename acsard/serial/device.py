@@ -46,7 +46,11 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
     """The port opened, locked for us alone, raw, flushed; raises OSError."""
-    device = _Device(baudrate=baud_rate, timeout=0, write_timeout=0, exclusive=True)
+    # With a time between bytes the driver is told to wait for one (VMIN = 1), so that a read which
+    # finds nothing is refused (EAGAIN), and one of nothing is a hang-up and nothing else.
+    device = _Device(
+        baudrate=baud_rate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
+    )
     device.port = path
     try:
         device.open()

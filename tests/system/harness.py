@@ -799,19 +799,31 @@ def waited_for_a_core(pid: int) -> float:
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
 
 
+def waits_for_a_core(pid: int) -> dict[int, float]:
+    """How long each thread of a process was ready and had no core, s."""
+    waits = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            waits[int(task.name)] = int((task / "schedstat").read_text().split()[1]) / 1e9
+        except OSError:
+            pass  # a thread that has ended meanwhile
+    return waits
+
+
 def kept_waiting(pid: int) -> float:
     """How long all threads of a process were ready and had no core, s: one may hold up the others.
 
     A process that has to pass its interpreter from thread to thread waits longer on a busy machine
     than a bystander that only looks at the clock.
     """
-    waits = 0
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        try:
-            waits += int((task / "schedstat").read_text().split()[1])
-        except OSError:
-            pass  # a thread that has ended meanwhile
-    return waits / 1e9
+    return sum(waits_for_a_core(pid).values())
+
+
+def held_up(before: dict[int, float], after: dict[int, float], pid: int) -> float:
+    """How long the machine may have kept the first thread, the control loop, between two looks, s:
+    it waited for a core itself, or for the interpreter, which the one had that waited longest."""
+    waits = {thread: waited - before.get(thread, 0.0) for thread, waited in after.items()}
+    return waits.pop(pid) + max(waits.values(), default=0.0)
 
 
 def silences(times: Sequence[float], longest: float = 0.2) -> float:

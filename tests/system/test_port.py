@@ -6,6 +6,7 @@ import asyncio
 import errno
 import itertools
 import os
+import select
 import termios
 import tty
 from collections.abc import Sequence
@@ -76,6 +77,36 @@ def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence
         in_time, late, again = asyncio.run(taken())
         assert in_time == again == []
         assert [one.data for one in late] == [GO]
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_no_hang_up() -> None:
+    """What lay there when the loop looked is taken by the step; the reader is called even so."""
+
+    async def kept() -> tuple[int, bool, str]:
+        async with SerialPort(
+            path, 115200, STOP, PERIOD_NS, lambda: None, lambda event: None
+        ) as port:
+            loop, taken = asyncio.get_running_loop(), list[bytes]()
+
+            def late_step() -> None:
+                taken.extend(one.data for one in port.take(clock.now()))
+
+            for _ in range(10):
+                os.write(master, GO)
+                select.select([port._fd], [], [], 5.0)
+                # In the loop's list before it looks, and finds that there is something to read.
+                loop.call_soon(late_step)
+                await asyncio.sleep(0.001)
+            return b"".join(taken).count(GO), port.is_open, port.trouble
+
+    master, slave = os.openpty()
+    try:
+        tty.setraw(master)
+        path = os.ttyname(slave)
+        assert asyncio.run(kept()) == (10, True, "")
     finally:
         os.close(master)
         os.close(slave)

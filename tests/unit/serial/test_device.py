@@ -49,6 +49,18 @@ def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: s
     assert words in str(refused)
 
 
+def test_nothing_to_read_is_no_hang_up_and_a_hang_up_is() -> None:
+    master, slave = pty.openpty()
+    device = open_raw(os.ttyname(slave), 115200)
+    os.close(slave)
+    device.timeout = 0  # as pyserial-asyncio does: it sets the port up once more
+    assert device.read(10) == b""
+    os.close(master)
+    with pytest.raises(SerialException, match=r"hung up|read failed"):
+        device.read(10)
+    close(device, lost=True).join(5.0)
+
+
 def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
     device = open_raw(path, 115200)
     with pytest.raises(OSError, match=r"lock|busy") as locked:
