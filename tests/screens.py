@@ -45,7 +45,7 @@ def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = 
 def _drive(bus: Bus) -> None:
     """A way to see on the map, and something that was refused."""
     bus.linked()
-    for angular, key, target in ((0.0, "x", 0.6), (0.8, "yaw", 2.5), (0.0, "y", 1.3)):
+    for angular, key, target in ((0.0, "x", 0.6), (0.8, "yaw", 1.5), (0.0, "y", 1.2)):
         with bus.commanding(0.4, angular):
             until(lambda k=key, t=target: bus.state()[k] > t, 10.0, f"{key} over {target}")  # type: ignore[misc]
     bus.at_rest()
@@ -55,9 +55,10 @@ def _drive(bus: Bus) -> None:
 def _picture(browser: Browser, directory: Path, size: str, look: str, view: str) -> Path:
     browser.size(*SIZES[size], touch=size == "phone", dark=look == "dark")
     browser.js(f"document.getElementById('tab-{view}').click()")
-    for name, row in (("robots", "#cards li"), ("set", "#settings div"), ("status", "#parts li")):
+    rows = {"robots": "#cards strong", "set": "#settings div", "status": "#parts li"}
+    if row := rows.get(view):
         there = f"document.querySelector({row!r}) !== null"
-        until(lambda n=name, t=there: n != view or browser.js(t), 5.0, row)  # type: ignore[misc]
+        until(lambda: browser.js(there), 5.0, row)
     browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 300))")
     path = directory / f"{size}-{look}-{view}.png"
     browser.picture(path)

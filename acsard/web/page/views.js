@@ -62,7 +62,7 @@ export function cards(list, robots) {
     return made("li", bad, made("strong", "", one.robot), ` ${one.mode ?? "silent"}`, made("div", "quiet", said(one.reason ?? "")),
       made("div", "quiet", facts.filter(Boolean).join(" · ")));
   });
-  list.replaceChildren(...(shown.length ? shown : [made("li", "warning", "no robot is heard")]));
+  list.replaceChildren(...(shown.length ? shown : [made("li", "warning", "no robot is heard yet")]));
 }
 
 export function recordings(list, none, files) {
