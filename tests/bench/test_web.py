@@ -173,7 +173,8 @@ class Finger:
         at = float(self.browser.js("window.finger")) / 1000 - wall + begun
 
         def line() -> float | None:
-            return next((h.at for h in self.peer.since(at) if wanted(wheels(h.line)[0])), None)
+            since = [heard for heard in self.peer.since(at) if heard.line.startswith(b"a")]
+            return next((heard.at for heard in since if wanted(wheels(heard.line)[0])), None)
 
         return 1000 * (until(line, 5.0, "the finger's line") - at)
 
@@ -200,11 +201,13 @@ def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
     ):
         browser.size(*PHONE)
         browser.open(page.here)
-        until(lambda: "live" in browser.text("age"), 10.0, "a page")
+        until(lambda: browser.text("mode") == "READY", 10.0, "a page")
         browser.js(FINGER)
-        finger = Finger(browser, peer)
-        pressed = [finger.waited(finger.press, lambda speed: speed > 0)]
-        moved, lifted = [], []
+        finger, begun = Finger(browser, peer), time.monotonic()
+        browser.hold(lambda: any(one.line.startswith(b"ap04") for one in peer.since(begun)))
+        pressed: list[float] = []
+        moved: list[float] = []
+        lifted: list[float] = []
         for number in range(FINGERS):
             time.sleep(0.06 + 0.05 * ((number * 0.618) % 1.0))  # not in step with the browser
             moved.append(finger.moved_to(*((30, 2.0), (90, 4.0))[number % 2]))
