@@ -242,9 +242,12 @@ def tab_killed(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def page_left(field: Field, number: int) -> Iterator[float]:
+    """What the finger was on is gone: Chromium would wait there for its end."""
     begun = time.monotonic()
     field.browser.open("about:blank")
     yield begun
+    field.browser.attend(field.browser.tab)
+    field.browser.size(*PHONE)
 
 
 @contextmanager
