@@ -209,6 +209,9 @@ COMMANDS: dict[str, How] = {
         "installs into venvs of other Pythons, for who has them"
     ),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
+    ".venv/bin/python -m tests.pictures pictures": Elsewhere(
+        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_and_a_desktop"
+    ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
         "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",

@@ -70,7 +70,7 @@ export function cards(list, robots, own) {
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
-  if (!shown.length) shown.push(made("li", "warning", "no robot is heard"));
+  if (!shown.length) shown.push(made("li", "warning", "no robot is heard yet"));
   if (shown.length !== list.children.length || shown.some((card, n) => card !== list.children[n])) list.replaceChildren(...shown);
 }
 
