@@ -162,7 +162,7 @@ class Timeline:
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # Who answers makes no line that we do not ask for: none is missing for that we were silent.
-        clocked = told.clock != "reads" or self._prompts.lost
+        clocked = told.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
@@ -184,8 +184,7 @@ class Timeline:
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
             prompts = self._prompts
-            plain = (speaks is False or prompts.thinks) and not prompts.lost
-            ours = asked_ns is not None or plain
+            ours = asked_ns is not None or speaks is False or prompts.thinks
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay is that of a first answer read late, in a stall that the

@@ -88,11 +88,16 @@ def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, s
     assert np.all(found[FOUND] <= found[ARRIVAL] / 2)
 
 
-SLOW = pytest.param(60.0, 12, marks=pytest.mark.slow, id="45 m")
-
-
-@pytest.mark.parametrize(("seconds", "seeds"), [SLOW, FULL])
-@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+@pytest.mark.parametrize(
+    ("prompted", "seconds", "seeds"),
+    [
+        pytest.param(False, 60.0, 12, marks=pytest.mark.slow, id="reporting-45 m"),
+        # What answers around a stall get lost decides a minute.
+        pytest.param(True, 600.0, 3, marks=pytest.mark.slow, id="prompted-450 m thrice"),
+        pytest.param(False, *FULL.values, marks=FULL.marks, id="reporting-450 m"),
+        pytest.param(True, *FULL.values, marks=FULL.marks, id="prompted-450 m"),
+    ],
+)
 def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
     prompted: bool, seconds: float, seeds: int
 ) -> None:
