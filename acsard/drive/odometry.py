@@ -57,11 +57,13 @@ class Odometry:
         kinematics: Kinematics,
         encoder_counts: int = 0,
         response_time: float = FeedbackConfig().response_time,
+        quiet: float = math.inf,
     ) -> None:
-        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel."""
+        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel;
+        `quiet` s of silence, after which the wheels are told to stand."""
         self._kinematics = kinematics
         self._positions = NOWHERE
-        self._rolling = Rolling()
+        self._rolling = Rolling(quiet)
         self._held = NOWHERE
         """rad of counts at rest, whose way is not clear yet."""
         self._steps_seen = NOWHERE

@@ -48,6 +48,14 @@ def test_what_no_line_reported_lies_between_two_speeds() -> None:
     assert (rolled.seconds, rolled.bridged) == near(0.03, 0.02)
 
 
+def test_a_silence_goes_on_as_before_it_no_longer_than_until_wheels_are_told_to_stand() -> None:
+    rolling = Rolling(quiet=0.1)
+    stood = rolling.take(Feedback(AT, WheelSpeeds(), 0.6, bridged=0.5), FOUR)
+    assert total(stood) == pytest.approx(0.4)
+    short = rolling.take(Feedback(AT, WheelSpeeds(), 0.2, bridged=0.1), FOUR)
+    assert total(short) == pytest.approx(0.2), "as long as nobody told them"
+
+
 def test_counts_go_before_the_speed() -> None:
     counted = (0.05, 0.05, 0.05, 0.05)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
