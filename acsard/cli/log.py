@@ -207,7 +207,7 @@ def report_one(args: argparse.Namespace) -> int:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    from acsard.record.ring import listed
+    from acsard.record.directory import listed
 
     where = Path(args.directory or load(None)[1].record.directory or SERVICE)
     try:

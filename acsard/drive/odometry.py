@@ -19,14 +19,14 @@ from collections import deque
 from itertools import takewhile
 
 from acsard.config.settings import FeedbackConfig, OdometryConfig
-from acsard.drive.gaps import Gaps
+from acsard.drive.distance import NOWHERE, Rolled, Rolling, Step, count_of, plus
+from acsard.drive.gap_variance import Gaps
 from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.lying_wheels.witness import Witness
 from acsard.drive.path import Path
-from acsard.drive.rolled import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
-from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
 from acsard.values import (

@@ -1,8 +1,9 @@
 """A good line -> feedback: when its sample was made, and what the wheels did since the one before.
 
 Whose clock says how far two lines are apart: the MCU's own where it sends it with its counts; the
-lines that left where each is answered (`prompts.py`); the period of an MCU that reports by itself
-(`slots.py`, and which of the two it is: `habit.py`); else the reads, evenly over the lines of one.
+lines that left where each is answered (`clock_of_answers.py`); the period of an MCU that reports by
+itself (`clock_of_reports.py`, and which of the two it is: `habit.py`); else the reads, evenly over
+the lines of one.
 Whether the link can be trusted is `session.py`'s, by arrival alone.
 """
 
@@ -16,11 +17,11 @@ from msgspec.structs import replace
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.mcu.check import Reading
+from acsard.mcu.clock_of_answers import Prompts
+from acsard.mcu.clock_of_reports import Slots
 from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.frames import Codec, Motors
 from acsard.mcu.habit import Habit
-from acsard.mcu.prompts import Prompts
-from acsard.mcu.slots import Slots
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
 BRIDGED_S = 1.0

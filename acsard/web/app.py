@@ -14,13 +14,13 @@ from aiohttp import web
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.web.calls import Calls
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
 from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
-from acsard.web.hand import Hand
 from acsard.web.limits import FULL, Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports

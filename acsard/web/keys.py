@@ -10,9 +10,9 @@ from acsard.bus.address import require_id
 from acsard.host.errors import UsageError
 from acsard.web.frames import Subscribe, Unsubscribe
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
-from acsard.web.outgoing import Following, Outgoing
 from acsard.web.robots import AGAIN_S, Robots
 from acsard.web.streams import KEYS, UNREADY, Stream
+from acsard.web.to_browser import Following, Outgoing
 
 MOST = 32
 

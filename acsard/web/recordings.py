@@ -9,8 +9,8 @@ from pathlib import Path
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
+from acsard.record.directory import PART, STAMP, listed
 from acsard.record.file import closing
-from acsard.record.ring import PART, STAMP, listed
 from acsard.values import NS_PER_S
 
 

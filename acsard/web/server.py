@@ -27,13 +27,13 @@ from acsard.host.logs import Log
 from acsard.host.parent import end_with_parent
 from acsard.web.app import Page
 from acsard.web.calls import Calls
+from acsard.web.commands import SOURCE, Hand
 from acsard.web.counts import Counts
 from acsard.web.errands import Reach
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
-from acsard.web.hand import SOURCE, Hand
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
 from acsard.web.unreadable import Reader

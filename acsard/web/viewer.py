@@ -19,6 +19,7 @@ from acsard.bus.access import MAY
 from acsard.host import clock
 from acsard.values import NS_PER_S
 from acsard.web.calls import Calls, RefusedError
+from acsard.web.commands import Hand, Order
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.frames import (
@@ -35,11 +36,10 @@ from acsard.web.frames import (
     decode,
 )
 from acsard.web.guide import Guide
-from acsard.web.hand import Hand, Order
 from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
-from acsard.web.outgoing import Outgoing
 from acsard.web.robots import Robots
+from acsard.web.to_browser import Outgoing
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0

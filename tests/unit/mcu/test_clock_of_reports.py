@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.mcu.slots import Slots
+from acsard.mcu.clock_of_reports import Slots
 
 MS = 1_000_000
 PERIOD = 0.01

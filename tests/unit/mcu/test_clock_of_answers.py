@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.mcu.prompts import Prompts
+from acsard.mcu.clock_of_answers import Prompts
 
 MS = 1_000_000
 DELAY_MS = 9.0
