@@ -61,13 +61,12 @@ class Page(Program):
         """A token."""
         return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
 
-    def client(self, token: str = "", address: str = "127.0.0.1") -> aiohttp.ClientSession:
-        """A program that comes from elsewhere, with or without a token, by one of our addresses."""
+    def client(self, token: str = "", address: str = "") -> aiohttp.ClientSession:
+        """A program that comes from elsewhere, with or without a token; by one of our addresses."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         told = {"Authorization": f"Bearer {token}"} if token else {}
-        connector = aiohttp.TCPConnector(
-            resolver=_Here(), ssl=trusted, limit=0, local_addr=(address, 0)
-        )
+        local = (address, 0) if address else None
+        connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0, local_addr=local)
         return aiohttp.ClientSession(connector=connector, headers=told)
 
     def refused(self) -> dict[str, float]:

@@ -210,7 +210,8 @@ RAW: dict[str, str] = {
 @pytest.mark.parametrize("what", RAW)
 def test_what_is_no_plain_request_is_refused_whole(table: Table, bus: Bus, what: str) -> None:
     # In the end it is ready: no second request, for a stop, was found in the first.
-    with table.attack(what, "400", "malformed"), _opened(table.page) as opened:
+    reason = "host" if what == "no Host" else "malformed"
+    with table.attack(what, "400", reason), _opened(table.page) as opened:
         opened.sendall(RAW[what].encode("latin-1"))
         answer = opened.recv(4096)
         assert answer.split()[1] == b"400", answer
