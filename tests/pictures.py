@@ -55,7 +55,7 @@ def _drive(bus: Bus) -> None:
 def _picture(browser: Browser, directory: Path, size: str, look: str, view: str) -> Path:
     browser.size(*SIZES[size], touch=size == "phone", dark=look == "dark")
     browser.js(f"document.getElementById('tab-{view}').click()")
-    rows = {"robots": "#cards strong", "set": "#settings div", "status": "#parts li"}
+    rows = {"robots": "#cards a", "set": "#settings div", "status": "#parts li"}
     if row := rows.get(view):
         there = f"document.querySelector({row!r}) !== null"
         until(lambda: browser.js(there), 5.0, row)

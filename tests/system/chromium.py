@@ -173,8 +173,8 @@ class Browser:
         return told["result"].get("value")
 
     def text(self, name: str) -> str:
-        """What stands in the element with this id."""
-        return str(self.js(f"document.getElementById({name!r}).textContent"))
+        """What stands in the element with this id; nothing while one page replaces another."""
+        return str(self.js(f"document.getElementById({name!r})?.textContent ?? ''"))
 
     def middle(self, name: str) -> tuple[float, float]:
         """Where the element is, px."""

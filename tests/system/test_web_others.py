@@ -120,7 +120,8 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         shows("mode", "READY")
         shows("age", "live")
         shows("stop", f"STOP {THEIRS}")
-        assert browser.js("document.getElementById('simulated').hidden") is False
+        badge = "document.getElementById('simulated').hidden"
+        until(lambda: browser.js(badge) is False, 10.0, "the badge of a simulator")
         assert browser.js("document.getElementById('tab-set').hidden") is True
         stick = "document.getElementById('stick')"
         assert browser.js(f"{stick}.getAttribute('aria-disabled')") == "true"

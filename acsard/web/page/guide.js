@@ -224,7 +224,8 @@ export class Guide {
 /** What a terminal says of its keys, as it is here. */
 export function worded(words) {
   return words
-    .replace('then type "lifted":', "then tick this:")
+    .replace('then type "lifted".', "then tick this.")
+    .replace(" q or Ctrl-C leaves, here and later:", " Leaving ends it, here and later:")
     .replace("Press SPACE", "Press NOW")
     .replace("Enter alone:", "Left empty:")
     .replace("any key stops it", "any key or the button stops it");

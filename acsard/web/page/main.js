@@ -257,5 +257,7 @@ open("drive");
 for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["wheel_states", 5], ["events", 5]])
   link.subscribe(key, rate, OTHER);
 setInterval(looked, 100);
+// A recording grows, and a new one begins, while they are looked at.
+setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 await invited();
 link.start();

@@ -9,6 +9,7 @@ export class Recordings {
   #list;
   #none;
   #reports = new Map(); // by name: its place in the row, which outlives the row
+  #shown = "";
 
   constructor(list, none) {
     this.#list = list;
@@ -17,6 +18,9 @@ export class Recordings {
 
   /** `barred` is why this one may not fetch them, "" for who may; `trouble` why there are none. */
   show(files, barred, trouble = "") {
+    const shown = JSON.stringify([files, barred, trouble]);
+    if (shown === this.#shown) return; // what has the focus keeps it
+    this.#shown = shown;
     this.#none.textContent = trouble || "none here";
     this.#none.hidden = files.length > 0;
     this.#list.replaceChildren(...files.map((one) => this.#row(one, barred)));
