@@ -10,6 +10,7 @@ like one with a dead encoder, and is left out too: the other one is what is driv
 from __future__ import annotations
 
 import math
+from operator import eq
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.residual import MEMORY_S, Residual
@@ -220,7 +221,7 @@ class Witness:
         left = self._left.residual.add(front_left, rear_left, keep, dt, count)
         right = self._right.residual.add(front_right, rear_right, keep, dt, count)
         last, self._last = self._last, speeds
-        same = [a == b for a, b in zip(speeds.as_tuple(), last.as_tuple(), strict=True)]
+        same = list(map(eq, speeds.as_tuple(), last.as_tuple()))
         stood, self._stands = self._stands, True in same
         self._found = None
         if stood or self._stands:
