@@ -97,8 +97,9 @@ class _Side:
             return False
         front, rear = self.wheels
         for i, (own, other) in enumerate(((front, rear), (rear, front))):
-            alike = turned[own] * self.residual.stand_in(front=i == 1)
-            apart = turned[other] - alike
+            apart = 0.0
+            if same[own]:
+                apart = turned[other] - turned[own] * self.residual.stand_in(front=i == 1)
             if self._stuck[i].says(same[own], apart, dt, count, slow, wish):
                 self._leave_out(i, "stuck")
                 return True
