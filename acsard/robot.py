@@ -74,6 +74,7 @@ class Robot:
             self._kinematics,
             config.mcu.encoder_counts,
             config.feedback.response_time,
+            self.session.quiet_ns / NS_PER_S,
         )
         self._gyro = Gyro() if config.odometry.gyro else None
         self._arbiter = Arbiter(config.commands)

@@ -209,6 +209,9 @@ COMMANDS: dict[str, How] = {
         "installs into venvs of other Pythons, for who has them"
     ),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
+    ".venv/bin/python -m tests.pictures pictures": Elsewhere(
+        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_and_a_desktop"
+    ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
         "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",
@@ -282,6 +285,11 @@ COMMANDS: dict[str, How] = {
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
+    "acsard web --connect tls/router.local:7447 --tls clients/robot1 --id robot1": Elsewhere(
+        "tests/system/test_web_others.py",
+        "test_another_robot_is_followed_and_stopped_and_only_that",
+        "by a router on loopback",
+    ),
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
     # deploy/ros2

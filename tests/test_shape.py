@@ -55,6 +55,7 @@ PURE_AMONG_SHELLS = (
     "top.teleop",
     "top.text",
     "top.view",
+    "web.errands",
     "web.frames",
     "web.limits",
     "web.metrics",

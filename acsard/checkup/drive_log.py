@@ -10,7 +10,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.checkup.line_times import Places, places
-from acsard.drive.gaps import Gaps
+from acsard.drive.gap_variance import Gaps
 from acsard.drive.kinematics import Kinematics
 from acsard.values import Twist, WheelSpeeds
 

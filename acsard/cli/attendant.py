@@ -1,4 +1,7 @@
-"""Who stands beside the robot while it is calibrated: a person at this terminal, or nobody."""
+"""Who stands beside the robot while it is calibrated: a person at this terminal, or nobody.
+
+A person whom a program asks is in `json_lines.py`.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +30,9 @@ class Attendant(Protocol):
     def say(self, text: str) -> None:
         """Tell."""
 
-    def start(self, text: str) -> None:
-        """Return when the leg may begin; raises `KeyboardInterrupt`."""
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Return when the leg may begin; raises `KeyboardInterrupt`. `by_key`: a key is how it is
+        meant to end."""
 
     def number(self, ask: Ask) -> float:
         """What was read off; raises `KeyboardInterrupt` or `GuideError`."""
@@ -46,7 +50,7 @@ class Nobody:
     def say(self, text: str) -> None:
         _print(text)
 
-    def start(self, text: str) -> None:
+    def start(self, text: str, by_key: bool = False) -> None:
         _print(text)
 
     def number(self, ask: Ask) -> float:
@@ -71,7 +75,7 @@ class Person:
     def say(self, text: str) -> None:
         _print(text)
 
-    def start(self, text: str) -> None:
+    def start(self, text: str, by_key: bool = False) -> None:
         import termios
 
         _print(text)
@@ -95,7 +99,7 @@ class Person:
                 line = self._read().strip()
                 if line == LEAVES:
                     raise KeyboardInterrupt
-                number = _number(line, ask.usual)
+                number = number_of(line, ask.usual)
                 if ask.least <= number <= ask.most:
                     return number
                 _print(f"a number of {ask.unit} from {ask.least:g} to {ask.most:g} (q leaves)")
@@ -136,9 +140,12 @@ def attending() -> Iterator[Person]:
 
 @contextmanager
 def interrupted_by(numbers: Sequence[signal.Signals]) -> Iterator[None]:
-    """These signals end it as Ctrl-C does, so that zeros go out; Ctrl-Z would leave it driving."""
+    """These signals end it as Ctrl-C does, so that zeros go out; Ctrl-Z would leave it driving. A
+    second one does not disturb the zeros."""
 
     def end(number: int, frame: FrameType | None) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
     before = [signal.signal(number, end) for number in numbers]
@@ -164,8 +171,8 @@ def _lines(terminal: int) -> Iterator[None]:
         termios.tcsetattr(terminal, termios.TCSANOW, before)
 
 
-def _number(line: str, usual: float | None) -> float:
-    """nan for what is none."""
+def number_of(line: str, usual: float | None) -> float:
+    """What was typed; nothing is what is usual, and nan what is no number."""
     if not line and usual is not None:
         return usual
     try:

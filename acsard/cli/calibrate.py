@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, guided
-from acsard.cli.common import add_bus, load, writable
+from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
+from acsard.cli.common import JSON_LINES, add_bus, load, writable
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.files import change
@@ -20,6 +20,7 @@ from acsard.host.files import change
 if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape import Tape
+    from acsard.cli.json_lines import JsonAttendant
     from acsard.config.settings import DriveConfig
 
 DESCRIPTION = """\
@@ -61,7 +62,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="with --log: how far from its start a run ends, in a straight line by tape measure: "
         "tells how large the wheels are; without RUN it is the straightest run",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="print one JSON object")
+    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
     parser.add_argument(
         "--write",
         action="store_true",
@@ -73,6 +76,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Calibrate and tell."""
+    if not args.json_lines or args.log:
+        return _calibrate(args, None)
+    if args.yes:
+        raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
+    from acsard.cli.json_lines import JsonAttendant
+
+    with JsonAttendant() as lines:
+        return _calibrate(args, lines)
+
+
+def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
     import msgspec
 
     from acsard.calibration.doubts import RefusedError
@@ -80,15 +94,15 @@ def main(args: argparse.Namespace) -> int:
     from acsard.calibration.report import Refusal, keys, report, text
     from acsard.calibration.table import LogError
 
-    where, config = load(args.config)
+    where, mine = load(args.config)
     if args.write:
         writable(args.config)
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found = _calibrated(_only_log(args), config.drive, args.distance)
+            found, config = _calibrated(_only_log(args), mine.drive, args.distance), mine
         else:
-            found, config = guided(_no_log(args), config, where)
+            found, config = guided(_no_log(args), mine, where, lines)
     except (LogError, RefusedError, GuideError) as error:
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error))).decode(), flush=True)
@@ -96,8 +110,14 @@ def main(args: argparse.Namespace) -> int:
     if args.write:
         change(Path(where), keys(found))
     told = report(source, found, config.drive, where if args.write else "")
-    print(msgspec.json.encode(told).decode() if args.json else text(told, found, where))
-    if args.write and not args.log:
+    written = args.write
+    if lines is None:
+        print(msgspec.json.encode(told).decode() if args.json else text(told, found, where))
+    else:
+        lines.shows(text(told, found, where))
+        trouble = differing(config, mine, where)
+        written = written or lines.offer(args.config, keys(found), trouble)
+    if written and not args.log:
         print("restart the daemon: it takes them at its start", file=sys.stderr)
     return int(Exit.OK)
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
+from acsard.calibration.guided.needs import NEEDS
 from acsard.host.errors import UsageError
 
 if TYPE_CHECKING:
@@ -19,18 +20,18 @@ if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.cli.attendant import Attendant
     from acsard.cli.calibrate_robot import Robot
+    from acsard.cli.json_lines import JsonAttendant
     from acsard.client import Client
     from acsard.config.settings import Config
 
-DRIVE_OPTIONS = ("way", "positions", "positions_at", "yes")
-WAYS = ("gyro", "positions", "tape", "wall", "umbmark")
+DRIVE_OPTIONS = ("way", "positions", "positions_at", "yes", "json_lines")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What only a guided drive takes."""
     parser.add_argument(
         "--way",
-        choices=WAYS,
+        choices=tuple(NEEDS),
         help="what the drive is compared with; without it a gyro where the robot has one "
         "([odometry] gyro), else a tape",
     )
@@ -55,7 +56,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibration, Config]:
+def guided(
+    args: argparse.Namespace, config: Config, where: str, lines: JsonAttendant | None
+) -> tuple[Calibration, Config]:
     """What was found, and the configuration of the robot it was found for. Raises `GuideError`,
     `LogError` and `RefusedError`; a key and Ctrl-C end it with zeros."""
     from acsard.bus.address import address_of
@@ -72,11 +75,14 @@ def guided(args: argparse.Namespace, config: Config, where: str) -> tuple[Calibr
     _usable(args, full_key(robot_id, "odom"))
     with ExitStack() as stack:
         client = stack.enter_context(connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls))
-        _may(args, client)
+        info = client.get("info")
+        _may(args, simulated=info.simulated)
         config = _in_force(client, config, where, write=args.write)
         name = _way(args, config)
         made, kind = setup(config), KINDS[name]
-        attendant = stack.enter_context(_attendant(args))
+        if lines is not None:
+            lines.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
+        attendant = stack.enter_context(_attendant(args, lines))
         robot = Robot(client, config, attendant)
         if name == "gyro":
             robot.gyro(args.imu)
@@ -99,16 +105,16 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         )
     if args.positions_at and not args.positions:
         raise UsageError("--positions-at says where --positions KEY is; give that as well")
-    if not args.yes and not sys.stdin.isatty():
+    if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(
             "calibrate drives the robot, and a person at the terminal starts and stops it: run it "
             "in one. --yes without one is for the built-in simulator; --log takes a recorded drive"
         )
 
 
-def _may(args: argparse.Namespace, client: Client) -> None:
+def _may(args: argparse.Namespace, *, simulated: bool) -> None:
     """Nothing real moves without a person."""
-    if args.yes and not client.get("info").simulated:
+    if args.yes and not simulated:
         raise UsageError(
             "--yes is for the built-in simulator: this robot is real, and somebody has to stand "
             "beside it and start each leg. Leave --yes out"
@@ -123,13 +129,21 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
     from acsard.config.settings import Config
 
     config = msgspec.convert(client.get("config"), Config)
-    same = config.drive.wheel_radius, config.drive.wheel_separation
-    if write and same != (mine.drive.wheel_radius, mine.drive.wheel_separation):
-        raise GuideError(
-            f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation = "
-            f"{same[1]:g}, and {where} says otherwise: give --config the file it runs with"
-        )
+    if write and (trouble := differing(config, mine, where)):
+        raise GuideError(trouble)
     return config
+
+
+def differing(config: Config, mine: Config, where: str) -> str:
+    """Why what is found with this configuration does not belong into the file `where`, which says
+    `mine`; "" when it does."""
+    same = config.drive.wheel_radius, config.drive.wheel_separation
+    if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
+        return ""
+    return (
+        f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation = "
+        f"{same[1]:g}, and {where} says otherwise: give --config the file it runs with"
+    )
 
 
 def _way(args: argparse.Namespace, config: Config) -> str:
@@ -145,13 +159,17 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 
 @contextmanager
-def _attendant(args: argparse.Namespace) -> Iterator[Attendant]:
+def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
     from acsard.cli.attendant import Nobody, attending, interrupted_by
 
     if args.yes:
         yield Nobody()
         return
     numbers = signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+    if lines is not None:
+        with interrupted_by((signal.SIGINT, *numbers)):
+            yield lines
+        return
     with attending() as person, interrupted_by(numbers):
         yield person
 
@@ -179,7 +197,7 @@ def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Cali
     while True:
         if isinstance(step, Leg):
             number += 1
-            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)")
+            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)", step.by_key)
             answer: object = robot.ride(step)
         else:
             answer = attendant.number(step)

@@ -31,6 +31,11 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
+JSON_LINES = (
+    "for a program that asks the person: what is told and asked is JSON on standard output, an "
+    "object a line, and answers come in the same on standard input (deploy/web/README.md)"
+)
+
 MANY = "; several with commas, or '*' for all there are"
 
 

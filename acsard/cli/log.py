@@ -53,6 +53,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     recover.add_argument("file", metavar="FILE")
     recover.add_argument("new", metavar="NEW", help="the file to write")
+    recover.add_argument("--force", action="store_true", help="write over what is there")
     recover.set_defaults(main=recover_one)
     export = log_export.add(inner)
     _span(export)
@@ -165,11 +166,13 @@ def replay_one(args: argparse.Namespace) -> int:
 
 def recover_one(args: argparse.Namespace) -> int:
     """Write a finished file."""
+    from acsard.record.beside import beside
     from acsard.record.file import rewrite
 
     recording, new = _recording(args), Path(args.new)
     try:
-        count = rewrite(recording, new)
+        with beside(new, args.force) as part:
+            count = rewrite(recording, part)
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
     print(f"{count} messages in {new}{_state(recording)}")
@@ -204,7 +207,7 @@ def report_one(args: argparse.Namespace) -> int:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    from acsard.record.ring import listed
+    from acsard.record.directory import listed
 
     where = Path(args.directory or load(None)[1].record.directory or SERVICE)
     try:

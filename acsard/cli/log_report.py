@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -14,9 +16,7 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
 if TYPE_CHECKING:
-    from acsard.record.again import Onlooker
     from acsard.record.file import Recording
-    from acsard.report.course import Course
 
 DESCRIPTION = """\
 Draw what happened as one HTML file that needs no network. Needs the library plotly; without it, it
@@ -44,6 +44,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
     parser.add_argument("--force", action="store_true", help="write over what is there")
+    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
     return parser
 
 
@@ -62,31 +63,14 @@ def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
     """Write it, tell what was written, and return what is to be known of it."""
-    from acsard.record.again import Onlooker, verdict
     from acsard.record.beside import beside
-    from acsard.report.account import Origin, notes
-    from acsard.report.course import Course
-    from acsard.report.page import page
 
+    if args.held:
+        return _held(recording, args, plotly, words)
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
-    about, looked = recording.about, Onlooker(recording)
-    course = Course(looked.config, words.seconds(args.begin), words.seconds(args.end))
     try:
         with beside(new, args.force) as part, telling(recording) as tell:
-            _follow(recording, looked, course, tell)
-            if course.began is None:
-                message = f"{recording.path} has no step of that time to draw"
-                raise ExitError(Exit.FAILURE, message)
-            course.end()
-            said = [*filter(None, [words.state(recording).strip(" []")]), *looked.notes]
-            tally = looked.replay.tally
-            if not (tally.same or looked.notes or course.missing):
-                said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
-            origin = Origin(
-                recording.path.name, about.robot, about.version, about.python, tuple(said)
-            )
-            offset_s = time.localtime(course.began).tm_gmtoff
-            text = page(course, origin, plotly, words.clock, offset_s)
+            text, known = _drawn(recording, args, plotly, words, tell)
             part.write_text(text, encoding="utf-8")
     except OSError as error:
         denied = isinstance(error, PermissionError)
@@ -94,19 +78,61 @@ def report_one(
             Exit.NO_PERMISSION if denied else Exit.FAILURE, f"cannot write {new}: {error.strerror}"
         ) from None
     print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
-    return notes(course, origin)
+    return known
 
 
-def _follow(
-    recording: Recording, looked: Onlooker, course: Course, tell: Callable[[int], None]
-) -> None:
-    """All steps that count, into `course`."""
-    from acsard.record.again import EVERY
+def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Words) -> list[str]:
+    """For the page's server: to standard output, and how far it is, in percent, to the other."""
+    from acsard.host.parent import end_with_parent
+    from acsard.record.file import closing
 
+    end_with_parent(signal.SIGKILL)
+    last, began = closing(recording.path), recording.about.wall_ns / 1e9
+    end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
+    told = 0
+
+    def tell(at_ns: int) -> None:
+        nonlocal told
+        percent = int(100 * (at_ns / 1e9 - began) / max(1.0, end - began))
+        if told < percent < 100:
+            told = percent
+            print(percent, file=sys.stderr, flush=True)
+
+    text, _ = _drawn(recording, args, plotly, words, tell)
+    sys.stdout.buffer.write(text.encode())
+    return []
+
+
+def _drawn(
+    recording: Recording,
+    args: argparse.Namespace,
+    plotly: str,
+    words: Words,
+    tell: Callable[[int], None],
+) -> tuple[str, list[str]]:
+    """The file, and what is to be known of it; `tell` hears the wall-clock time it has come to."""
+    from acsard.record.again import EVERY, Onlooker, verdict
+    from acsard.report.account import Origin, notes
+    from acsard.report.course import Course
+    from acsard.report.page import page
+
+    about, looked = recording.about, Onlooker(recording)
+    course = Course(looked.config, words.seconds(args.begin), words.seconds(args.end))
     for number, (step, outputs, robot) in enumerate(looked.steps()):
         if number % EVERY == 0:
             tell(step.inputs.now.wall_ns)
         course.step(step, outputs, robot)
         if course.over:
             deque(recording.messages(), maxlen=0)  # only what is missing of it
-            return
+            break
+    if course.began is None:
+        message = f"{recording.path} has no step of that time to draw"
+        raise ExitError(Exit.FAILURE, message)
+    course.end()
+    said = [*filter(None, [words.state(recording).strip(" []")]), *looked.notes]
+    tally = looked.replay.tally
+    if not (tally.same or looked.notes or course.missing):
+        said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
+    offset_s = time.localtime(course.began).tm_gmtoff
+    return page(course, origin, plotly, words.clock, offset_s), notes(course, origin)

@@ -6,13 +6,11 @@ What is looked at, and in which order, is `checkup/procedure.py`'s; who answers 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import Overrides, add_config, load, writable
-from acsard.cli.person import SIMULATOR, answering, ended_by_signals
-from acsard.host.colours import coloured
+from acsard.cli.common import JSON_LINES, Overrides, add_config, load, writable
+from acsard.cli.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
 from acsard.host.files import change
@@ -20,6 +18,7 @@ from acsard.host.files import change
 if TYPE_CHECKING:
     from acsard.checkup.findings import Finding
     from acsard.checkup.outside import Wire
+    from acsard.cli.json_lines import JsonPerson
     from acsard.config.settings import Config
 
 DESCRIPTION = """\
@@ -60,7 +59,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         action="store_true",
         help="with --yes: you have made sure that no wheel touches anything, and watch the robot",
     )
-    check.add_argument("--json", action="store_true", help="print one JSON object")
+    how = check.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="print one JSON object")
+    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
     check.add_argument(
         "--write",
         action="store_true",
@@ -72,32 +73,33 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Check and tell."""
-    import msgspec
-
-    from acsard.checkup import advice, procedure
-    from acsard.checkup.report import failed, report, row, summary
-
     given: Overrides = {}
     for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
         if value is not None:
             given.setdefault("mcu", {})[key] = value
     where, config = load(args.config, given)
-    _, configured = load(args.config)
     if args.write:
         writable(args.config)
-    port = config.mcu.port
-    person = answering(args, port)
+    with answering(args, config.mcu.port) as person:
+        return _checked(args, config, where, person)
+
+
+def _checked(
+    args: argparse.Namespace, config: Config, where: str, person: Person | Nobody | JsonPerson
+) -> int:
+    from acsard.checkup import advice, procedure
+    from acsard.checkup.report import failed, report
+
+    _, configured = load(args.config)
+    port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
     def tell(finding: Finding) -> None:
         findings.append(finding)
-        if not args.json:
-            person.clear()
-            print(row(finding, coloured(sys.stdout)), flush=True)
+        person.found(finding)
 
-    if not args.json:
-        simulated = " (the built-in SIMULATOR, in its own time)" if port == SIMULATOR else ""
-        print(f"port {port}{simulated}, configuration {where}", flush=True)
+    words = " (the built-in SIMULATOR, in its own time)" if simulated else ""
+    person.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
     trouble: MendableError | None = None
     try:
         with ended_by_signals():
@@ -106,19 +108,19 @@ def main(args: argparse.Namespace) -> int:
         if not args.json:
             raise
         trouble = error  # programs get their object all the same
-    finally:
-        person.clear()
-    changes, written = advice.changes(findings, configured, args.port if args.write else ""), ""
+    named = args.port if args.write or (args.json_lines and not simulated) else ""
+    changes, written = advice.changes(findings, configured, named), ""
     if args.write and changes and not trouble:
         try:
             change(Path(where), changes)
             written = where
         except MendableError as error:  # a minute's findings are told first
             trouble = error
-    found = report(port, findings, changes, written, str(trouble or ""))
-    print(msgspec.json.encode(found).decode() if args.json else summary(found, where))
+    person.result(report(port, findings, changes, written, str(trouble or "")), where)
     if trouble is not None:
         raise trouble
+    if changes and not args.write:
+        person.offer(args.config, changes)
     return int(Exit.FAILURE if failed(findings) else Exit.OK)
 
 

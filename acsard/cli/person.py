@@ -1,4 +1,7 @@
-"""Who answers for a check and what it asks: somebody at the terminal, or nobody; who ends it."""
+"""Who answers for a check and what it asks: somebody at the terminal, or nobody; who ends it.
+
+Somebody whom a program asks is in `json_lines.py`.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +9,60 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING, Self
 
+from acsard.host.colours import coloured
 from acsard.host.exits import Exit, ExitError
+
+if TYPE_CHECKING:
+    from acsard.checkup.findings import Finding
+    from acsard.checkup.report import Report
+    from acsard.cli.json_lines import JsonPerson
 
 SIMULATOR = "sim"
 
 LEAVES = "q"
 
 
-class Progress:
-    """What happens now: a line on the terminal, written over by what comes next; nothing into a
-    pipe."""
+class Screen:
+    """What is told: findings on standard output, or all as one JSON object; and what happens now, a
+    line on the terminal that is written over by what comes next, and nothing into a pipe."""
 
-    def __init__(self, quiet: bool = False) -> None:
-        self._on = sys.stderr.isatty() and not quiet
+    def __init__(self, as_json: bool = False) -> None:
+        self._as_json = as_json
+        self._on = sys.stderr.isatty() and not as_json
         self._shown = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.clear()
+
+    def begin(self, subject: str, *, simulated: bool) -> None:
+        """What is checked, first of all."""
+        if not self._as_json:
+            print(subject, flush=True)
+
+    def found(self, finding: Finding) -> None:
+        """Tell a finding as it is made."""
+        from acsard.checkup.report import row
+
+        if not self._as_json:
+            self.clear()
+            print(row(finding, coloured(sys.stdout)), flush=True)
+
+    def result(self, found: Report, where: str) -> None:
+        """Tell all of it together."""
+        import msgspec
+
+        from acsard.checkup.report import summary
+
+        self.clear()
+        print(msgspec.json.encode(found).decode() if self._as_json else summary(found, where))
 
     def say(self, text: str) -> None:
         """Tell what happens now."""
@@ -39,8 +78,12 @@ class Progress:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
             self._shown = False
 
+    def offer(self, config: str | None, keys: Mapping[str, object]) -> bool:
+        """At a terminal one writes by --write."""
+        return False
 
-class Person(Progress):
+
+class Person(Screen):
     """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
@@ -58,7 +101,7 @@ class Person(Progress):
             print(f"   please type {' or '.join(answers)}; {LEAVES} leaves", file=sys.stderr)
 
 
-class Nobody(Progress):
+class Nobody(Screen):
     """Confirms what has been said on the command line, and sees nothing."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
@@ -66,7 +109,7 @@ class Nobody(Progress):
         return answers[0] if len(answers) == 1 else None
 
 
-def answering(args: argparse.Namespace, port: str) -> Person | Nobody:
+def answering(args: argparse.Namespace, port: str) -> Person | Nobody | JsonPerson:
     """Who answers; raises unless that is a person here, or nothing real can move."""
     if port == SIMULATOR and args.port != SIMULATOR:
         raise ExitError(
@@ -75,6 +118,14 @@ def answering(args: argparse.Namespace, port: str) -> Person | Nobody:
             '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
             "DEVICE`; `--port sim` checks the built-in simulator",
         )
+    if args.json_lines:
+        from acsard.cli.json_lines import JsonPerson
+
+        if args.yes:
+            raise ExitError(
+                Exit.USAGE, "--yes asks nobody, and --json-lines a program: one of both"
+            )
+        return JsonPerson()
     if not args.yes:
         if not sys.stdin.isatty():
             raise ExitError(

@@ -79,6 +79,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
 
     from acsard.bus.address import address_of
     from acsard.bus.session import log_from_environment
+    from acsard.host.logs import Log
     from acsard.web import server, tokens
 
     def announce(urls: Sequence[str]) -> None:
@@ -95,10 +96,15 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         listen,
         args.tls or config.bus.tls,
         tokens.place(),
+        args.config or "",
         next_port=args.held,
         held=args.held,
     )
-    asyncio.run(server.serve(wanted, announce))
+    log = Log(config.log)
+    try:
+        asyncio.run(server.serve(wanted, announce, log))
+    finally:
+        log.close()
     return int(Exit.OK)
 
 

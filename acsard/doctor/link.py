@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding
 from acsard.doctor.running import Running
-from acsard.mcu.lateness import BUSY
+from acsard.mcu.whose_silence import BUSY
 
 LOST = 0.02
 """Share of the lines; a sound link loses none."""

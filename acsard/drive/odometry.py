@@ -19,14 +19,14 @@ from collections import deque
 from itertools import takewhile
 
 from acsard.config.settings import FeedbackConfig, OdometryConfig
-from acsard.drive.gaps import Gaps
+from acsard.drive.distance import NOWHERE, Rolled, Rolling, Step, count_of, plus
+from acsard.drive.gap_variance import Gaps
 from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.lying_wheels.witness import Witness
 from acsard.drive.path import Path
-from acsard.drive.rolled import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
-from acsard.drive.witness import Witness
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.frames import Motors
 from acsard.values import (
@@ -57,11 +57,13 @@ class Odometry:
         kinematics: Kinematics,
         encoder_counts: int = 0,
         response_time: float = FeedbackConfig().response_time,
+        quiet: float = math.inf,
     ) -> None:
-        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel."""
+        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel;
+        `quiet` s of silence, after which the wheels are told to stand."""
         self._kinematics = kinematics
         self._positions = NOWHERE
-        self._rolling = Rolling()
+        self._rolling = Rolling(quiet)
         self._held = NOWHERE
         """rad of counts at rest, whose way is not clear yet."""
         self._steps_seen = NOWHERE

@@ -21,6 +21,19 @@ class Exit(IntEnum):
     BAD_CONFIG = 78
 
 
+WORDS: dict[int, str] = {
+    Exit.OK: "done",
+    Exit.FAILURE: "failure",
+    Exit.USAGE: "usage",
+    Exit.NO_PORT: "no such port",
+    Exit.UNREACHABLE: "daemon unreachable",
+    Exit.IN_USE: "port, bus address or robot id in use",
+    Exit.NO_PERMISSION: "no permission",
+    Exit.BAD_CONFIG: "bad configuration",
+}
+"""What a code means, for people."""
+
+
 class ExitError(MendableError):
     """Ends the program with `code`; the text says what was wrong and what to do."""
 

@@ -1,8 +1,9 @@
 """A good line -> feedback: when its sample was made, and what the wheels did since the one before.
 
 Whose clock says how far two lines are apart: the MCU's own where it sends it with its counts; the
-lines that left where each is answered (`prompts.py`); the period of an MCU that reports by itself
-(`slots.py`, and which of the two it is: `habit.py`); else the reads, evenly over the lines of one.
+lines that left where each is answered (`clock_of_answers.py`); the period of an MCU that reports by
+itself (`clock_of_reports.py`, and which of the two it is: `habit.py`); else the reads, evenly over
+the lines of one.
 Whether the link can be trusted is `session.py`'s, by arrival alone.
 """
 
@@ -16,11 +17,11 @@ from msgspec.structs import replace
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.mcu.check import Reading
+from acsard.mcu.clock_of_answers import Prompts
+from acsard.mcu.clock_of_reports import Slots
 from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.frames import Codec, Motors
 from acsard.mcu.habit import Habit
-from acsard.mcu.prompts import Prompts
-from acsard.mcu.slots import Slots
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
 BRIDGED_S = 1.0
@@ -28,6 +29,9 @@ BRIDGED_S = 1.0
 
 APART_NS = 1000
 """Between the stamps of two lines at least: what has the time of the one before is taken for it."""
+
+LATER = 0.05
+"""How quickly it follows by how much one clock is later than another."""
 
 FULL_READ = 1024
 """Bytes that the port reads at once: behind so many there may be more."""
@@ -98,6 +102,8 @@ class Timeline:
         self._forgotten = True
         self._told = Told("reads", 0)
         """The last good line's."""
+        self._later = 0.0
+        """How much later answers are due by their lines than by the slots, ns, in the mean."""
         self.leaps = 0
         """Readings whose counts no wheel can have made; the speeds stood in for them."""
         self.restarted = False
@@ -157,7 +163,7 @@ class Timeline:
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # Who answers makes no line that we do not ask for: none is missing for that we were silent.
-        clocked = told.clock != "reads" or self._prompts.lost
+        clocked = told.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
@@ -179,18 +185,21 @@ class Timeline:
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
             prompts = self._prompts
-            plain = (speaks is False or prompts.thinks) and not prompts.lost
-            ours = asked_ns is not None or plain
+            ours = asked_ns is not None or speaks is False or prompts.thinks
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay is that of a first answer read late, in a stall that the
                     # line before has counted: this one is no further from it than it came.
                     return Told("prompts", came_ns)
                 return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
+        else:
+            answered = None
         if slots.period is None:
             return self._told_by_reads()
         place, due_ns = slots.place(self._rest), min(slots.time_ns(self._rest), came_ns)
         last = self._told
+        if answered is not None:
+            self._compare(answered.due_ns - slots.time_ns(self._rest))
         if last.clock != "slots" or last.found != slots.found:
             return Told("slots", due_ns, place=place, found=slots.found)
         passed = max(0.0, place - last.place)
@@ -208,15 +217,26 @@ class Timeline:
         no change of clocks adds up.
         """
         last = self._told
-        due_ns = told.due_ns
-        if due_ns < last.due_ns:
-            due_ns, told = last.due_ns, replace(told, due_ns=last.due_ns)
-        self._told = told
+        late_ns = self._late_ns(told.clock) - self._late_ns(last.clock)
+        dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
+        self._told = replace(told, due_ns=max(told.due_ns, last.due_ns))
         if told.dt is not None and told.clock == last.clock:
             return told.dt, told.bridged
-        dt, period = (due_ns - last.due_ns) / NS_PER_S, self._usual_ns / NS_PER_S
+        period = self._usual_ns / NS_PER_S
         missing = dt > 1.5 * period and self._habit.speaks is not False
         return dt, dt - period if missing else 0.0
+
+    def _compare(self, later_ns: int) -> None:
+        """By their lines, answers are due so much later than by the slots."""
+        if self._told.found != self._slots.found:
+            self._later = float(later_ns)
+        self._later += LATER * (later_ns - self._later)
+
+    def _late_ns(self, clock: str) -> float:
+        """How much later than by the slots a line is due by this clock, in the mean."""
+        if clock == "reads":
+            return self._slots.late_ns
+        return self._later if clock == "prompts" else 0.0
 
     @property
     def _usual_ns(self) -> float:

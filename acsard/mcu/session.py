@@ -14,13 +14,13 @@ from acsard.mcu.check import Reading, unseal
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.hearing import Hearing
-from acsard.mcu.lateness import Lateness
 from acsard.mcu.lines import LineReader
 from acsard.mcu.link import Link
 from acsard.mcu.link import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
 from acsard.mcu.snapping import Snapping
 from acsard.mcu.throttle import Throttle
+from acsard.mcu.whose_silence import Lateness
 from acsard.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {

@@ -67,14 +67,14 @@ def _near(new: Path, ending: str) -> Path:
 def _require_free(new: Path, force: bool) -> None:
     if not (new.exists() or new.is_symlink()):
         return
-    if not force:
-        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
     if new.is_dir():
         _require_bag(new)
     elif new.exists() and not new.is_file():
         raise FileExistsError(EEXIST, "it is no file but a device or a pipe; name a file")
     elif new.is_file() and _is_recording(new):
         raise FileExistsError(EEXIST, "it is a recording; name another file")
+    if not force:
+        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
 
 
 def _require_bag(directory: Path) -> None:

@@ -19,8 +19,8 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.record.batch import encode
+from acsard.record.directory import Ring
 from acsard.record.file import About, Writing
-from acsard.record.ring import Ring
 from acsard.record.state import freeze
 from acsard.record.steps import Taken
 from acsard.record.story import told

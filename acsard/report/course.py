@@ -117,6 +117,11 @@ class Course:
         """No step to come counts."""
         return self._wall > self._window[1]
 
+    @property
+    def at(self) -> float:
+        """Wall-clock time of the last step, s."""
+        return self._wall
+
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
         """A step as it was recorded, and what `robot` made of it now."""
         now = step.inputs.now

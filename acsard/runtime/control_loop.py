@@ -21,7 +21,7 @@ from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import Queries, Query, refused
 from acsard.incoming.routers import RoutersTold
-from acsard.mcu.port import Port
+from acsard.mcu.gate import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
 from acsard.messages.schema import Info, Message

@@ -21,7 +21,7 @@ import serial_asyncio
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import in_thread
-from acsard.mcu.port import Gate, Offered
+from acsard.mcu.gate import Gate, Offered
 from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
 

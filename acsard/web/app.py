@@ -14,21 +14,26 @@ from aiohttp import web
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.web.calls import Calls
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
 from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
-from acsard.web.hand import Hand
-from acsard.web.limits import CONNECTIONS, CONNECTIONS_OF_ONE, Places, Tries
+from acsard.web.guide import Guide
+from acsard.web.limits import FULL, Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
+from acsard.web.reports import Reports
 from acsard.web.requests import (
     COOKIE,
     asked_of,
     body_of,
     keep_little,
     own_address,
+    problem,
     secured,
+    sent,
+    takes_gzip,
     token_posted,
     token_shown,
 )
@@ -71,14 +76,17 @@ class Page:
         vault: Vault,
         names: frozenset[str],
         gate: Gate,
+        guide: Guide,
         page: Path = PAGE,
     ) -> None:
         """`names` are those by which the robot is reached from elsewhere, lower case."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
+        self._guide = guide
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
-        self._files, self._programs = Files(page), Programs(robots, calls, counts)
+        self._files, self._reports = Files(page), Reports()
+        self._programs = Programs(robots, calls, counts, self._reports)
         self._tries = Tries()
-        self._places = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._seats = Seats()
         self._viewers: set[Viewer] = set()
         self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
         self.app.on_response_prepare.append(secured)
@@ -92,8 +100,11 @@ class Page:
                 web.get("/api", self._api),
                 web.get("/api/recordings", self._recordings),
                 web.get("/api/recordings/{name}", self._recording),
+                web.post("/api/recordings/{name}/report", self._draw),
+                web.get("/report/{name}", self._report),
                 web.get("/api/whoami", self._whoami),
                 web.get("/api/settings", self._settings),
+                web.get("/api/guide", self._guided),
                 web.post("/api/srv/{verb}", self._service),
                 web.get("/api/{key:.+}", self._value),
                 web.get("/metrics", self._metrics),
@@ -107,11 +118,14 @@ class Page:
 
     def end_all(self, why: str) -> None:
         """Everybody goes; who drove stops."""
+        self._reports.end()
         for viewer in list(self._viewers):
             viewer.end(why)
 
-    async def end_revoked(self) -> None:
-        """Those go whose token counts no more, or cannot be looked up."""
+    async def tidy(self) -> None:
+        """To be called now and then: those go whose token counts no more, or cannot be looked
+        up, and the report that nobody waits for."""
+        self._reports.tidy()
         try:
             counting = await in_thread(self._vault.counting, READ_S)
         except TimeoutError:
@@ -130,7 +144,7 @@ class Page:
         if isinstance(spot, Refusal):
             return self.refused(spot)
         acts = request.method not in ("GET", "HEAD") or request.path == "/ws"
-        if acts or request.path.startswith(("/api", "/metrics")):
+        if acts or request.path.startswith(("/api", "/metrics", "/report")):
             strange = foreign(asked)
             if strange is not None:
                 return self.refused(strange)
@@ -206,20 +220,12 @@ class Page:
         file = await in_thread(lambda: self._files.get(name), READ_S)
         if file is None:
             raise web.HTTPNotFound
-        headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
-        if request.headers.get("If-None-Match") == file.tag:
-            return web.Response(status=304, headers=headers)
-        body = file.body
-        if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
-            body, headers["Content-Encoding"] = file.packed, "gzip"
-        return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+        return sent(request, file)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         who, peer = _who(request), request.remote or ""
-        if not self._places.enter(peer):
-            return self.refused(
-                Refusal("too_many", f"{CONNECTIONS} pages at most, {CONNECTIONS_OF_ONE} of one")
-            )
+        if not self._seats.enter(peer, who.token):
+            return self.refused(Refusal("too_many", FULL))
         try:
             served = web.WebSocketResponse(
                 max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
@@ -228,7 +234,7 @@ class Page:
             keep_little(request)
             viewer = Viewer(
                 served, request, who, self._robots, self._hand, self._calls, self._fleet,
-                self._counts,
+                self._guide, self._counts,
             )  # fmt: skip
             self._viewers.add(viewer)
             try:
@@ -236,7 +242,7 @@ class Page:
             finally:
                 self._viewers.discard(viewer)
         finally:
-            self._places.leave(peer)
+            self._seats.leave(peer, who.token)
         return served
 
     # for programs
@@ -254,6 +260,9 @@ class Page:
     async def _settings(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.settings(_who(request))
 
+    async def _guided(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.guide(_who(request), self._guide)
+
     async def _value(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.value(_who(request), request.match_info["key"])
 
@@ -267,16 +276,18 @@ class Page:
     async def _recording(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.recording(_who(request), request.match_info["name"])
 
+    async def _draw(self, request: web.Request) -> web.StreamResponse:
+        return await self._programs.draw(_who(request), request.match_info["name"])
+
+    async def _report(self, request: web.Request) -> web.StreamResponse:
+        name, packed = request.match_info["name"], takes_gzip(request)
+        return await self._programs.report(_who(request), name, packed)
+
 
 def _who(request: web.Request) -> Who:
     who = request[WHO]
     assert who is not None, "it is not open to all"
     return who
-
-
-def problem(status: int, text: str) -> web.Response:
-    """What was wrong, in words."""
-    return web.json_response({"error": text}, status=status)
 
 
 _WORDS = {

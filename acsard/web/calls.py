@@ -7,9 +7,11 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+from acsard.bus import fleet
 from acsard.bus.access import MAY, SERVICE_ROLES
+from acsard.bus.address import require_id
 from acsard.client import Client
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, UsageError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError
 from acsard.messages.schema import ServiceReply
@@ -20,6 +22,9 @@ from acsard.web.who import Who
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
 """Of all viewers. Stops have a room of their own; more of them would all stop the same robot."""
+
+ELSEWHERE_AT_ONCE = 8
+"""Stops of other robots that are waited for; one beyond is told to its robot all the same."""
 
 ANSWER_S = 8.0
 """Longer than a client waits for its answer, which says why there is none."""
@@ -43,20 +48,29 @@ class Calls:
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
-        self._running, self._stops = 0, Stops()
+        self._running, self._stops, self._elsewhere = 0, Stops(), 0
 
-    async def call(self, who: Who, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
-        """Call a service in the name of `who`; raises `RefusedError`."""
+    async def call(
+        self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
+    ) -> ServiceReply:
+        """Call a service in the name of `who`, of another `robot` only stop; raises
+        `RefusedError`."""
         require(who, verb)
+        other = "" if robot == self._robots.id else robot
+        if other:
+            _require_stop(verb, other)
         client = self._robots.client
         if client is None:
             return ServiceReply(False, self._robots.gone)
 
         def request() -> ServiceReply:
-            return _named(client, self._robots.id, who).request(verb, payload)
+            return _named(client, other or self._robots.id, who).request(verb, payload)
 
         try:
-            reply = await (self._stops.ask(request) if verb == "stop" else self._ask(request))
+            if other:
+                reply = await self._stop(other, client, who, request)
+            else:
+                reply = await (self._stops.ask(request) if verb == "stop" else self._ask(request))
         except (MendableError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "no answer in time")
         if verb == "set" and reply.success:
@@ -69,6 +83,19 @@ class Calls:
         if client is None:
             raise MendableError(self._robots.gone)
         return await self._ask(lambda: client.like(robot).reply(f"{name}?fmt=json"))
+
+    async def _stop(
+        self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
+    ) -> ServiceReply:
+        """Of another robot: names that none has keep none waiting."""
+        if self._elsewhere < ELSEWHERE_AT_ONCE:
+            self._elsewhere += 1
+            try:
+                return await in_thread(request, ANSWER_S)
+            finally:
+                self._elsewhere -= 1
+        await in_thread(lambda: fleet.stop(client.session, [robot], _caller(who)), ANSWER_S)
+        return ServiceReply(False, f"{robot} was told to stop; look at it: {BUSY}")
 
     async def _ask(self, call: Callable[[], T]) -> T:
         if self._running >= AT_ONCE:
@@ -114,8 +141,26 @@ def require(who: Who, verb: str) -> None:
         )
 
 
+def _require_stop(verb: str, robot: str) -> None:
+    """Raises `RefusedError`."""
+    try:
+        require_id(robot)
+    except UsageError as error:
+        raise RefusedError(str(error), role=False) from None
+    if verb != "stop":
+        raise RefusedError(
+            f"{robot} is not this page's robot: here it is seen and stopped; for {verb} open its "
+            "own page",
+            role=True,
+        )
+
+
 def _named(client: Client, robot: str, who: Who) -> Client:
     """The daemon's log says who called."""
     other = client.like(robot)
-    other.name = f"{who.name}@page"
+    other.name = _caller(who)
     return other
+
+
+def _caller(who: Who) -> str:
+    return f"{who.name}@page"

@@ -30,6 +30,13 @@ FORGET_NS = 30 * NS_PER_S
 ASK_NS = 2 * NS_PER_S
 """Who has not said his version is asked again so often."""
 
+UNROUTED = (
+    "seen by way of the daemon of {robot} alone, and daemons hand on nothing that others say: only "
+    "one that is connected to it is here too. For all robots of a router have this page's server "
+    "at the router: acsard web --connect ROUTER --id {robot}"
+)
+"""Why there are not more."""
+
 LONG = 40
 """Characters of a version that are shown."""
 
@@ -72,6 +79,8 @@ class Fleet:
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
         self._busy: set[asyncio.Task[None]] = set()
+        self.note = ""
+        """What is to be known of the rows, in words; "" behind a router."""
 
     def join(self, viewer: object) -> None:
         """This one looks from now on."""
@@ -160,6 +169,8 @@ class Fleet:
     async def _declare(self, client: Client) -> None:
         def declare() -> list[Any]:
             session = client.session
+            routed = bool(session.info.routers_zid())
+            self.note = "" if routed else UNROUTED.format(robot=self._robots.id)
             states = session.declare_subscriber(full_key(ALL, "state"), self._state)
             try:
                 tokens = session.liveliness().declare_subscriber(

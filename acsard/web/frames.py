@@ -7,7 +7,7 @@ One JSON object a message; what it is for is told by its first field (`subscribe
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -26,6 +26,7 @@ LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
 later stamp than his last command."""
 
 Short = Annotated[str, Meta(max_length=80)]
+Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
@@ -85,6 +86,7 @@ class Call(_Frame, frozen=True):
     call: Short
     id: int | Short = 0
     payload: dict[str, Any] = {}
+    robot: Short = ""
 
 
 class Ping(_Frame, frozen=True):
@@ -93,7 +95,30 @@ class Ping(_Frame, frozen=True):
     ping: float
 
 
-Frame = Subscribe | Unsubscribe | Command | Call | Ping
+class Begin(_Frame, frozen=True):
+    """Check the board at `port`, or calibrate by a `way`, "" for the usual one."""
+
+    begin: Literal["check", "calibrate"]
+    port: Device = ""
+    way: Short = ""
+    positions: Short = ""
+    """The key they come on, with that way."""
+
+
+class Reply(_Frame, frozen=True):
+    """The answer to the question of this number, of what was begun; none is what is usual."""
+
+    reply: int
+    value: float | Short | None = None
+
+
+class Press(_Frame, frozen=True):
+    """A key at the terminal of what was begun, or Ctrl-C."""
+
+    press: Literal["key", "leave"]
+
+
+Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
 KINDS: dict[str, type[Frame]] = {
     "subscribe": Subscribe,
@@ -101,6 +126,9 @@ KINDS: dict[str, type[Frame]] = {
     "cmd": Command,
     "call": Call,
     "ping": Ping,
+    "begin": Begin,
+    "reply": Reply,
+    "press": Press,
 }
 """What a message is by the field it has."""
 

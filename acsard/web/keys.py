@@ -9,9 +9,10 @@ from typing import Any
 from acsard.bus.address import require_id
 from acsard.host.errors import UsageError
 from acsard.web.frames import Subscribe, Unsubscribe
-from acsard.web.outgoing import Following, Outgoing
+from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 from acsard.web.robots import AGAIN_S, Robots
 from acsard.web.streams import KEYS, UNREADY, Stream
+from acsard.web.to_browser import Following, Outgoing
 
 MOST = 32
 
@@ -23,12 +24,16 @@ CLIENT_S = 0.2
 
 
 class Keys:
-    """Of one viewer; `start` runs what has to wait."""
+    """Of one viewer; `start` runs what has to wait, `holder` is whose share of room it takes."""
 
     def __init__(
-        self, out: Outgoing, robots: Robots, start: Callable[[Coroutine[Any, Any, None]], None]
+        self,
+        out: Outgoing,
+        robots: Robots,
+        start: Callable[[Coroutine[Any, Any, None]], None],
+        holder: str,
     ) -> None:
-        self._out, self._robots, self._start = out, robots, start
+        self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
         """Follow a key, or another rate of it; what may not be is refused."""
@@ -51,6 +56,9 @@ class Keys:
             self._out.wake()
         elif len(self._out.following) >= MOST:
             self._out.refuse("subscribe", "too_many", f"{MOST} keys at most")
+        elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
+            text = f"{STREAMS_OF_ONE} keys of other robots for one token, {STREAMS} in all"
+            self._out.refuse("subscribe", "too_many", f"no room: {text}; unsubscribe some")
         else:
             one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
             self._out.following[robot, key] = one
@@ -60,15 +68,27 @@ class Keys:
         """No more of it."""
         name = frame.robot or self._robots.id, frame.unsubscribe
         one = self._out.following.pop(name, None)  # at once: it may be subscribed to anew next
-        if one is not None and one.stream is not None:
-            self._start(self._robots.streams.leave(*name))
+        if one is not None:
+            self._give_back(one)
+            if one.stream is not None:
+                self._start(self._robots.streams.leave(*name))
 
     async def leave_all(self) -> None:
         """No more of any."""
         followed, self._out.following = self._out.following, {}
         for one in followed.values():
+            self._give_back(one)
+        for one in followed.values():
             if one.stream is not None:
                 await self._robots.streams.leave(one.robot, one.name)
+
+    @property
+    def _shares(self) -> Shares:
+        return self._robots.streams.shares
+
+    def _give_back(self, one: Following) -> None:
+        if one.robot != self._robots.id:
+            self._shares.leave(self._holder, (one.robot, one.name))
 
     async def _join(self, one: Following) -> None:
         stream = None
@@ -89,15 +109,11 @@ class Keys:
             await asyncio.sleep(CLIENT_S)
             return None
         try:
-            stream = await self._robots.streams.follow(client, one.robot, one.name)
+            return await self._robots.streams.follow(client, one.robot, one.name)
         except UNREADY:
             self._out.refuse("subscribe", "stuck", "the bus is stuck; it is tried again")
             await asyncio.sleep(AGAIN_S)
             return None
-        if stream is None and self._is_followed(one):
-            del self._out.following[one.robot, one.name]
-            self._out.refuse("subscribe", "too_many", "no room for another key: try again")
-        return stream
 
     def _is_followed(self, one: Following) -> bool:
         return self._out.following.get((one.robot, one.name)) is one

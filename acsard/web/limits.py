@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Hashable
 
 from acsard.values import NS_PER_S
 
@@ -12,8 +13,17 @@ MESSAGES_HZ, MESSAGES_AT_ONCE = 200.0, 400.0
 OVERRUNS = 600
 """So many messages too many end a connection."""
 
-CONNECTIONS, CONNECTIONS_OF_ONE = 100, 20
-"""WebSockets: in all, and of one address."""
+CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN = 100, 20, 30
+"""WebSockets: in all, of one address, and with one token, from wherever."""
+
+FULL = (
+    f"there is room for {CONNECTIONS} pages, {CONNECTIONS_OF_ONE} of one address, "
+    f"{CONNECTIONS_OF_TOKEN} with one token: close some"
+)
+
+STREAMS, STREAMS_OF_ONE = 200, 50
+"""Keys of other robots that are followed: in all, and for one token. Those of the page's own robot
+are few, and for everybody."""
 
 TRIES_OF_ONE, TRIES = 10, 100
 """Wrong tokens a minute: of one address, and in all."""
@@ -59,7 +69,7 @@ class Tries:
 
 
 class Places:
-    """Room for so many, and for so many of one address."""
+    """Room for so many, and for so many of one address (or token)."""
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
@@ -82,3 +92,58 @@ class Places:
         self._taken[address] -= 1
         if not self._taken[address]:
             del self._taken[address]
+
+
+class Seats:
+    """Room for the pages that are open: of an address, and with a token where there is one."""
+
+    def __init__(self) -> None:
+        self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._tokens = Places(CONNECTIONS, CONNECTIONS_OF_TOKEN)
+
+    def enter(self, address: str, token: str) -> bool:
+        """Take a place, if there is one."""
+        if not self._addresses.enter(address):
+            return False
+        if token and not self._tokens.enter(token):
+            self._addresses.leave(address)
+            return False
+        return True
+
+    def leave(self, address: str, token: str) -> None:
+        """Give it back."""
+        self._addresses.leave(address)
+        if token:
+            self._tokens.leave(token)
+
+
+class Shares:
+    """Room for so many different things, and for so many that one holds; who holds the same as
+    another takes no more room in all."""
+
+    def __init__(self, most: int, of_one: int) -> None:
+        self._most, self._of_one = most, of_one
+        self._held: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
+        """By thing: who holds it, and how often."""
+
+    def enter(self, holder: str, thing: Hashable) -> bool:
+        """Hold it (once more), if there is room."""
+        holders = self._held.get(thing)
+        if holders is None and len(self._held) >= self._most:
+            return False
+        if not (holders and holder in holders) and self._of(holder) >= self._of_one:
+            return False
+        self._held[thing][holder] += 1
+        return True
+
+    def leave(self, holder: str, thing: Hashable) -> None:
+        """Let go of it once."""
+        holders = self._held[thing]
+        holders[holder] -= 1
+        if not holders[holder]:
+            del holders[holder]
+        if not holders:
+            del self._held[thing]
+
+    def _of(self, holder: str) -> int:
+        return sum(holder in holders for holders in self._held.values())

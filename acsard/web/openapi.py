@@ -117,6 +117,18 @@ _RECORDING: Described = {
     },
 }
 
+_REPORT: Described = {
+    "type": "object",
+    "required": ["report"],
+    "properties": {
+        "report": {"type": "string", "enum": ["drawing", "busy", "ready", "failed"]},
+        "text": {"type": "string", "description": "why it failed, or what to wait for"},
+        "percent": {"type": "integer"},
+        "seconds": {"type": "number", "description": "since it was begun"},
+        "href": {"type": "string", "description": "where it is, from the page on"},
+    },
+}
+
 _SETTING: Described = {
     "type": "object",
     "required": ["key", "value", "what", "when"],
@@ -128,6 +140,25 @@ _SETTING: Described = {
         "low": {"type": "number"},
         "high": {"type": "number"},
         "choices": {"type": "array", "items": {"type": "string"}},
+    },
+}
+
+_CHOICES: Described = {
+    "type": "object",
+    "properties": {
+        "ways": {
+            "type": "object",
+            "description": "of calibrating, and what each needs",
+            "additionalProperties": {"type": "string"},
+        },
+        "ports": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {"port": {"type": "string"}, "what": {"type": "string"}},
+            },
+        },
+        "note": {"type": "string", "description": "what cannot be done here, and what to type"},
     },
 }
 
@@ -147,6 +178,13 @@ _OTHERS: Described = {
             },
         }
     },
+    "/api/guide": {
+        "get": {
+            "summary": "what the WebSocket takes to begin: ways to calibrate, ports to check; for "
+            "a maintainer",
+            "responses": {"200": _answer("Choices.", _CHOICES), "default": _TROUBLE},
+        }
+    },
     "/api/recordings": {
         "get": {
             "summary": "the recordings of the black box, oldest first",
@@ -162,6 +200,29 @@ _OTHERS: Described = {
             "parameters": [_NAME],
             "responses": {
                 "200": _answer("MCAP.", {}, "application/octet-stream"),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/api/recordings/{name}/report": {
+        "post": {
+            "summary": "draws its report, or says how far that is: ask again; for who is at least "
+            "operator",
+            "parameters": [_NAME],
+            "responses": {
+                "200": _answer("It is at `href`.", _REPORT),
+                "202": _answer("It is being drawn, or another one is.", _REPORT),
+                "503": _answer("It cannot be drawn, and why.", _REPORT),
+                "default": _TROUBLE,
+            },
+        }
+    },
+    "/report/{name}": {
+        "get": {
+            "summary": "the report, once it is drawn; for who is at least operator",
+            "parameters": [_NAME],
+            "responses": {
+                "200": _answer("A page.", {"type": "string"}, "text/html"),
                 "default": _TROUBLE,
             },
         }

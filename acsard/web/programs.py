@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gzip import decompress
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,17 @@ from acsard.values import AcsardError
 from acsard.web import metrics, openapi, recordings, settings
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.counts import Counts
+from acsard.web.guide import Guide
+from acsard.web.reports import POLICY, Reports, State
 from acsard.web.robots import Robots
 from acsard.web.streams import as_json
 from acsard.web.who import Who, is_loopback
 
 READ_S = 10.0
 """For a disk."""
+
+DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
+"""How far a report is, as a status."""
 
 
 class TroubleError(AcsardError):
@@ -37,8 +43,9 @@ class TroubleError(AcsardError):
 class Programs:
     """Answers; who asks and whether he may come in at all is known by then."""
 
-    def __init__(self, robots: Robots, calls: Calls, counts: Counts) -> None:
+    def __init__(self, robots: Robots, calls: Calls, counts: Counts, reports: Reports) -> None:
         self._robots, self._calls, self._counts = robots, calls, counts
+        self._reports = reports
         self._document = msgspec.json.encode(openapi.document(__version__))
 
     def described(self) -> web.Response:
@@ -59,6 +66,14 @@ class Programs:
         assert isinstance(told.body, bytes)
         rows = settings.rows(msgspec.json.decode(told.body))
         return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
+
+    async def guide(self, who: Who, guide: Guide) -> web.Response:
+        """What may be begun: a check of the board, a calibration."""
+        if not who.may("maintainer"):
+            self._counts.refuse("role")
+            raise TroubleError(403, f"checks and calibrations are for maintainers, not {who.role}")
+        body = msgspec.json.encode(await guide.choices())
+        return web.Response(body=body, content_type="application/json")
 
     async def value(self, who: Who, key: str) -> web.Response:
         """The last value of a key."""
@@ -105,19 +120,54 @@ class Programs:
 
     async def recording(self, who: Who, name: str) -> web.StreamResponse:
         """One of them."""
+        path, _ = await self._recorded(who, name)
+        told = {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
+
+    async def draw(self, who: Who, name: str) -> web.Response:
+        """How far the report of one is; who asks first begins it."""
+        told = self._reports.ask(*await self._recorded(who, name))
+        body = msgspec.json.encode(told)
+        return web.Response(body=body, content_type="application/json", status=DRAWN[told.report])
+
+    async def report(self, who: Who, name: str, packed: bool) -> web.Response:
+        """The report of one, as a page that has nothing to do with ours."""
+        self._require_operator(who)
+        body = self._reports.drawn(name)
+        if body is None:
+            self._counts.refuse("path")
+            raise TroubleError(404, f"it is not drawn: POST /api/recordings/{name}/report first")
+        headers = {
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Security-Policy": POLICY,
+            "Vary": "Accept-Encoding",
+        }
+        if packed:
+            return web.Response(body=body, headers=headers | {"Content-Encoding": "gzip"})
+        return web.Response(body=await in_thread(lambda: decompress(body), None), headers=headers)
+
+    async def _recorded(self, who: Who, name: str) -> tuple[Path, tuple[int, int]]:
+        """Where the recording is, and its stamp."""
+        self._require_operator(who)
+        place = self._place()
+
+        def look() -> tuple[Path, tuple[int, int]] | None:
+            path = recordings.named(place, name)
+            return None if path is None else (path, recordings.stamp(path))
+
+        try:
+            found = await in_thread(look, READ_S)
+        except (OSError, TimeoutError) as error:
+            raise _unread(place, error) from None
+        if found is None:
+            self._counts.refuse("path")
+            raise TroubleError(404, "there is no such recording; GET /api/recordings lists them")
+        return found
+
+    def _require_operator(self, who: Who) -> None:
         if not who.may("operator"):
             self._counts.refuse("role")
             raise TroubleError(403, f"recordings are for operators; you are {who.role}")
-        place = self._place()
-        try:
-            path = await in_thread(lambda: recordings.named(place, name), READ_S)
-        except (OSError, TimeoutError) as error:
-            raise _unread(place, error) from None
-        if path is None:
-            self._counts.refuse("path")
-            raise TroubleError(404, "there is no such recording; GET /api/recordings lists them")
-        told = {"Content-Disposition": f'attachment; filename="{path.name}"'}
-        return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
 
     def _place(self) -> Path:
         """The directory of the black box; raises `TroubleError`."""

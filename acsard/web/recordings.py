@@ -9,8 +9,8 @@ from pathlib import Path
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
+from acsard.record.directory import PART, STAMP, listed
 from acsard.record.file import closing
-from acsard.record.ring import PART, STAMP, listed
 from acsard.values import NS_PER_S
 
 
@@ -36,6 +36,12 @@ def named(directory: Path, name: str) -> Path | None:
     """The file of this name, if it is one of them; raises `OSError`."""
     found = (path for path in listed(directory) if path.name == name)
     return next((path for path in found if path.is_file() and not path.is_symlink()), None)
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """Another when there is more in it; raises `OSError`."""
+    seen = path.stat()
+    return seen.st_mtime_ns, seen.st_size
 
 
 def _row(path: Path) -> Listed:

@@ -10,6 +10,7 @@ from urllib.parse import parse_qsl
 import msgspec
 from aiohttp import web
 
+from acsard.web.files import File
 from acsard.web.who import Asked
 
 COOKIE = "__Host-acsard"
@@ -22,6 +23,16 @@ PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
 """How the headers begin by which a proxy says that it hands on what another asked."""
 
 NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
+
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Server": "acsard",
+}
+"""What every answer has."""
 
 BODY_S = 5.0
 """For a body of a few hundred bytes; who keeps it keeps a place that others wait for."""
@@ -41,6 +52,11 @@ def asked_of(request: web.Request) -> Asked:
         request.headers.get("Sec-Fetch-Site"),
         any(name.lower().startswith(PROXIES) for name in request.headers),
     )
+
+
+def problem(status: int, text: str) -> web.Response:
+    """What was wrong, in words."""
+    return web.json_response({"error": text}, status=status)
 
 
 def own_address(request: web.Request) -> str:
@@ -78,6 +94,22 @@ async def token_posted(request: web.Request) -> str:
     raise web.HTTPBadRequest(reason=NO_TOKEN)
 
 
+def sent(request: web.Request, file: File) -> web.Response:
+    """A file of the page's, unless the browser has it; packed where it takes that."""
+    headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+    if request.headers.get("If-None-Match") == file.tag:
+        return web.Response(status=304, headers=headers)
+    body = file.body
+    if file.packed is not None and takes_gzip(request):
+        body, headers["Content-Encoding"] = file.packed, "gzip"
+    return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+
+
+def takes_gzip(request: web.Request) -> bool:
+    """The client unpacks it by itself."""
+    return "gzip" in request.headers.get("Accept-Encoding", "")
+
+
 def keep_little(request: web.Request) -> None:
     """Let the kernel hold little for a client that does not read."""
     at = None if request.transport is None else request.transport.get_extra_info("socket")
@@ -91,16 +123,10 @@ async def secured(request: web.Request, response: web.StreamResponse) -> None:
     # A browser of before 2022 does not take 'self' for ws too; a Host that is none of ours is
     # refused, and not written back.
     connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
-    response.headers.update(
-        {
-            "Content-Security-Policy": f"default-src 'self'; connect-src 'self'{connect}; "
-            "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Opener-Policy": "same-origin",
-            "Cross-Origin-Resource-Policy": "same-origin",
-        }
+    policy = (
+        f"default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; "
+        "base-uri 'none'; form-action 'self'"
     )
+    response.headers.update(HEADERS)
+    response.headers.setdefault("Content-Security-Policy", policy)  # a report has its own
     response.headers.setdefault("Cache-Control", "no-store")
-    response.headers["Server"] = "acsard"

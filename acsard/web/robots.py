@@ -61,7 +61,7 @@ class Robots:
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.about = about
         self.client: Client | None = None
-        self.streams = Streams(counts)
+        self.streams = Streams()
         self.gone = f"no daemon answers at {address.endpoint} yet"
         """Why nothing is heard of the robot, in words; "" while it is."""
         self._connect, self._counts = connect, counts
@@ -99,9 +99,7 @@ class Robots:
         assert self.client is not None
         while True:
             try:
-                stream = await self.streams.follow(self.client, self.id, key)
-                assert stream is not None, "the first ones find room"
-                return stream
+                return await self.streams.follow(self.client, self.id, key)
             except UNREADY:
                 self.gone = "the bus is stuck; it is tried again"
                 await asyncio.sleep(AGAIN_S)

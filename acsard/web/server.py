@@ -23,22 +23,26 @@ from acsard.client import Client
 from acsard.config.settings import Config
 from acsard.host.addresses import own_addresses
 from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.host.logs import Log
 from acsard.host.parent import end_with_parent
 from acsard.web.app import Page
 from acsard.web.calls import Calls
+from acsard.web.commands import SOURCE, Hand
 from acsard.web.counts import Counts
+from acsard.web.errands import Reach
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
-from acsard.web.hand import SOURCE, Hand
+from acsard.web.guide import Guide
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
+from acsard.web.unreadable import Reader
 from acsard.web.who import is_loopback
 
 TRIES = 20
 """Ports after a taken one that are tried."""
 
-BEAT_S, TIDY_S = 0.5, 1.0
+BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0
 
 NICE = 5
 """Behind the daemon that has started us."""
@@ -89,6 +93,8 @@ class Wanted(Struct, frozen=True):
     """The directory of the robot's certificate, for who comes from elsewhere."""
     state: Path
     """The directory of the tokens."""
+    file: str = ""
+    """The configuration file that was named; "" is none."""
     next_port: bool = False
     """Take a later port where one is taken."""
     held: bool = False
@@ -137,7 +143,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     return found
 
 
-async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> None:
+async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: Log) -> None:
     """Until a signal; `announce` is told once where it is. Raises `MendableError`s."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     leaving = asyncio.Event()
@@ -152,7 +158,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
     hand = Hand(lambda: robots.client, counts)
     calls, fleet = Calls(robots), Fleet(robots)
     vault, gate = Vault(wanted.state), Gate(counts)
-    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, wanted.page)
+    guide = Guide(_reach(wanted), wanted.config.mcu.port)
+    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, guide, wanted.page)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S,
@@ -160,10 +167,11 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
     async with AsyncExitStack() as stack:
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
+        stack.push_async_callback(guide.close)
         places = [_bound(one, wanted.next_port) for one in wanted.listen]
         for one, bound in places:
             server = await asyncio.get_running_loop().create_server(
-                gate.guarded(runner.server),  # type: ignore[arg-type]
+                gate.guarded(lambda: Reader(counts, runner.server)),
                 sock=bound,
                 ssl=secure if one.secure else None,
                 ssl_handshake_timeout=HANDSHAKE_S if one.secure else None,
@@ -171,6 +179,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None]) -> No
             )
             stack.callback(server.close)
         announce([one.url for one, _ in places])
+        stack.callback(asyncio.create_task(_tell(counts, log)).cancel)
         await _until(leaving, robots, hand, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
@@ -201,7 +210,15 @@ async def _until(
 async def _tidy(page: Page) -> None:
     while True:
         await asyncio.sleep(TIDY_S)
-        await page.end_revoked()
+        await page.tidy()
+
+
+async def _tell(counts: Counts, log: Log) -> None:
+    """What is refused, a line a second at most."""
+    while True:
+        await asyncio.sleep(TELL_S)
+        if (news := counts.news()) is not None:
+            log.event(news)
 
 
 async def _held(leaving: asyncio.Event) -> None:
@@ -236,6 +253,11 @@ def _connected(address: Address) -> Client:
     """The way to the daemon; blocks."""
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, SOURCE, address.tls)
+
+
+def _reach(wanted: Wanted) -> Reach:
+    address = wanted.address
+    return Reach(wanted.file, address.endpoint, address.robot_id, address.tls)
 
 
 def _about(wanted: Wanted) -> About:

@@ -20,13 +20,10 @@ from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, detect
 from acsard.messages.topics import PUBLISHED
-from acsard.web.counts import Counts
+from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 
 KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
 """What may be followed."""
-
-MOST = 200
-"""Keys of all robots at once."""
 
 DECLARE_S = 3.0
 
@@ -80,17 +77,16 @@ class Stream:
 class Streams:
     """Those that somebody follows; the last to go ends one."""
 
-    def __init__(self, counts: Counts) -> None:
+    def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
-        self._counts = counts
+        self.shares = Shares(STREAMS, STREAMS_OF_ONE)
+        """Who follows what of other robots; to be entered before and left after."""
 
-    async def follow(self, client: Client, robot: str, key: str) -> Stream | None:
-        """The stream of this key; None where there is no room. `TimeoutError` from a locked bus."""
+    async def follow(self, client: Client, robot: str, key: str) -> Stream:
+        """The stream of this key; `TimeoutError` from a locked bus."""
         name = robot, key
         stream = self._streams.get(name)
         if stream is None:
-            if len(self._streams) >= MOST:
-                return None
             stream = self._streams[name] = Stream(client.like(robot).key(key))
         stream.users += 1
         try:

@@ -19,23 +19,27 @@ from acsard.bus.access import MAY
 from acsard.host import clock
 from acsard.values import NS_PER_S
 from acsard.web.calls import Calls, RefusedError
+from acsard.web.commands import Hand, Order
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.frames import (
+    Begin,
     Call,
     Command,
     Frame,
     FrameError,
     Ping,
+    Press,
+    Reply,
     Subscribe,
     Unsubscribe,
     decode,
 )
-from acsard.web.hand import Hand, Order
+from acsard.web.guide import Guide
 from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
-from acsard.web.outgoing import Outgoing
 from acsard.web.robots import Robots
+from acsard.web.to_browser import Outgoing
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0
@@ -64,17 +68,18 @@ class Viewer:
         hand: Hand,
         calls: Calls,
         fleet: Fleet,
+        guide: Guide,
         counts: Counts,
     ) -> None:
         self.who = who
         self.sender = f"{who.name[:40]}/{secrets.token_hex(4)}"
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
-        self._fleet, self._counts = fleet, counts
+        self._fleet, self._guide, self._counts = fleet, guide, counts
         self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts)
-        self._keys = Keys(self._out, robots, self._start)
+        self._keys = Keys(self._out, robots, self._start, who.token or who.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
@@ -87,6 +92,7 @@ class Viewer:
         """Until it ends, by whomever."""
         self._greet()
         self._out.say(self._robots.way())
+        self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
@@ -95,6 +101,7 @@ class Viewer:
         finally:
             # First of all: who drove and is gone drives no more.
             self._release()
+            self._guide.leave(self)
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
@@ -105,6 +112,7 @@ class Viewer:
         """Close it from outside; `why` is at most 120 characters."""
         self._ended = True
         self._release()
+        self._guide.leave(self)
         self._start(self._out.close(why))
 
     # what comes
@@ -125,7 +133,7 @@ class Viewer:
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
             return room or await self._overrun()
-        if room or (isinstance(frame, Call) and frame.call == "stop"):
+        if room or isinstance(frame, Press) or (isinstance(frame, Call) and frame.call == "stop"):
             self._obey(frame)
         else:
             self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
@@ -139,6 +147,7 @@ class Viewer:
         return False
 
     def _obey(self, frame: Frame) -> None:
+        self._guide.heard(self)
         match frame:
             case Command():
                 self._command(frame)
@@ -151,6 +160,13 @@ class Viewer:
                 self._subscribe(frame)
             case Unsubscribe():
                 self._unsubscribe(frame)
+            case Begin():
+                self._begin(frame)
+            case Reply():
+                if why := self._guide.reply(self, frame):
+                    self._out.refuse("reply", "malformed", why)
+            case Press():
+                self._guide.press(self, frame)
 
     def _command(self, frame: Command) -> None:
         if not self.who.may("operator"):
@@ -179,6 +195,13 @@ class Viewer:
         self._sequence += 1
         self._hand.give(Order(self.sender, 0.0, 0.0, stamp_ns, self._sequence, now_ns))
 
+    def _begin(self, frame: Begin) -> None:
+        """It turns wheels, and writes configurations."""
+        if not self.who.may("maintainer"):
+            self._out.refuse("begin", "role", f"it is for maintainers; you are {self.who.role}")
+        elif why := self._guide.begin(self, self.who.name, frame):
+            self._out.refuse("begin", "too_many", why)
+
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
             # Whoever sent it may be gone before it is asked for: the robot stops all the same.
@@ -192,7 +215,7 @@ class Viewer:
 
     async def _answer(self, frame: Call) -> None:
         try:
-            reply = await self._calls.call(self.who, frame.call, frame.payload)
+            reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
             ok, text = reply.success, reply.message
         except RefusedError as error:
             self._counts.refuse("role" if error.role else "malformed")
@@ -245,7 +268,7 @@ class Viewer:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
-            self._out.say({"fleet": self._fleet.rows()})
+            self._out.say({"fleet": self._fleet.rows(), "note": self._fleet.note})
         return now + LOOK_S
 
     def _start(

@@ -14,15 +14,20 @@ import pytest
 
 from acsard.client import connect
 from tests.system.browser import Hands, Page, hands, run
+from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import (
     Bus,
     Daemon,
+    FarPeer,
     Peer,
     Periods,
     Program,
+    acsard,
     cpu_seconds,
+    finish,
     resident_kb,
     until,
+    wheels,
 )
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(240)]
@@ -76,8 +81,7 @@ def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, 
 
 
 def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
-    missed = {}
-    for count in (0, 1, 20):  # a daemon each, since lateness is of the last minute
+    for count in (0, 20, 1, 0, 20):  # a daemon each, since lateness is of the last minute
         with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as page, Bus(daemon.endpoint) as b:
             b.linked()
             viewers = Program(
@@ -87,7 +91,6 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
                 if count:
                     until(lambda v=viewers, c=count: len(v.out) == c, 10.0, "all see")  # type: ignore[misc]
                 share, kb, periods, late = watched(page, daemon, b)
-            missed[count] = periods.missed
             print(
                 f"\n{count:2} viewers: page {100 * share:.1f} % of a core, {kb / 1000:.0f} MB; "
                 f"daemon {periods.missed} of {periods.elapsed:.0f} periods missed, "
@@ -146,6 +149,84 @@ def test_a_command_by_the_page_is_soon_on_the_port(tmp_path: Path, peer: Peer) -
                 time.sleep(0.02)
             medians["client"] = told("client", asyncio.run(measured(peer, robot.send)))
     assert medians["page"] < 10 * max(medians["client"], 0.5)
+
+
+FINGERS, LIFTS = 150, 40
+
+FINGER = """for (const kind of ["pointerdown", "pointermove", "pointerup"])
+    document.getElementById("stick").addEventListener(kind, (event) => {
+        window.finger = performance.timeOrigin + event.timeStamp;
+    }, true);"""
+"""Notes when the finger did what it did, ms since 1970."""
+
+
+class Finger:
+    """On the page's stick, in a real browser; its times are beside those of the port's far end."""
+
+    def __init__(self, browser: Browser, peer: FarPeer) -> None:
+        self.browser, self.peer = browser, peer
+
+    def waited(self, does: Callable[[], object], wanted: Callable[[float], bool]) -> float:
+        """ms from what it does to the first byte of a line with a wheel speed that is wanted."""
+        begun, wall = time.monotonic(), time.time()
+        does()
+        at = float(self.browser.js("window.finger")) / 1000 - wall + begun
+
+        def line() -> float | None:
+            since = [heard for heard in self.peer.since(at) if heard.line.startswith(b"a")]
+            return next((heard.at for heard in since if wanted(wheels(heard.line)[0])), None)
+
+        return 1000 * (until(line, 5.0, "the finger's line") - at)
+
+    def moved_to(self, y: float, speed: float) -> float:
+        """ms until the wheels are told to turn about so fast."""
+        return self.waited(lambda: self.browser.push(0, y), lambda told: abs(told - speed) < 0.5)
+
+    def press(self) -> None:
+        """Down and forwards."""
+        self.browser.push(0, 0, "Start")
+        self.browser.push(0, 90)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
+    """The browser says what is wished 20 times a second, and at once that it was let go."""
+    fast = dict.fromkeys(("linear_acceleration", "linear_deceleration"), 100.0)
+    fast["linear_stop_deceleration"] = 100.0
+    with (
+        FarPeer(tmp_path) as peer,
+        Daemon(tmp_path, peer.path, {"limits": fast}) as daemon,
+        Page(daemon, tmp_path) as page,
+        browsing() as browser,
+    ):
+        browser.size(*PHONE)
+        browser.open(page.here)
+        until(lambda: browser.text("mode") == "READY", 10.0, "a page")
+        browser.js(FINGER)
+        finger, begun = Finger(browser, peer), time.monotonic()
+        browser.hold(lambda: any(one.line.startswith(b"ap04") for one in peer.since(begun)))
+        pressed: list[float] = []
+        moved: list[float] = []
+        lifted: list[float] = []
+        for number in range(FINGERS):
+            time.sleep(0.06 + 0.05 * ((number * 0.618) % 1.0))  # not in step with the browser
+            moved.append(finger.moved_to(*((30, 2.0), (90, 4.0))[number % 2]))
+        for _ in range(LIFTS):
+            lifted.append(finger.waited(lambda: browser.touch("End"), lambda speed: speed == 0))
+            time.sleep(0.1)
+            pressed.append(finger.waited(finger.press, lambda speed: speed > 3.5))
+    told("finger down -> first byte of a line that drives", pressed)
+    moves = told("finger moved -> first byte of its line", moved)
+    lifts = told("finger lifted -> first byte of the zero", lifted)
+    done = finish(acsard("bench", "--json"), tmp_path, 60.0)
+    by_bench = json.loads(done.out)["outside"]["command_to_wire"]
+    print(
+        f"\nacsard bench: a command put -> first byte: p50 {by_bench['p50'] / 1000:.2f} ms, "
+        f"p99 {by_bench['p99'] / 1000:.2f} ms; a finger moved "
+        f"{1000 * moves / by_bench['p50']:.0f}, one lifted "
+        f"{1000 * lifts / by_bench['p50']:.0f} times that at p50"
+    )
+    assert lifts < moves
 
 
 async def _read(ours: Hands) -> None:

@@ -17,7 +17,7 @@ from acsard.incoming.commands import Arrival
 from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Query, Reply
 from acsard.mcu.frames import Codec
-from acsard.mcu.port import Gate, Offered
+from acsard.mcu.gate import Gate, Offered
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.messages.signature import Signature

@@ -7,6 +7,7 @@ import json
 import socket
 import ssl
 import time
+import urllib.request
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -32,14 +33,17 @@ NAME = socket.gethostname()
 class Page(Program):
     """`acsard web` beside a daemon: by HTTP, and by HTTPS as others reach it."""
 
-    def __init__(self, daemon: Daemon, where: Path, *words: str) -> None:
+    def __init__(self, daemon: Daemon, where: Path, *words: str, at: str = "", **more: str) -> None:
+        """`at` is the address that another host has of the one it runs on; `more` is for its
+        environment."""
         plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
-        self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{NAME}:{secure}"
+        self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{at or NAME}:{secure}"
         self.state, self.tls = where / "state", where / "tls"
-        self.env = environment(XDG_STATE_HOME=str(self.state))
+        self.env = environment(XDG_STATE_HOME=str(self.state), **more)
         self.told = ["--config", str(daemon.config), "--address", self.here]
         if self.tls.is_dir():
-            self.told += ["--address", f"https://127.0.0.1:{secure}", "--tls", str(self.tls)]
+            self.told += ["--address", f"https://{at or '127.0.0.1'}:{secure}"]
+            self.told += ["--tls", str(self.tls)]
         super().__init__(acsard("web", *self.told, *words), where, self.env)
 
     def __enter__(self) -> Page:
@@ -57,17 +61,21 @@ class Page(Program):
         """A token."""
         return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
 
-    def client(self, token: str = "") -> aiohttp.ClientSession:
-        """A program that comes from elsewhere, with or without a token."""
+    def client(self, token: str = "", address: str = "127.0.0.1") -> aiohttp.ClientSession:
+        """A program that comes from elsewhere, with or without a token, by one of our addresses."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         told = {"Authorization": f"Bearer {token}"} if token else {}
-        connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0)
+        connector = aiohttp.TCPConnector(
+            resolver=_Here(), ssl=trusted, limit=0, local_addr=(address, 0)
+        )
         return aiohttp.ClientSession(connector=connector, headers=told)
 
     def refused(self) -> dict[str, float]:
         """What was refused so far, by reason."""
+        with urllib.request.urlopen(f"{self.here}/metrics") as answer:
+            told = answer.read().decode()
         found = {}
-        for line in asyncio.run(text(f"{self.here}/metrics")).splitlines():
+        for line in told.splitlines():
             if line.startswith("acsard_page_refused_total{"):
                 found[line.partition('reason="')[2].partition('"')[0]] = float(line.split()[-1])
         return found

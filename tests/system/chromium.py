@@ -15,14 +15,15 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 
 from tests.system.harness import PATIENCE_S, until
+from tests.system.hosts import inside
 
 CHROMIUM = shutil.which("chromium")
 
@@ -38,50 +39,84 @@ PHONE, DESKTOP = (390, 844), (1280, 800)
 class Browser:
     """One page in a process of its own; calls come from the test's thread."""
 
-    def __init__(self, where: Path) -> None:
-        self._where = where
+    def __init__(self, where: Path, host: str = "", options: Sequence[str] = ()) -> None:
+        """`host` is another one than this, `options` are words more for its command line."""
+        self._where, self._options = where, options
+        self._host = host
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self._number = 0
         self._answers: dict[int, asyncio.Future[Any]] = {}
         self._down: tuple[tuple[float, float], ...] = ()
         self.process: subprocess.Popen[bytes] | None = None
+        self.tab = ""
+        """What the one that is spoken to is known by."""
         self.said: list[str] = []
         """What the page wrote to its console, and errors."""
+        self.received = 0
+        """Bytes, of HTTP with its headers and over WebSockets, since `Network.enable`."""
 
     def start(self) -> None:
         """Until it can be spoken to."""
         assert CHROMIUM is not None
-        words = [CHROMIUM, *OPTIONS, f"--user-data-dir={self._where}", "about:blank"]
-        self.process = subprocess.Popen(
-            words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-        )
+        words = [CHROMIUM, *OPTIONS, *self._options, f"--user-data-dir={self._where}"]
+        with self._there():
+            self.process = subprocess.Popen(
+                [*words, "about:blank"],
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
         told = self._where / "DevToolsActivePort"
 
         def port() -> str | None:
             return next(iter(told.read_text().split()), None) if told.exists() else None
 
         self._wait(self._connect(until(port, 20.0, "a browser")))
-        for domain in ("Page", "Runtime", "Log"):
-            self.ask(f"{domain}.enable")
 
-    def end(self, how: int = signal.SIGKILL) -> None:
+    def _there(self) -> AbstractContextManager[None]:
+        return inside(self._host) if self._host else nullcontext()
+
+    def end(self) -> None:
         """Kill it, with all its processes."""
         if self.process is None:
             return
-        if how == signal.SIGKILL and hasattr(self, "_session"):
+        if hasattr(self, "_session"):
             self._wait(self._session.close())
-        os.killpg(self.process.pid, how)
-        if how == signal.SIGKILL:
-            self.process.wait(10.0)
+        with suppress(ProcessLookupError):  # somebody was faster
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(10.0)
 
     async def _connect(self, port: str) -> None:
-        self._session = aiohttp.ClientSession()
-        async with self._session.get(f"http://127.0.0.1:{port}/json") as answer:
-            pages = await answer.json()
-        url = next(one["webSocketDebuggerUrl"] for one in pages if one["type"] == "page")
-        self._socket = await self._session.ws_connect(url, max_msg_size=1 << 26)
+        self._session = aiohttp.ClientSession(f"http://127.0.0.1:{port}")
+        await self._attend(next(iter(await self._tabs())))
+
+    async def _tabs(self) -> dict[str, str]:
+        """Where each is spoken to; the one in front first."""
+        with self._there():
+            async with self._session.get("/json") as answer:
+                pages = await answer.json()
+        return {one["id"]: one["webSocketDebuggerUrl"] for one in pages if one["type"] == "page"}
+
+    async def _attend(self, tab: str) -> None:
+        url = (await self._tabs())[tab]
+        with self._there():
+            self._socket = await self._session.ws_connect(url, max_msg_size=1 << 26)
+        self.tab = tab
         self._reader = asyncio.ensure_future(self._read())
+        for domain in ("Page", "Runtime", "Log"):
+            await self._ask(f"{domain}.enable", {})
+
+    def another(self, **how: bool) -> str:
+        """One more tab, in front (or `background`, or a `newWindow`); what it is known by."""
+        return str(self.ask("Target.createTarget", url="about:blank", **how)["targetId"])
+
+    def attend(self, tab: str) -> None:
+        """Speak to that one from now on."""
+        self._wait(self._attend(tab))
+        self._down = ()
+
+    def close(self, tab: str) -> None:
+        """Close that one."""
+        self.ask("Target.closeTarget", targetId=tab)
 
     async def _read(self) -> None:
         async for message in self._socket:
@@ -96,6 +131,10 @@ class Browser:
                 self.said.append(json.dumps(told["params"]["exceptionDetails"]))
             elif told["method"] == "Log.entryAdded":
                 self.said.append(told["params"]["entry"]["text"])
+            elif told["method"] == "Network.loadingFinished":
+                self.received += int(told["params"]["encodedDataLength"])
+            elif told["method"] == "Network.webSocketFrameReceived":
+                self.received += len(told["params"]["response"]["payloadData"].encode())
 
     def ask(self, method: str, **params: object) -> Any:
         """One command of the protocol; its result."""
@@ -162,9 +201,34 @@ class Browser:
             self.touch("End")
 
     def lift(self) -> None:
-        """All fingers, if there are any."""
+        """All fingers, if there are any; a page that has gone has taken them along."""
         if self._down:
-            self.touch("End")
+            with suppress(AssertionError):
+                self.touch("End")
+            self._down = ()
+
+    def push(self, x: float, y: float, kind: str = "Move") -> None:
+        """The finger on the page's stick, from its middle, px; y up."""
+        mx, my = self.middle("stick")
+        self.touch(kind, (mx + x, my - y))
+
+    def hold(self, drives: Callable[[], bool]) -> None:
+        """A finger pushes the stick forwards until it drives; it presses again where a busy
+        machine made the page let go."""
+        told: list[str] = []
+
+        def look() -> bool:
+            if not self.js("document.getElementById('stick').matches('.held')"):
+                told.append(self.text("told"))
+                self.lift()
+                self.push(0, 0, "Start")
+                self.push(0, 90)
+            return drives()
+
+        try:
+            until(look, 10.0, "it drives")
+        except AssertionError as error:
+            raise AssertionError(f"{error}; it said {told}") from None
 
     def key(self, kind: str, code: str, key: str) -> None:
         """`kind` is Down or Up."""
@@ -178,10 +242,10 @@ class Browser:
 
 
 @contextmanager
-def browsing() -> Iterator[Browser]:
+def browsing(host: str = "", options: Sequence[str] = ()) -> Iterator[Browser]:
     """A browser of its own, killed in the end."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as where:
-        browser = Browser(Path(where))
+        browser = Browser(Path(where), host, options)
         try:
             browser.start()
             yield browser

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from acsard.lan.authority import Authority
+from tests.system.browser import NAME, Page
 from tests.system.bystander import standing_by
 from tests.system.harness import Bus, Daemon, Peer, until
+from tests.system.hosts import Hosts, two_hosts
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -39,3 +42,35 @@ def peer(tmp_path: Path) -> Iterator[Peer]:
     """A serial peer that is not ours, plugged in at `tmp_path/mcu`."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
+
+
+@pytest.fixture(scope="module")
+def hosts() -> Iterator[Hosts]:
+    """The robot's host and another one; skips where there can be none."""
+    yield from two_hosts()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A daemon on the simulator that records, for the tests of its page."""
+    where = tmp_path_factory.mktemp("daemon")
+    with Daemon(where, config={"record": {"directory": str(where / "record")}}) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """Its page, by HTTP here and by HTTPS for others."""
+    where = tmp_path_factory.mktemp("page")
+    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    with Page(daemon, where) as page:
+        yield page
+
+
+@pytest.fixture
+def standing(daemon: Daemon) -> Iterator[Bus]:
+    """A plain client of `daemon`, whose robot stands and may be driven."""
+    with Bus(daemon.endpoint) as bus:
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus

@@ -7,6 +7,7 @@ own pid.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import json
 import os
@@ -517,14 +518,19 @@ class FarPeer(Program):
     @property
     def lines(self) -> list[Heard]:
         """All lines so far, without their ends; "-" for an empty one."""
-        for text in self.out[1 + len(self._heard) :]:
-            at, _, line = text.partition(" ")
-            self._heard.append(Heard(float(at), line.encode()))
-        return list(self._heard)
+        return list(self._all())
 
     def since(self, at: float, to: float = float("inf")) -> list[Heard]:
         """The lines between two times."""
-        return [heard for heard in self.lines if at < heard.at <= to]
+        heard = self._all()
+        first, last = (bisect.bisect_right(heard, time, key=lambda h: h.at) for time in (at, to))
+        return heard[first:last]
+
+    def _all(self) -> list[Heard]:
+        for text in self.out[1 + len(self._heard) :]:
+            at, _, line = text.partition(" ")
+            self._heard.append(Heard(float(at), line.encode()))
+        return self._heard
 
     def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> Heard:
         """The first line that starts so after then."""

@@ -7,8 +7,6 @@ root, or without `ip`, those tests are skipped.
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +27,7 @@ from tests.system.harness import (
     resident_kb,
     until,
 )
+from tests.system.hosts import Hosts, inside, on
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
 from tests.system.strangers import words
 
@@ -39,65 +38,21 @@ PORT, TLS_PORT = 7448, 7449
 # another host
 
 
-class Hosts:
-    """Two hosts with one cable between them."""
-
-    def __init__(self) -> None:
-        tag = f"acsard{os.getpid()}"
-        self.robot, self.stranger = f"{tag}r", f"{tag}s"
-        self.address = "198.18.77.1"
-
-    def __enter__(self) -> Hosts:
-        try:
-            for name in (self.robot, self.stranger):
-                _ip("netns", "add", name)
-                _ip("-n", name, "link", "set", "lo", "up")
-            cable = ("link", "add", "cable", "type", "veth", "peer", "name", "cable")
-            _ip("-n", self.robot, *cable, "netns", self.stranger)
-            for name, last in ((self.robot, 1), (self.stranger, 2)):
-                _ip("-n", name, "address", "add", f"198.18.77.{last}/24", "dev", "cable")
-                _ip("-n", name, "link", "set", "cable", "up")
-                # Scouting goes only where there is a way for multicast.
-                _ip("-n", name, "route", "add", "default", "dev", "cable")
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for name in (self.robot, self.stranger):
-            _ip("netns", "delete", name, check=False)
-
-    @contextmanager
-    def daemon(self, where: Path, bus: dict[str, object]) -> Iterator[Daemon]:
-        """A daemon on the robot's host, with this bus table."""
-        bus = {"listen": NEAR} | bus
-        daemon = Daemon(where, config={"bus": bus})
-        daemon.words = _at(self.robot, daemon.words)
-        with daemon:
-            yield daemon
-
-    def visit(
-        self,
-        host: str,
-        where: Path,
-        endpoints: list[str],
-        tls: dict[str, object] | None = None,
-    ) -> dict[str, Any]:
-        """What somebody on a host finds out and gets done in a second."""
-        said = [json.dumps(endpoints), json.dumps(tls)]
-        done = finish(_at(host, words(VISIT, 1.0, *said)), where)
-        assert done.code == 0, done
-        found: dict[str, Any] = json.loads(done.out)
-        return found
+def daemon_on(host: str, where: Path, bus: dict[str, object]) -> AbstractContextManager[Daemon]:
+    """A daemon on a host, with this bus table."""
+    return on(host, Daemon(where, config={"bus": {"listen": NEAR} | bus}))
 
 
-def _ip(*arguments: str, check: bool = True) -> None:
-    subprocess.run(["ip", *arguments], check=check, capture_output=True, timeout=10.0)
-
-
-def _at(host: str, command: list[str]) -> list[str]:
-    return ["ip", "netns", "exec", host, *command]
+def visit(
+    host: str, where: Path, endpoints: list[str], tls: dict[str, object] | None = None
+) -> dict[str, Any]:
+    """What somebody on a host finds out and gets done in a second."""
+    said = [json.dumps(endpoints), json.dumps(tls)]
+    with inside(host):
+        done = finish(words(VISIT, 1.0, *said), where)
+    assert done.code == 0, done
+    found: dict[str, Any] = json.loads(done.out)
+    return found
 
 
 VISIT = """\
@@ -163,18 +118,6 @@ sys.stdin.read()
 """A Zenoh program without configuration, as anybody runs it: it lets itself be found."""
 
 
-@pytest.fixture(scope="module")
-def hosts() -> Iterator[Hosts]:
-    if shutil.which("ip") is None or os.geteuid() != 0:
-        pytest.skip("needs ip and root, to make a second host")
-    try:
-        entered = Hosts().__enter__()
-    except subprocess.CalledProcessError as error:
-        pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
-    yield entered
-    entered.__exit__()
-
-
 NEAR = [f"tcp/127.0.0.1:{PORT}"]
 FAR = [f"tcp/198.18.77.1:{port}" for port in (PORT, 7447)]
 
@@ -182,13 +125,13 @@ FAR = [f"tcp/198.18.77.1:{port}" for port in (PORT, 7447)]
 def test_a_stranger_on_another_host_neither_sees_nor_commands_the_default_daemon(
     hosts: Hosts, tmp_path: Path
 ) -> None:
-    ordinary = Program(_at(hosts.robot, words(ORDINARY)), tmp_path, stdin=subprocess.PIPE)
-    with hosts.daemon(tmp_path, {}), ordinary:
+    ordinary = Program(words(ORDINARY), tmp_path, stdin=subprocess.PIPE)
+    with daemon_on(hosts.robot, tmp_path, {}), on(hosts.robot, ordinary):
         other = ordinary.says("here").split()[1]
-        there = hosts.visit(hosts.stranger, tmp_path, FAR)
+        there = visit(hosts.stranger, tmp_path, FAR)
         # What lets itself be found is found: the cable carries all that scouting needs.
         assert there == {"scouted": [other], "opened": [], "heard": [], "counted": []}
-        here = hosts.visit(hosts.robot, tmp_path, NEAR)
+        here = visit(hosts.robot, tmp_path, NEAR)
         assert here["scouted"] == [other]
         assert here["opened"] == NEAR
         assert "acsard/acsar/odom" in here["heard"]
@@ -199,8 +142,8 @@ def test_a_stranger_on_another_host_neither_sees_nor_commands_the_default_daemon
 def test_a_stranger_drives_an_insecure_daemon_from_another_host(
     hosts: Hosts, tmp_path: Path
 ) -> None:
-    with hosts.daemon(tmp_path, {"listen": [f"tcp/0.0.0.0:{PORT}"], "insecure": True}):
-        there = hosts.visit(hosts.stranger, tmp_path, FAR)
+    with daemon_on(hosts.robot, tmp_path, {"listen": [f"tcp/0.0.0.0:{PORT}"], "insecure": True}):
+        there = visit(hosts.stranger, tmp_path, FAR)
     assert there["opened"] == FAR[:1]
     assert "acsard/acsar/odom" in there["heard"]
     assert there["counted"][-1] > there["counted"][0] == 0
@@ -210,11 +153,11 @@ def test_over_the_network_the_certificate_decides(hosts: Hosts, tmp_path: Path) 
     certificates = Certificates(tmp_path, "198.18.77.1")
     listen = [*NEAR, f"tls/0.0.0.0:{TLS_PORT}"]
     endpoints = [*FAR, f"tls/198.18.77.1:{TLS_PORT}"]
-    with hosts.daemon(tmp_path, {"listen": listen, "tls": str(certificates.robot)}):
-        without = hosts.visit(hosts.stranger, tmp_path, endpoints, certificates.settings(own=None))
+    with daemon_on(hosts.robot, tmp_path, {"listen": listen, "tls": str(certificates.robot)}):
+        without = visit(hosts.stranger, tmp_path, endpoints, certificates.settings(own=None))
         assert without == {"scouted": [], "opened": [], "heard": [], "counted": []}
         own = certificates.robot / "clients" / "operator"
-        there = hosts.visit(hosts.stranger, tmp_path, endpoints, certificates.settings(own))
+        there = visit(hosts.stranger, tmp_path, endpoints, certificates.settings(own))
         assert there["opened"] == endpoints[-1:]
         assert "acsard/acsar/odom" in there["heard"]
         assert there["counted"][-1] > there["counted"][0] == 0

@@ -10,7 +10,6 @@ import select
 import signal
 import socket
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,26 +34,9 @@ from tests.system.harness import (
 )
 
 
-@pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    where = tmp_path_factory.mktemp("daemon")
-    with Daemon(where, config={"record": {"directory": str(where / "record")}}) as daemon:
-        yield daemon
-
-
-@pytest.fixture(scope="module")
-def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with Page(daemon, tmp_path_factory.mktemp("page")) as page:
-        yield page
-
-
 @pytest.fixture
-def bus(daemon: Daemon) -> Iterator[Bus]:
-    """The robot stands and may be driven."""
-    with Bus(daemon.endpoint) as bus:
-        bus.ask("srv/clear")
-        bus.at_rest()
-        yield bus
+def bus(standing: Bus) -> Bus:
+    return standing
 
 
 def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
@@ -95,27 +77,6 @@ def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
     run(story)
     assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
     assert commands[-1]["linear"]["x"] == 0
-
-
-@pytest.mark.slow
-def test_nobody_obeys_a_stamp_twice_or_one_from_before(page: Page, bus: Bus) -> None:
-    async def story() -> None:
-        async with hands(page) as ours:
-            await ours.say(subscribe="state", rate=50)
-            await ours.until_driving(0.3)
-            await ours.drive(0.0)
-            before = bus.at_rest()
-            for _ in range(100):
-                await ours.drive(0.5, late_ms=5000.0)
-            refused = await ours.find(lambda said: said.get("refused") == "cmd")
-            assert "stamp" in refused["reason"]
-            await asyncio.sleep(0.3)
-            after = bus.state()
-            assert after["counters"]["commands"] == before["counters"]["commands"]
-            assert abs(after["x"] - before["x"]) < 0.005
-
-    run(story)
-    assert page.refused()["replayed"] >= 100
 
 
 def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
@@ -159,6 +120,60 @@ def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemo
                 assert (await answer.read()).startswith(b"\x89MCAP")
 
     run(story)
+
+
+async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
+    """The first recording, and what becomes of its report."""
+    async with session.get("/api/recordings") as answer:
+        name = (await answer.json())[0]["name"]
+    async with asyncio.timeout(2 * PATIENCE_S):
+        while True:
+            async with session.post(f"/api/recordings/{name}/report") as answer:
+                told = await answer.json()
+            if answer.status != 202:
+                return name, {"status": answer.status, **told}
+            assert told["report"] == "drawing"
+            await asyncio.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
+    page: Page, bus: Bus
+) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            name, told = await drawn(session)
+            assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
+            bodies = set()
+            for packing in ("gzip", "identity"):
+                asked = {"Accept-Encoding": packing}
+                async with session.get(f"/report/{name}", headers=asked) as answer:
+                    policy = answer.headers["Content-Security-Policy"]
+                    bodies.add(await answer.text())
+            (body,) = bodies
+            assert body.startswith("<!DOCTYPE html>")
+            assert "Plotly" in body
+            assert "sandbox allow-scripts;" in policy
+            assert "allow-same-origin" not in policy
+            assert "default-src 'none'" in policy
+
+    run(story)
+
+
+@pytest.mark.slow
+def test_without_its_library_a_report_is_refused_with_what_to_type(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
+
+    async def story() -> None:
+        async with aiohttp.ClientSession(without.here) as session:
+            _, told = await drawn(session)
+            assert (told["status"], told["report"]) == (503, "failed")
+            assert re.search("needs the library plotly; run: .*pip install.*report", told["text"])
+
+    with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
+        run(story)
 
 
 @pytest.mark.slow

@@ -20,10 +20,12 @@ from acsard.host.errors import UnreachableError
 from acsard.messages.signature import MOST
 from acsard.web.app import Page
 from acsard.web.calls import Calls
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
+from acsard.web.errands import Reach
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
-from acsard.web.hand import Hand
+from acsard.web.guide import Guide
 from acsard.web.limits import OVERRUNS
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
@@ -50,7 +52,7 @@ class Inside:
         self.fleet, self.gate = Fleet(self.robots), Gate(self.counts)
         self.page = Page(
             self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
-            Vault(where), frozenset(), self.gate,
+            Vault(where), frozenset(), self.gate, Guide(Reach("", "", "acsar", ""), "sim"),
         )  # fmt: skip
 
     @asynccontextmanager

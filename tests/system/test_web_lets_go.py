@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -56,18 +56,6 @@ async def freezes_for_a_while(ours: Hands, page: Page) -> None:
 
 OF_THE_BROWSER: tuple[Way, ...] = (closes, vanishes, freezes, releases, freezes_for_a_while)
 OF_THE_SERVER: tuple[Way, ...] = (is_asked_to_end, is_killed)
-
-
-@pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with Daemon(tmp_path_factory.mktemp("daemon")) as daemon:
-        yield daemon
-
-
-@pytest.fixture(scope="module")
-def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with Page(daemon, tmp_path_factory.mktemp("page")) as page:
-        yield page
 
 
 def let_go(daemon: Daemon, page: Page, way: Way) -> None:

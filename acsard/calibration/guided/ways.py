@@ -7,6 +7,7 @@ from collections.abc import Callable
 from msgspec import Struct
 
 from acsard.calibration.guided import tape, tour, umbmark, wall
+from acsard.calibration.guided.needs import NEEDS
 from acsard.calibration.guided.setup import WIDEST, Setup
 from acsard.calibration.guided.steps import Way
 
@@ -31,9 +32,9 @@ class Kind(Struct, frozen=True):
 
 
 KINDS: dict[str, Kind] = {
-    "gyro": Kind("a gyro on the key imu, and a tape measure", tour.gyro, tour.spinning_s, False),
-    "positions": Kind("positions on a key", tour.positions, tour.petals_s, False),
-    "tape": Kind("a tape measure and a straight line on the floor", tape.way, tape.longest_s, True),
-    "wall": Kind("a straight wall and a tape measure", wall.way, wall.longest_s, True),
-    "umbmark": Kind("a tape measure and marks", umbmark.way, umbmark.longest_s, True),
+    "gyro": Kind(NEEDS["gyro"], tour.gyro, tour.spinning_s, False),
+    "positions": Kind(NEEDS["positions"], tour.positions, tour.petals_s, False),
+    "tape": Kind(NEEDS["tape"], tape.way, tape.longest_s, True),
+    "wall": Kind(NEEDS["wall"], wall.way, wall.longest_s, True),
+    "umbmark": Kind(NEEDS["umbmark"], umbmark.way, umbmark.longest_s, True),
 }

@@ -26,14 +26,17 @@ export class Link extends EventTarget {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
   }
 
-  /** Follow a key at most `rate` times a second, also after a new connection. */
-  subscribe(key, rate) {
-    this.#wanted.set(key, rate);
-    this.send({ subscribe: key, rate });
+  /** Follow a key at most `rate` times a second, also after a new connection; of another `robot`
+   *  than the page's own, if it is named. */
+  subscribe(key, rate, robot) {
+    const asked = { subscribe: key, rate, robot };
+    this.#wanted.set(key, asked);
+    this.send(asked);
   }
 
   unsubscribe(key) {
-    if (this.#wanted.delete(key)) this.send({ unsubscribe: key });
+    const asked = this.#wanted.get(key);
+    if (this.#wanted.delete(key)) this.send({ unsubscribe: key, robot: asked.robot });
   }
 
   /** True when it was handed on: nothing is kept for later, and nothing is added to a jam. */
@@ -43,15 +46,18 @@ export class Link extends EventTarget {
     return true;
   }
 
-  /** Ask for a service; the answer, or why there is none. */
-  call(verb, payload) {
+  /** The same whatever waits before it: what stops something. */
+  urge(message) {
+    if (this.open) this.#socket.send(JSON.stringify(message));
+  }
+
+  /** Ask for a service (of another `robot`, if it is named); the answer, or why there is none. */
+  call(verb, payload, robot) {
     const id = ++this.#number;
     return new Promise((done) => {
       const given = setTimeout(() => this.#answer({ answer: id, ok: false, text: "no answer within 3 s" }), 3000);
       this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
-      const message = payload === undefined ? { call: verb, id } : { call: verb, payload, id };
-      // Not by `send`: a stop goes whatever waits before it.
-      if (this.open) this.#socket.send(JSON.stringify(message));
+      if (this.open) this.urge({ call: verb, payload, id, robot });
       else this.#answer({ answer: id, ok: false, text: "no connection to the robot" });
     });
   }
@@ -67,7 +73,7 @@ export class Link extends EventTarget {
       this.#tries = 0;
       this.#heard = performance.now();
       this.#asked = null;
-      for (const [key, rate] of this.#wanted) this.send({ subscribe: key, rate });
+      for (const asked of this.#wanted.values()) this.send(asked);
       this.#tell("up", {});
       this.#ping();
     };
@@ -90,7 +96,7 @@ export class Link extends EventTarget {
       if (message.pong === this.#asked) this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {

@@ -1,25 +1,33 @@
 // The page: one link, one hand, and the views.
 
 import { Drive, SOURCE } from "./drive.js";
+import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Plot } from "./plot.js";
+import { Recordings } from "./recordings.js";
+import { barred, may, permit } from "./roles.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { said as words, signed, yaw } from "./words.js";
+import { milliseconds, said as words, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
-const VIEWS = ["drive", "status", "events", "set", "robots"];
+/** Another robot than the page's own: seen and stopped here; to drive or set it, it has its own page. */
+const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
+const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
 const LATCHED = ["stopped", "fault"];
 
 const link = new Link();
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
+const recordings = new Recordings($("recordings"), $("no-recordings"));
+const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "wished", colour: "--wished" }];
 const plots = {
-  speed: new Plot($("plot-speed"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.1, high: 0.3 }),
-  turn: new Plot($("plot-turn"), [{ name: "wished", colour: "--wished" }, { name: "measured", colour: "--accent" }], { low: -0.3, high: 0.3 }),
+  speed: new Plot($("plot-speed"), COMPARED, { low: -0.1, high: 0.3 }),
+  turn: new Plot($("plot-turn"), COMPARED, { low: -0.3, high: 0.3 }),
   wheels: new Plot($("plot-wheels"), ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` })), { low: -1, high: 3 }),
   late: new Plot($("plot-late"), [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }], { low: 0, high: 1 }),
 };
@@ -28,6 +36,7 @@ let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
 let hello = null;
 let wished = null;
+let period = 0; // s from one state of another robot's to the next
 
 function open(name) {
   view = VIEWS.includes(name) ? name : "drive";
@@ -42,17 +51,19 @@ function open(name) {
   followed("fleet", 2, view === "robots");
   if (view === "events") listed();
   if (view === "set") configured();
+  if (view === "set") guided();
   map.redraw();
 }
 
 function followed(key, rate, wanted) {
-  if (wanted) link.subscribe(key, rate);
+  if (wanted) link.subscribe(key, rate, key === "fleet" ? undefined : OTHER);
   else link.unsubscribe(key);
 }
 
 async function stop() {
   drive.release();
-  const told = await link.call("stop");
+  guide.leave();
+  const told = await link.call("stop", undefined, OTHER);
   views.alarm(told.ok ? "" : `STOP: ${told.text}`);
 }
 
@@ -83,9 +94,9 @@ async function got(path) {
 }
 
 async function listed() {
+  if (OTHER) return recordings.show([], "", `those of ${OTHER} are listed on its own page`);
   const files = await got("api/recordings");
-  views.text("no-recordings", files.error ?? "none here");
-  views.recordings($("recordings"), $("no-recordings"), files.error ? [] : files);
+  recordings.show(files.error ? [] : files, barred(hello?.role ?? "", "operator"), files.error);
 }
 
 async function configured() {
@@ -93,6 +104,10 @@ async function configured() {
   const rows = await got("api/settings");
   if (rows.error) return views.text("set-told", rows.error);
   settings.show(rows);
+}
+
+async function guided() {
+  guide.choices(await got("api/guide"));
 }
 
 function limited() {
@@ -103,7 +118,7 @@ function limited() {
 function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   // A state that is published seldom is old for longer.
-  const fresh = Math.max(500, 2500 / (hello?.state_rate || 10));
+  const fresh = Math.max(500, OTHER ? 2500 * period : 2500 / (hello?.state_rate || 10));
   views.freshness(old, fresh, link.way);
   if (old > 2 * fresh) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
@@ -111,10 +126,12 @@ function looked() {
 }
 
 function stated({ detail }) {
+  const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
+  if (since > 0) period = Math.min(since, 2);
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   views.banner(state, hello?.role === "viewer");
-  $("clear").hidden = !LATCHED.includes(state.mode);
+  $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
@@ -123,8 +140,8 @@ function stated({ detail }) {
   views.text("turn", `${signed(state.angular, 2)} of ${signed(wish.angular, 2)} rad/s`);
   const late = state.figures.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
-  plots.speed.add(heard, null, state.linear);
-  plots.turn.add(heard, null, state.angular);
+  plots.speed.add(heard, state.linear, null);
+  plots.turn.add(heard, state.angular, null);
   if (view !== "status") return;
   views.sources($("sources"), state);
   views.counters($("counters"), state);
@@ -132,18 +149,29 @@ function stated({ detail }) {
 
 function greeted({ detail }) {
   hello = detail.hello;
-  $("robot").textContent = document.title = hello.robot;
-  $("simulated").hidden = !hello.simulated;
+  if (OTHER === hello.robot) return location.replace("./");
+  $("robot").textContent = document.title = OTHER ?? hello.robot;
+  if (!OTHER) $("simulated").hidden = !hello.simulated;
   $("role").textContent = hello.role;
   drive.sender = hello.sender;
   drive.limits = hello.limits;
-  drive.allowed = hello.role !== "viewer";
-  $("stick").classList.toggle("off", !drive.allowed);
+  drive.allowed = !OTHER && may(hello.role, "operator");
+  permit(hello.role, OTHER ? `only on the own page of ${OTHER}` : "");
   $("limit").max = String(hello.limits.linear);
   limited();
-  if (!drive.allowed) views.text("told", "you may watch and stop, not drive");
-  $("clear").disabled = !drive.allowed;
-  if (hello.simulated) link.subscribe("sim/pose", 5);
+  if (!drive.allowed && !OTHER) views.text("told", "you may watch and stop, not drive");
+  views.text("barred", barred(hello.role, "operator"));
+  if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
+  if (OTHER) elsewhere();
+}
+
+/** What this page is to a robot that is not its own. */
+function elsewhere() {
+  const back = views.made("a", "", `Back to ${hello.robot}`);
+  back.href = "./";
+  const words = `${OTHER}, seen by the page of ${hello.robot}: you may watch it and stop it here. To drive it, open its own page. `;
+  $("other").replaceChildren(words, back);
+  $("other").hidden = false;
 }
 
 /** Who comes by an invitation has its token behind the #: it becomes a cookie, and is wiped. */
@@ -163,22 +191,29 @@ link.addEventListener("key:odom", ({ detail: { value } }) => {
   const { position, orientation } = value.pose.pose;
   map.pose(position.x, position.y, yaw(orientation));
 });
-link.addEventListener("key:sim/pose", ({ detail: { value } }) => map.truth(value.pose.position.x, value.pose.position.y));
+link.addEventListener("key:sim/pose", ({ detail: { value } }) => {
+  $("simulated").hidden = false;
+  map.truth(value.pose.position.x, value.pose.position.y);
+});
 link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
   wished = { linear: value.twist.linear.x, angular: value.twist.angular.z };
-  plots.speed.add(performance.now() - age, wished.linear, null);
-  plots.turn.add(performance.now() - age, wished.angular, null);
+  plots.speed.add(performance.now() - age, null, wished.linear);
+  plots.turn.add(performance.now() - age, null, wished.angular);
 });
 link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.wheels.add(performance.now() - age, ...value.velocity));
 link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
 link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
-link.addEventListener("path", ({ detail }) => map.trail(detail.path));
-link.addEventListener("fleet", ({ detail }) => views.cards($("cards"), detail.fleet));
+link.addEventListener("path", ({ detail }) => OTHER || map.trail(detail.path));
+link.addEventListener("fleet", ({ detail }) => {
+  views.cards($("cards"), detail.fleet, hello?.robot);
+  views.text("fleet-note", detail.note);
+});
 link.addEventListener("refused", ({ detail }) => {
+  if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
   const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
   views.text("told", why || detail.reason);
 });
-link.addEventListener("gone", ({ detail }) => views.text("reason", detail.gone));
+link.addEventListener("gone", ({ detail }) => OTHER || views.text("reason", detail.gone));
 link.addEventListener("down", async ({ detail }) => {
   drive.release("let go: the connection is gone");
   heard = -Infinity;
@@ -214,13 +249,13 @@ $("recentre").addEventListener("click", () => map.recentre());
 $("erase").addEventListener("click", () => map.erase());
 $("limit").addEventListener("input", limited);
 
+permit("");
 limited();
+$("tab-set").hidden = Boolean(OTHER);
+if (OTHER) $("stop").firstElementChild.textContent = `STOP ${OTHER}`;
 open("drive");
-link.subscribe("state", 10);
-link.subscribe("odom", 20);
-link.subscribe("cmd_vel_out", 10);
-link.subscribe("wheel_states", 5);
-link.subscribe("events", 5);
+for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["wheel_states", 5], ["events", 5]])
+  link.subscribe(key, rate, OTHER);
 setInterval(looked, 100);
 await invited();
 link.start();

@@ -1,9 +1,15 @@
-// One plot of the last minute: lines over time, the scale at the left, now at the right.
+// One plot of the last minute: lines over time, the scale at the left, now at the right, and below
+// it which line is which and what it says now.
 
 import { colours, sized } from "./map.js";
+import { made } from "./views.js";
+import { signed } from "./words.js";
 
 const SPAN = 60000;
 const ROOM = 44;
+
+// Dash and shift of each line, px. Drawn in this order, of four that lie on each other each is seen.
+const LOOKS = [[[], 0], [[12, 12], 0], [[4, 8], 0], [[5, 19], 5]];
 
 export class Plot {
   #canvas;
@@ -13,8 +19,11 @@ export class Plot {
   /** `lines`: [{name, colour}], as many as each `add` has values; `floor`: the least range. */
   constructor(canvas, lines, floor) {
     this.#canvas = canvas;
-    this.#lines = lines.map((line) => ({ ...line, points: [] }));
+    this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
     this.#floor = floor;
+    const legend = this.#lines.map((line) => made("span", "", line.sample, line.said));
+    for (const { sample } of this.#lines) sample.setAttribute("aria-hidden", "true");
+    canvas.after(made("p", "legend", ...legend));
   }
 
   /** Values at `now`, ms; null leaves a line as it is. */
@@ -35,7 +44,7 @@ export class Plot {
     const top = Math.max(this.#floor.high, ...all) * 1.08;
     const bottom = Math.min(this.#floor.low, ...all) * 1.08;
     const x = (at) => ROOM + ((at - now + SPAN) / SPAN) * (width - ROOM - 6);
-    const y = (value) => 8 + ((top - value) / (top - bottom)) * (height - 26);
+    const y = (value) => 8 + ((top - value) / (top - bottom)) * (height - 18);
     paper.font = "11px system-ui, sans-serif";
     paper.fillStyle = look("--quiet");
     paper.strokeStyle = look("--line");
@@ -47,13 +56,21 @@ export class Plot {
       paper.stroke();
       paper.fillText((value / (value ? 1.08 : 1)).toFixed(Math.abs(top) < 10 ? 2 : 0), 6, y(value) + 4);
     }
-    let side = ROOM;
-    for (const { name, colour, points } of this.#lines) {
-      paper.strokeStyle = paper.fillStyle = look(colour);
-      paper.fillText(name, side, height - 5);
-      side += paper.measureText(name).width + 14;
-      paper.lineWidth = 1.6;
-      paper.beginPath();
+    this.#lines.forEach(({ name, colour, points, sample, said }, n) => {
+      const last = points.at(-1);
+      const words = `${name} ${last ? signed(last[1], 2) : "–"}`;
+      if (said.textContent !== words) said.textContent = words;
+      const [small, wide, high] = sized(sample);
+      for (const one of [small, paper]) {
+        one.strokeStyle = look(colour);
+        one.lineWidth = 2;
+        one.setLineDash(LOOKS[n][0]);
+        one.lineDashOffset = LOOKS[n][1];
+        one.beginPath();
+      }
+      small.moveTo(0, high / 2);
+      small.lineTo(wide, high / 2);
+      small.stroke();
       let before = -Infinity;
       for (const [at, value] of points) {
         if (at < now - SPAN) continue;
@@ -61,6 +78,7 @@ export class Plot {
         before = at;
       }
       paper.stroke();
-    }
+    });
+    paper.setLineDash([]);
   }
 }

@@ -1,6 +1,6 @@
 // What the other views show: rows made of what the bus says. Text goes in as text, never as HTML.
 
-import { age, ago, began, clock, lasted, reason, said, signed } from "./words.js";
+import { age, ago, clock, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
@@ -50,7 +50,10 @@ export function happened(list, told) {
   list.replaceChildren(...rows);
 }
 
-export function cards(list, robots) {
+/** A card for each robot, which opens it; those that stay are not made anew, or nobody could press
+ *  them. `own` is the id of the page's own. */
+export function cards(list, robots, own) {
+  const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
   const shown = robots.map((one) => {
     const bad = ["fault", "stopped"].includes(one.mode) ? "error" : one.mode === "driving" || one.mode === "ready" ? "" : "warning";
     const facts = [
@@ -59,22 +62,24 @@ export function cards(list, robots) {
       one.version ? `version ${one.version}` : "",
       typeof one.age === "number" ? `heard ${ago(one.age)}` : "",
     ];
-    return made("li", bad, made("strong", "", one.robot), ` ${one.mode ?? "silent"}`, made("div", "quiet", said(one.reason ?? "")),
-      made("div", "quiet", facts.filter(Boolean).join(" · ")));
+    const card = before.get(one.robot) ?? empty(one.robot, own);
+    const [, mode, why, what] = card.children;
+    card.className = bad;
+    mode.textContent = one.mode ?? "silent";
+    why.textContent = said(one.reason ?? "");
+    what.textContent = facts.filter(Boolean).join(" · ");
+    return card;
   });
-  list.replaceChildren(...(shown.length ? shown : [made("li", "warning", "no robot is heard")]));
+  if (!shown.length) shown.push(made("li", "warning", "no robot is heard yet"));
+  if (shown.length !== list.children.length || shown.some((card, n) => card !== list.children[n])) list.replaceChildren(...shown);
 }
 
-export function recordings(list, none, files) {
-  none.hidden = files.length > 0;
-  list.replaceChildren(
-    ...files.map((one) => {
-      const link = made("a", "", one.name);
-      link.href = `api/recordings/${encodeURIComponent(one.name)}`;
-      link.download = one.name;
-      return made("li", "", link, made("div", "quiet", [began(one.begin), lasted(one.seconds), one.events].filter(Boolean).join(" · ")));
-    }),
-  );
+function empty(robot, own) {
+  const link = made("a", "", robot === own ? `${robot} (this page's own)` : robot);
+  link.href = robot === own ? "./" : `./?robot=${encodeURIComponent(robot)}`;
+  const card = made("li", "", link, made("span", "mode"), made("div", "quiet"), made("div", "quiet"));
+  card.dataset.robot = robot;
+  return card;
 }
 
 /** Mode and why, in words, and what doubts there are. */

@@ -153,6 +153,8 @@ def driving(*words: str) -> int:
         (["--positions", "acsard/acsar/odom"], "what the wheels say"),
         (["--log", "drive.csv", "--way", "tape"], "--way is for a guided drive"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
+        (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
+        (["--yes", "--json-lines"], "--json-lines a program"),
     ],
 )
 def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(

@@ -8,7 +8,7 @@ from acsard.cli import main
 from acsard.cli.exits import CODES, code_of
 from acsard.host import errors
 from acsard.host.errors import MendableError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.exits import WORDS, Exit, ExitError
 
 PROMISED = [
     (errors.UsageError, ValueError, 2),
@@ -47,6 +47,8 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     told = capsys.readouterr().out
     assert all(f" {int(code)} " in told for code in Exit)
+    assert all(f"{code} {words}" in " ".join(told.split()) for code, words in WORDS.items())
+    assert set(WORDS) == set(Exit)
 
 
 @pytest.mark.parametrize("code", list(Exit))

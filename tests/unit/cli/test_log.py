@@ -10,6 +10,7 @@ import pytest
 from acsard.cli import main
 from acsard.cli.log import SERVICE
 from acsard.config.settings import Config
+from acsard.record.file import Writing
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -136,6 +137,30 @@ def test_what_was_cut_is_written_as_a_finished_file(
     assert main(["log", "replay", str(new)]) == 0
     assert capsys.readouterr().err == ""
     assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
+
+
+def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recording(
+    where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.mcap"
+    (cut,) = where.glob("*.part")
+    seen: list[bool] = []
+    finish = Writing.finish
+
+    def looked(writing: Writing) -> None:
+        seen.append(new.exists())
+        finish(writing)
+
+    monkeypatch.setattr(Writing, "finish", looked)
+    assert log(capsys, where, "recover", str(cut), str(new))[0] == 0
+    assert seen == [False]
+    code, _, err = log(capsys, where, "recover", str(cut), str(new), "--force")
+    assert (code, "it is a recording; name another file" in err) == (1, True)
+    (mine := tmp_path / "mine").write_text("mine")
+    code, _, err = log(capsys, where, "recover", str(cut), str(mine))
+    assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
+    assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
+    assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
 
 
 def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

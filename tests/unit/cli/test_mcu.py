@@ -233,6 +233,12 @@ def test_progress_does_not_go_into_a_pipe(
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
+def test_yes_and_a_program_that_asks_are_not_both(tmp_path: Path) -> None:
+    with pytest.raises(ExitError, match="--json-lines") as end:
+        called(tmp_path, "--port", "sim", "--yes", "--json-lines")
+    assert end.value.code == Exit.USAGE
+
+
 @pytest.mark.parametrize("typed", ["", "q\n", "what?\nQ\n"])
 def test_q_and_the_end_of_the_input_end_the_check(
     typed: str, monkeypatch: pytest.MonkeyPatch

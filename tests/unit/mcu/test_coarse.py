@@ -23,6 +23,7 @@ from tests.unit.mcu.counted import (
     speeds,
     text,
 )
+from tests.unit.mcu.table import print_row
 
 COUNTS = (16, 20, 40, 96, 400)
 FINER = (1000, 2000, 4000)
@@ -72,9 +73,11 @@ def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int) -> None:
         float(np.mean([getattr(one, what) for one in drives])) for what in ("raw", "plain", "ours")
     )
     dropped = sum(one.dropped for one in drives)
-    print(
-        f"\n{counts}: raw counter {raw * 1e3:.1f} mm, reports {plain * 1e3:.1f} mm, "
-        f"ours {ours * 1e3:.1f} mm ({ours / raw:.3f}), {dropped} lines dropped"
+    print_row(
+        f"{counts} counts a turn",
+        "0.2 x reports" if counts in FINER else "1.05 x raw counter, 0 lines dropped",
+        f"{ours * 1e3:.1f} mm, {ours / raw:.3f} x raw, {ours / plain:.2f} x reports; "
+        f"{dropped} lines dropped",
     )
     assert dropped == 0
     assert ours <= 1.05 * raw or counts in FINER

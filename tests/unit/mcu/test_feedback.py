@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from itertools import pairwise
 
 import pytest
@@ -290,3 +291,20 @@ def test_a_change_of_clocks_adds_up_to_no_time() -> None:
         if number % 100 == 70:
             bench.timeline._slots.forget()
     assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> None:
+    """A slot is where the promptest read would be, an answer where reads are in the mean."""
+    bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
+    began = bench.now_ns
+    for number in (*range(200), *range(215, 230)):  # a stall, which shows that it answers
+        left_ns = began + number * 10 * MS
+        bench.timeline.left(left_ns)
+        bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)
+        at = Instant(bench.now_ns, bench.now_ns)
+        bench.timeline.read(at, LENGTH, 1, 0)
+        dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
+        total += dt if number >= 150 else 0.0
+    assert bench.timeline._told.clock == "prompts"
+    assert total == pytest.approx(0.8, abs=0.0003)

@@ -6,8 +6,15 @@ import asyncio
 import threading
 from collections import Counter
 
+import pytest
+import zenoh
+
+from acsard.client import Client
+from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import ServiceReply
-from acsard.web.calls import STOPS_AT_ONCE, Stops
+from acsard.web.calls import ELSEWHERE_AT_ONCE, STOPS_AT_ONCE, Calls, RefusedError, Stops
+from acsard.web.who import MAINTAINER
+from tests.unit.web.test_fleet import quiet, robots
 
 PATIENCE_S = 20.0
 
@@ -65,3 +72,52 @@ def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
             await asyncio.gather(*first)
 
     asyncio.run(story())
+
+
+def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_have() -> None:
+    async def story() -> None:
+        calls = Calls(robots(None))
+        with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
+            await calls.call(MAINTAINER, "clear", {}, "r2")
+        assert told.value.role
+        with pytest.raises(RefusedError, match="not a robot's id"):
+            await calls.call(MAINTAINER, "stop", {}, "**")
+        # Its own by name is its own.
+        assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
+
+    asyncio.run(story())
+
+
+def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:
+    held: list[zenoh.Query] = []
+    told: list[str] = []
+
+    async def story(session: zenoh.Session) -> None:
+        calls = Calls(robots(Client(session, "acsar", "teleop")))
+
+        async def stop(robot: str) -> ServiceReply:
+            return await calls.call(MAINTAINER, "stop", {}, robot)
+
+        first = [asyncio.create_task(stop("r2")) for _ in range(ELSEWHERE_AT_ONCE)]
+        async with asyncio.timeout(PATIENCE_S):
+            while len(held) < ELSEWHERE_AT_ONCE:
+                await asyncio.sleep(0.01)
+            beyond = await stop("r3")
+            while not told:
+                await asyncio.sleep(0.01)
+        assert not beyond.success
+        assert "r3 was told to stop" in beyond.message
+        assert told == ["acsard/r3/stop"]
+        answer = encode(ServiceReply(True, "stopped"), "msgpack")
+        while held:
+            with held.pop() as query:
+                kind = encoding_name("msgpack", "ServiceReply")
+                query.reply(query.key_expr, answer, encoding=kind)
+        assert all(reply.success for reply in await asyncio.gather(*first))
+
+    with zenoh.open(quiet()) as session:
+        session.declare_queryable("acsard/r2/srv/stop", held.append)
+        session.declare_subscriber(
+            "acsard/*/stop", lambda sample: told.append(str(sample.key_expr))
+        )
+        asyncio.run(story(session))

@@ -3,7 +3,18 @@
 from __future__ import annotations
 
 from acsard.values import NS_PER_S
-from acsard.web.limits import TRIES, TRIES_OF_ONE, Bucket, Places, Tries
+from acsard.web.limits import (
+    CONNECTIONS,
+    CONNECTIONS_OF_ONE,
+    CONNECTIONS_OF_TOKEN,
+    TRIES,
+    TRIES_OF_ONE,
+    Bucket,
+    Places,
+    Seats,
+    Shares,
+    Tries,
+)
 
 
 def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
@@ -42,3 +53,44 @@ def test_places_are_bounded_by_address_and_in_all() -> None:
     places.leave("a")
     assert places.enter("c")
     assert places.taken == 3
+
+
+def test_a_token_has_a_share_of_the_pages_from_however_many_addresses_and_leaves_room() -> None:
+    seats = Seats()
+    taken = [seats.enter(f"10.0.0.{n}", "wall") for n in range(CONNECTIONS)]
+    assert taken.count(True) == CONNECTIONS_OF_TOKEN < CONNECTIONS
+    assert seats.enter("10.0.1.1", "phone")
+    seats.leave("10.0.0.0", "wall")
+    assert seats.enter("10.0.2.1", "wall")
+
+
+def test_a_token_without_room_takes_no_place_of_its_address() -> None:
+    seats = Seats()
+    for n in range(CONNECTIONS_OF_TOKEN):
+        seats.enter(f"10.0.0.{n}", "wall")
+    assert not any(seats.enter("10.0.1.1", "wall") for _ in range(2 * CONNECTIONS_OF_ONE))
+    assert seats.enter("10.0.1.1", "phone")
+
+
+def test_who_is_at_the_machine_has_no_token_to_share() -> None:
+    seats = Seats()
+    assert [seats.enter("::1", "") for _ in range(CONNECTIONS_OF_ONE + 1)].count(False) == 1
+
+
+def test_one_holder_has_his_share_and_leaves_room_for_others() -> None:
+    shares = Shares(10, 4)
+    assert [shares.enter("a", n) for n in range(6)] == [True] * 4 + [False] * 2
+    assert shares.enter("b", 9)
+
+
+def test_the_same_thing_again_takes_no_more_room_until_all_have_let_go() -> None:
+    shares = Shares(2, 1)
+    assert [shares.enter("a", "state") for _ in range(3)] == [True] * 3
+    assert shares.enter("b", "state")
+    assert shares.enter("c", "odom")
+    assert not shares.enter("d", "tf")
+    for _ in range(3):
+        shares.leave("a", "state")
+    assert not shares.enter("d", "tf")
+    shares.leave("b", "state")
+    assert shares.enter("d", "tf")

@@ -13,9 +13,9 @@ import math
 from operator import eq
 
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.residual import MEMORY_S, Residual
-from acsard.drive.stuck import Stuck
-from acsard.drive.suspect import WORDS, Known, Lie, Suspect, has_lied
+from acsard.drive.lying_wheels.residual import MEMORY_S, Residual
+from acsard.drive.lying_wheels.stuck import Stuck
+from acsard.drive.lying_wheels.suspect import WORDS, Known, Lie, Suspect, has_lied
 from acsard.mcu.frames import Motors
 from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 

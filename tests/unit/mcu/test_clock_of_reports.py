@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.mcu.slots import Slots
+from acsard.mcu.clock_of_reports import Slots
 
 MS = 1_000_000
 PERIOD = 0.01
@@ -165,6 +165,26 @@ def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(
         if not had and slots.period is not None:
             assert slots.period == PERIOD
     assert (slots.period, counted) == (PERIOD, 0)
+
+
+OUT_OF_TURN = [
+    0.0, 0.49, 1.1, 0.68, 1.31, 0.87, 0.53, 1.11, 0.69, 1.29, 0.91, 0.48, 1.09, 0.68, 1.29, 0.97,
+    0.51, 1.08, 0.75, 1.32, 1.0, 0.49, 1.09, 0.68, 1.31, 0.91, 1.49, 1.09, 0.68, 1.28, 0.88, 0.52,
+]  # fmt: skip
+"""Slots by which the reads of half a second of batches are late, as seen: the first one's line was
+early, as the first answer of a port is, since our lines follow each other only after it."""
+
+
+def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
+    slots, slot, before = Slots((PERIOD,)), 0, 0.0
+    for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
+        lines = round(1.6 - late + before)  # 16 ms of them
+        slot, before = slot + lines, late
+        slots.read(10**12 + int((slot + late) * 10 * MS), lines, True)
+        if slots.period is not None:
+            break
+    assert slots.period == PERIOD
+    assert slots.usual == 10 * MS
 
 
 @pytest.mark.parametrize("lost", [1, 2, 7, 50])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from acsard.mcu.lateness import Lateness
 from acsard.mcu.link import WORDS
+from acsard.mcu.whose_silence import Lateness
 
 MS = 1_000_000
 QUIET_NS = 100 * MS

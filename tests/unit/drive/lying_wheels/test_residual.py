@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.drive.residual import MEMORY_S, UNEQUAL, Residual
+from acsard.drive.lying_wheels.residual import MEMORY_S, UNEQUAL, Residual
 
 DT = 0.01
 KEEP = MEMORY_S / (MEMORY_S + DT)

@@ -8,8 +8,8 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
 from acsard.web.counts import Counts
-from acsard.web.outgoing import Following, Outgoing
 from acsard.web.streams import Stream
+from acsard.web.to_browser import Following, Outgoing
 
 
 def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from acsard.drive.rolled import MAX_LOST_S, NOWHERE, Rolled, Rolling
+from acsard.drive.distance import MAX_LOST_S, NOWHERE, Rolled, Rolling
 from acsard.mcu.feedback import Feedback
 from acsard.values import Instant, WheelSpeeds
 
@@ -46,6 +46,14 @@ def test_what_no_line_reported_lies_between_two_speeds() -> None:
     assert rolled.pieces == (all_four(0.06), all_four(0.04))
     assert rolled.seen == all_four(0.1)
     assert (rolled.seconds, rolled.bridged) == near(0.03, 0.02)
+
+
+def test_a_silence_goes_on_as_before_it_no_longer_than_until_wheels_are_told_to_stand() -> None:
+    rolling = Rolling(quiet=0.1)
+    stood = rolling.take(Feedback(AT, WheelSpeeds(), 0.6, bridged=0.5), FOUR)
+    assert total(stood) == pytest.approx(0.4)
+    short = rolling.take(Feedback(AT, WheelSpeeds(), 0.2, bridged=0.1), FOUR)
+    assert total(short) == pytest.approx(0.2), "as long as nobody told them"
 
 
 def test_counts_go_before_the_speed() -> None:

@@ -1,7 +1,8 @@
 """What a line says of how far the wheels rolled since the one before: each second, each count once.
 
 By the encoders' own counts where there are such; else by whole counts that the speeds show; else by
-the speeds times the time. What no line reported lies between two speeds, and what lines should have
+the speeds times the time. What no line reported lies between two speeds; but a silence so long that
+the wheels were told to stand went on as before it no longer than until then. What lines should have
 told that cannot be true is left to the next one that can.
 """
 
@@ -45,7 +46,9 @@ class Rolled(Struct, frozen=True, gc=False):
 class Rolling:
     """Remembers the lines that were passed over; `take` the next one that can be true."""
 
-    def __init__(self) -> None:
+    def __init__(self, quiet: float = math.inf) -> None:
+        """`quiet` s of silence make the link stale, and wheels are told to stand then."""
+        self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
         """s of the lines passed over: without counts, unreported before them, with counts."""
         self._turned = NOWHERE
@@ -78,7 +81,8 @@ class Rolling:
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
-                between = times(plus(before.as_tuple(), speeds), bridged / 2)
+                on = min(bridged / 2, self._quiet)
+                between = plus(times(before.as_tuple(), on), times(speeds, bridged - on))
                 seen, pieces = plus(between, said), _some(between, *pieces)
         return Rolled(pieces, turned, seen, seconds, bridged, unknown, 0.0 if unknown else known)
 

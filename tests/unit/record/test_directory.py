@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from acsard.config.settings import RecordConfig
+from acsard.record.directory import DIRECTORY_MODE, KEPT, KEPT_FILES, PART, Ring, listed
 from acsard.record.file import About, Recording
-from acsard.record.ring import DIRECTORY_MODE, KEPT, KEPT_FILES, PART, Ring, listed
 
 DAY_NS = 86_400_000_000_000
 NOW_NS = 1_800_000_000_000_000_000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from acsard.client import Client
 from acsard.host import clock
+from acsard.web.commands import Hand, Order
 from acsard.web.counts import Counts
-from acsard.web.hand import Hand, Order
 
 PATIENCE_S = 20.0
 

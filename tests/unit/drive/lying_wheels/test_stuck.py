@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.drive.stuck import Stuck
+from acsard.drive.lying_wheels.stuck import Stuck
 
 DT = 0.01
 FINE = math.tau / 3200

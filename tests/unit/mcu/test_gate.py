@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, seal
-from acsard.mcu.port import Gate
+from acsard.mcu.gate import Gate
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS

@@ -127,6 +127,11 @@ class Slots:
             self._follow(at_ns)
         return lost
 
+    @property
+    def late_ns(self) -> float:
+        """How long after its line was complete a read comes, in the mean."""
+        return self._lag * self.usual
+
     def time_ns(self, behind: int) -> int:
         """When the line was complete that lies so many lines before the read's last one."""
         return int(self._first + (self._slot - behind) * self.usual)
@@ -163,17 +168,18 @@ class Slots:
         reads.append((at_ns, lines))
         if len(reads) <= WINDOW_READS or at_ns - reads[0][0] < WINDOW_NS:
             return
-        self._reads = reads[-1:]
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
             if max(late) <= most:
                 break
         else:
+            del reads[: len(reads) // 4]
             return
         self.usual, self._first, self._slot = guess, first, slots[-1]
         self._lag, self._batch, self._gain = fmean(late), median(gaps) / guess, 1.0
         self._batched = most > 1
+        self._reads = []
         self.period = self._nominal()
         self._given, self._share, self._alone = 0, 0.0, False
         self._begin(at_ns)
@@ -186,7 +192,8 @@ class Slots:
 
         Of jittery lines a configured period says more than half a second of them. An adapter hands
         lines over one by one too, where they fill its packets: so before lines are missing for a
-        period that nobody has configured, none is for one that somebody has.
+        period that nobody has configured, none is for one that somebody has. And half a second of
+        batches tells no period from one that it is hardly off.
         """
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
@@ -195,7 +202,11 @@ class Slots:
             own = _slots(reads, median(alone))
             yield from ((own, LATE_ALONE, period) for period in known)
         yield from ((plain, LATE_BATCHED, period) for period in known)
-        yield own, LATE_BATCHED if own is plain else LATE_ALONE, _slope(reads, own)
+        slope = _slope(reads, own)
+        if own is not plain:
+            yield own, LATE_ALONE, slope
+        elif all(abs(slope / period - 1) > DRIFT for period in known):
+            yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
         """A new window: its least x, its reads, their slots, and how many of them were lossy."""

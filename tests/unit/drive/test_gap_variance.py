@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.drive.gaps import GUESS, SPAN, Gaps
+from acsard.drive.gap_variance import GUESS, SPAN, Gaps
 from acsard.values import REST, Twist
 
 CRUISE = Twist(0.5, 0.5)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from acsard.drive.suspect import WORDS, Known, Lie, Suspect, has_lied
+from acsard.drive.lying_wheels.suspect import WORDS, Known, Lie, Suspect, has_lied
 
 DT = 0.01
 FINE = math.tau / 3200

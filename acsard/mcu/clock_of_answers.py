@@ -43,7 +43,7 @@ LOSING = 0.005
 """How quickly the share of lost answers follows: in 20 reads two lost ones would make it 3 %."""
 
 MOST_LOST = 0.03
-"""Share of answers lost on a batched link, from which on nobody can tell whose one is."""
+"""Share of answers lost on a batched link, from which on any line may be without one."""
 
 SEVERAL = 0.15
 """Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
@@ -105,8 +105,8 @@ class Prompts:
         return self._thinking > THINKS and not self._batched
 
     @property
-    def lost(self) -> bool:
-        """Answers get lost on a batched link: which line one belongs to cannot be told."""
+    def lossy(self) -> bool:
+        """Answers get lost on a batched link, where no clock of slots is to be found."""
         return self._batched and self._losses > MOST_LOST
 
     @property
@@ -182,8 +182,14 @@ class Prompts:
             self._delay = self._least = float(self._at - left[0])
 
     def _weigh(self, lines: int, since: int) -> None:
-        """Give up lines that a batch's last answer is too late for, `since` the read before."""
+        """Give up lines that a batch's last answer is too late for, `since` the read before.
+
+        Where many are lost, its first answer too: it came with the batch after it was made.
+        """
         left, at = self._left, self._at
+        judged, soonest = lines - 1, float(self._soonest)
+        if self.lossy:
+            judged, soonest = 0, max(soonest, self._base - JITTER_NS)
         if since < 1.5 * self._batch:
             self._batch += GAIN * (since - self._batch)
         if len(left) < lines or self._delay is None:
@@ -193,8 +199,8 @@ class Prompts:
             self._base = float(at - left[lines - 1])
         lost = 0
         while len(left) > lines:
-            late = at - left[lines - 1] - self._base
-            if late <= self._batch + 2 * JITTER_NS or at - left[lines] < self._soonest:
+            late = at - left[judged] - self._base
+            if late <= self._batch + 2 * JITTER_NS or at - left[lines] < soonest:
                 break
             self._passed, lost = left.popleft(), lost + 1
         self._losses += LOSING * (lost / (lines + lost) - self._losses)

@@ -1,0 +1,250 @@
+// A check of the board or a calibration: what the command tells and asks, and what the person beside
+// the robot answers. The command runs at the robot, and ends with this page's connection.
+
+import { made, text } from "./views.js";
+
+const $ = (id) => document.getElementById(id);
+const LABELS = {
+  fr: "front right", fl: "front left", rl: "rear left", rr: "rear right", none: "none", again: "show it again",
+  start: "Start", write: "Write them", leave: "Leave the file as it is", lifted: "The wheels are lifted: none touches anything",
+};
+const NAMES = { check: "Check of the board", calibrate: "Calibration" };
+const LOOKS = { PASS: "", WARN: "warning", FAIL: "error", SKIPPED: "skipped" };
+const MODIFIERS = ["Shift", "Control", "Alt", "AltGraph", "Meta", "Tab"];
+
+export class Guide {
+  #link;
+  #running = false; // ours
+  #question = null;
+  #rides = false; // a leg: a key stops it
+  #busy = ""; // who else goes through one
+
+  constructor(link) {
+    this.#link = link;
+    link.addEventListener("guide", ({ detail }) => this.#take(detail.guide));
+    link.addEventListener("down", () => this.#running && this.#over("the connection is gone: the robot's computer has ended it"));
+    $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
+    $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#way() }));
+    $("way").addEventListener("change", () => this.#ways());
+    $("guide-halt").addEventListener("click", () => this.#key());
+    $("guide-leave").addEventListener("click", () => this.leave());
+    $("guide-close").addEventListener("click", () => this.#close());
+    $("guide-question").addEventListener("submit", (event) => event.preventDefault());
+    document.addEventListener("visibilitychange", () => document.hidden && !this.#question && this.leave());
+    addEventListener("keydown", (event) => this.#pressed(event));
+  }
+
+  /** End what goes on, as Ctrl-C does. */
+  leave() {
+    if (this.#running) this.#link.urge({ press: "leave" });
+  }
+
+  /** What may be begun, as `api/guide` says; or why nothing. */
+  choices({ ways, ports, note, error }) {
+    text("guide-note", [error ?? note, this.#busy].filter(Boolean).join(" "));
+    for (const id of ["check-card", "calibrate-card"]) $(id).hidden = Boolean(error);
+    if (error) return;
+    options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
+    options($("way"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(ways).map(([way, needs]) => [way, `${way}: ${needs}`])]);
+    this.#ways();
+  }
+
+  refused(why) {
+    text("guide-note", why);
+  }
+
+  #ways() {
+    $("positions-row").hidden = $("way").value !== "positions";
+  }
+
+  #way() {
+    const way = $("way").value;
+    return way === "positions" ? { way, positions: $("positions").value.trim() } : { way };
+  }
+
+  #begin(wish) {
+    text("guide-note", "");
+    if (!this.#link.send(wish)) text("guide-note", "no connection to the robot's computer");
+  }
+
+  #take(said) {
+    if ("running" in said) return this.#runs(said);
+    if ("subject" in said) this.#subject(said);
+    if ("told" in said) this.#tell(made("li", "", worded(said.told)));
+    if ("doing" in said) text("guide-doing", said.doing);
+    if ("finding" in said) this.#found(said.finding);
+    if ("progress" in said) this.#progress(said.progress);
+    if ("result" in said) this.#result(said.result);
+    if ("question" in said) this.#ask(said);
+    if ("ended" in said) this.#over(`${said.meaning} (exit ${said.ended})`, said.text, said.ended === 0 ? "" : "error");
+  }
+
+  #runs({ running, by, yours }) {
+    for (const id of ["check", "calibrate"]) $(id).disabled = Boolean(running);
+    this.#busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
+    text("guide-note", this.#busy);
+    if (!running || !yours) return;
+    this.#running = true;
+    $("errands").hidden = true;
+    $("guide").hidden = false;
+    $("guide-leave").hidden = false;
+    $("guide-close").hidden = $("guide-result").hidden = $("guide-where").hidden = true;
+    text("guide-name", NAMES[running]);
+    text("guide-doing", "it begins");
+    $("guide-story").replaceChildren();
+    this.#progress(0);
+    focus("guide-name");
+  }
+
+  #subject({ subject, simulated }) {
+    const badge = $("guide-where");
+    badge.hidden = false;
+    badge.textContent = simulated ? "SIMULATED" : "REAL ROBOT";
+    this.#tell(made("li", "", subject));
+  }
+
+  #found({ name, verdict, figure, text: meaning, mend }) {
+    const head = made("strong", "", `${verdict} ${name}`);
+    const more = [meaning, mend ? `→ ${mend}` : ""].filter(Boolean).map((one) => made("div", "quiet", one));
+    this.#tell(made("li", LOOKS[verdict] ?? "", head, ` ${figure ?? ""}`, ...more));
+  }
+
+  #tell(item) {
+    $("guide-story").append(item);
+    item.scrollIntoView({ block: "nearest" });
+  }
+
+  #progress(share) {
+    $("guide-progress").value = share;
+    if (share >= 1) this.#ride(false);
+  }
+
+  #ride(on, byKey = false) {
+    this.#rides = on;
+    $("guide-halt").hidden = !on;
+    $("guide-halt").textContent = byKey ? "NOW" : "Stop it";
+    if (on) focus("guide-halt");
+  }
+
+  #result(found) {
+    $("guide-result").hidden = false;
+    text("guide-result", found);
+  }
+
+  #ask(question) {
+    this.#question = question;
+    this.#ride(false);
+    const again = question.wrong ? worded(question.wrong) : "";
+    const form = $("guide-question");
+    form.hidden = false;
+    text("guide-words", worded(question.words));
+    text("guide-wrong", again && `That does not do: ${again}`);
+    text("guide-doing", "");
+    const number = !question.answers;
+    $("guide-answers").replaceChildren(...(number ? this.#number(question) : this.#choice(question)));
+    focus(number ? "guide-number" : "guide-words");
+    form.scrollIntoView({ block: "nearest" });
+  }
+
+  #choice({ answers }) {
+    const answer = (one, label = LABELS[one] ?? one) => {
+      const button = made("button", one === "start" || answers.length === 1 ? "go" : "", label);
+      button.type = "button";
+      button.dataset.answer = one;
+      button.addEventListener("click", () => this.#answer(one));
+      return button;
+    };
+    if (answers.length > 1 || answers[0] === "start") return answers.map((one) => answer(one));
+    // What has to be seen to is ticked before it goes on.
+    const tick = made("input");
+    const go = answer(answers[0], "Go on");
+    tick.type = "checkbox";
+    tick.id = "guide-tick";
+    go.disabled = true;
+    tick.addEventListener("change", () => (go.disabled = !tick.checked));
+    return [made("label", "tick", tick, ` ${LABELS[answers[0]] ?? answers[0]}`), go];
+  }
+
+  #number({ unit, usual }) {
+    const field = made("input");
+    field.id = "guide-number";
+    field.inputMode = "decimal";
+    field.autocomplete = "off";
+    field.setAttribute("aria-describedby", "guide-words guide-wrong");
+    const label = made("label", "number", "read off: ", field, ` ${unit}`);
+    const button = made("button", "go", "Take it");
+    button.addEventListener("click", () => this.#answer(typed(field.value, usual)));
+    return [label, button];
+  }
+
+  #answer(value) {
+    const question = this.#question;
+    if (!question || !this.#link.send({ reply: question.question, value })) return;
+    this.#question = null;
+    $("guide-question").hidden = true;
+    text("guide-doing", "it goes on");
+    if (question.leg) {
+      this.#progress(0);
+      this.#ride(true, question.by_key);
+    } else focus("guide-name");
+  }
+
+  #key() {
+    this.#link.urge({ press: "key" });
+  }
+
+  /** As at the terminal: any key stops a robot that drives, Escape ends it all. Space is STOP, everywhere. */
+  #pressed(event) {
+    if (!this.#running || event.repeat || MODIFIERS.includes(event.key)) return;
+    if (event.key === "Escape") this.leave();
+    else if (this.#rides && event.code !== "Space") {
+      event.preventDefault();
+      this.#key();
+    }
+  }
+
+  #over(why, words = "", look = "warning") {
+    this.#running = false;
+    this.#question = null;
+    this.#ride(false);
+    $("guide-question").hidden = $("guide-leave").hidden = true;
+    $("guide-close").hidden = false;
+    text("guide-doing", `ended: ${why}`);
+    for (const line of words.split("\n").filter(Boolean)) this.#tell(made("li", look, worded(line)));
+    focus("guide-name");
+  }
+
+  #close() {
+    $("guide").hidden = true;
+    $("errands").hidden = false;
+    $("check").focus();
+  }
+}
+
+/** What a terminal says of its keys, as it is here. */
+export function worded(words) {
+  return words
+    .replace('then type "lifted":', "then tick this:")
+    .replace("Press SPACE", "Press NOW")
+    .replace("Enter alone:", "Left empty:")
+    .replace("any key stops it", "any key or the button stops it");
+}
+
+/** The number that was typed; null where nothing was and something is usual; what it cannot be goes as
+ *  it is, and is refused. */
+export function typed(words, usual) {
+  const plain = words.trim().replace("−", "-").replace(",", ".");
+  if (plain === "") return usual === undefined ? "" : null;
+  return Number.isNaN(Number(plain)) ? words.slice(0, 80) : Number(plain);
+}
+
+function options(select, rows) {
+  const before = select.value;
+  select.replaceChildren(...rows.map(([value, label]) => new Option(label, value)));
+  if (rows.some(([value]) => value === before)) select.value = before;
+}
+
+/** Where the eye and the screen reader are to be, when the view is shown. */
+function focus(id) {
+  if (!$("set").hidden) $(id).focus({ preventScroll: false });
+}

@@ -1,0 +1,73 @@
+// The black box: each recording with its download, and its report, which the robot draws when asked.
+
+import { made } from "./views.js";
+import { began, lasted } from "./words.js";
+
+const AGAIN = 1000;
+
+export class Recordings {
+  #list;
+  #none;
+  #reports = new Map(); // by name: its place in the row, which outlives the row
+
+  constructor(list, none) {
+    this.#list = list;
+    this.#none = none;
+  }
+
+  /** `barred` is why this one may not fetch them, "" for who may; `trouble` why there are none. */
+  show(files, barred, trouble = "") {
+    this.#none.textContent = trouble || "none here";
+    this.#none.hidden = files.length > 0;
+    this.#list.replaceChildren(...files.map((one) => this.#row(one, barred)));
+  }
+
+  #row(one, barred) {
+    const about = made("div", "quiet", [began(one.begin), lasted(one.seconds), one.events].filter(Boolean).join(" · "));
+    if (barred) return made("li", "", made("span", "", one.name), about, made("div", "quiet", `download and report are ${barred}`));
+    const link = made("a", "", one.name);
+    link.href = `api/recordings/${encodeURIComponent(one.name)}`;
+    link.download = one.name;
+    if (!this.#reports.has(one.name)) this.#reports.set(one.name, this.#offer(one.name));
+    return made("li", "", link, about, this.#reports.get(one.name));
+  }
+
+  #offer(name) {
+    const place = made("div", "report");
+    place.setAttribute("role", "status");
+    const button = made("button", "", "Report");
+    button.setAttribute("aria-label", `Report of ${name}`);
+    button.addEventListener("click", () => this.#draw(name, place, button));
+    place.append(button);
+    return place;
+  }
+
+  async #draw(name, place, button) {
+    for (;;) {
+      const told = await ask(name);
+      if (told.report === "ready") {
+        const link = made("a", "", "Open the report");
+        link.href = told.href;
+        link.target = "_blank";
+        link.rel = "noopener";
+        return place.replaceChildren(button, " ", link);
+      }
+      if (told.report !== "drawing" && told.report !== "busy") return place.replaceChildren(button, made("span", "warn", ` ${told.text}`));
+      const how = told.report === "busy" ? told.text : `being drawn: ${told.percent ?? 0} %, ${Math.round(told.seconds ?? 0)} s`;
+      place.replaceChildren(how);
+      await new Promise((done) => setTimeout(done, AGAIN));
+    }
+  }
+}
+
+/** How far it is; who asks first has it begun. */
+async function ask(name) {
+  try {
+    const way = `api/recordings/${encodeURIComponent(name)}/report`;
+    const answer = await fetch(way, { method: "POST", signal: AbortSignal.timeout(15000) });
+    const told = await answer.json();
+    return told.report ? told : { text: told.error };
+  } catch {
+    return { text: "no answer from the robot" };
+  }
+}

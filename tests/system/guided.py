@@ -1,0 +1,99 @@
+"""Somebody who goes through a check or a calibration over the page's WebSocket."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.system.browser import Hands, Page, hands
+from tests.system.harness import Daemon, Tables, children, free_endpoint, until, write_config
+
+PING_S = 0.5
+
+WHEELS = ("fr", "fl", "rl", "rr")
+
+
+class NoDaemon(Daemon):
+    """The configuration of a daemon that does not run."""
+
+    def __init__(self, where: Path, port: str = "sim") -> None:
+        self.endpoint = free_endpoint()
+        tables: Tables = {"mcu": {"port": port}, "bus": {"listen": [self.endpoint]}}
+        self.config = write_config(where / "alone.toml", tables)
+
+
+class Guided:
+    """What the child says, in order; pings go on as a browser's."""
+
+    def __init__(self, ours: Hands) -> None:
+        self.ours = ours
+
+    async def begin(self, what: str, **more: object) -> None:
+        await self.ours.say(begin=what, **more)
+
+    async def says(self, look: Callable[[Any], Any]) -> Any:
+        """The first of it that it finds true; fails when it has ended before."""
+
+        def found(said: Any) -> Any:
+            found = "guide" in said and look(said["guide"])
+            assert found or "ended" not in said.get("guide", {}), said
+            return found
+
+        return (await self.ours.find(found))["guide"]
+
+    async def asks(self, words: str = "") -> Any:
+        """The next question, which has these words."""
+        question = await self.says(lambda said: "question" in said)
+        assert words in question["words"], question
+        return question
+
+    async def answer(self, question: Any, value: object) -> None:
+        await self.ours.say(reply=question["question"], value=value)
+
+    async def ended(self) -> Any:
+        return await self.says(lambda said: "ended" in said)
+
+    async def starts(self, words: str = "") -> None:
+        """The next leg is begun."""
+        await self.answer(await self.asks(words), "start")
+
+    async def lifted(self) -> None:
+        """A check goes on."""
+        await self.answer(await self.asks("lifted"), "lifted")
+
+    async def sees(self, wheels: tuple[str, ...] = WHEELS) -> None:
+        """Which wheel each motor turns, all of them forward."""
+        for wheel in wheels:
+            await self.answer(await self.asks("which wheel"), wheel)
+            await self.answer(await self.asks("which way"), "forward")
+
+
+@asynccontextmanager
+async def guiding(page: Page, *, pings: bool = True, token: str = "") -> AsyncIterator[Guided]:
+    """Connected, as a page that is looked at."""
+    async with hands(page, token) as ours:
+        pinging = asyncio.create_task(_ping(ours)) if pings else None
+        try:
+            yield Guided(ours)
+        finally:
+            if pinging is not None:
+                pinging.cancel()
+
+
+async def _ping(ours: Hands) -> None:
+    while True:
+        await ours.say(ping=1.0)
+        await asyncio.sleep(PING_S)
+
+
+def commands(page: Page) -> list[int]:
+    """The checks and calibrations that the page's server has started and that still run."""
+    return children(page.pid, "--json-lines")
+
+
+def none_left(page: Page) -> None:
+    """They end."""
+    until(lambda: not commands(page), 8.0, "no command runs any more")

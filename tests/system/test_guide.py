@@ -1,0 +1,335 @@
+"""Checks and calibrations gone through over the page's WebSocket: begun, answered, let go of."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import aiohttp
+import pytest
+
+from acsard.cli.json_lines import HEARD_S
+from acsard.lan.authority import Authority
+from tests.system.browser import NAME, Page, run, text
+from tests.system.bystander import lost
+from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
+from tests.system.harness import Bus, Daemon, Program, acsard, until
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with Daemon(tmp_path_factory.mktemp("daemon")) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    where = tmp_path_factory.mktemp("page")
+    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    with Page(daemon, where) as page:
+        yield page
+
+
+@pytest.fixture
+def bus(daemon: Daemon) -> Iterator[Bus]:
+    """The robot stands and may be driven."""
+    with Bus(daemon.endpoint) as bus:
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus
+
+
+async def beside(call: Callable[[], Any]) -> Any:
+    """What waits, while the pings go on."""
+    return await asyncio.to_thread(call)
+
+
+async def drives(guided: Guided, bus: Bus) -> None:
+    """The first leg moves; it is begun again where a busy machine has ended it."""
+    for _ in range(4):
+        await guided.begin("calibrate", way="umbmark")
+        await guided.answer(await guided.asks("How wide"), 300)
+        await guided.starts("1. Set the robot")
+        said = await guided.says(lambda said: said.get("progress", 0.0) > 0.15 or "ended" in said)
+        if "ended" not in said:
+            break
+        await guided.says(lambda said: said.get("running") == "")
+    await beside(lambda: until(lambda: bus.state()["linear"] > 0.25, 10.0, "the leg moves"))
+    assert bus.state()["source"] == "app"
+
+
+def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
+    tmp_path: Path,
+) -> None:
+    alone = NoDaemon(tmp_path)
+    found: list[Any] = []
+
+    async def story() -> None:
+        async with guiding(served) as guided:
+            await guided.begin("check", port="sim")
+            subject = await guided.says(lambda said: "subject" in said)
+            assert subject["simulated"] is True
+            question = await guided.asks("lifted")
+            assert question["answers"] == ["lifted"]
+            # What is not allowed is told, and asked again; nothing has turned.
+            await guided.answer(question, "yes")
+            question = await guided.asks("lifted")
+            assert question["wrong"] == "one of: lifted"
+            await guided.answer(question, "lifted")
+            await guided.sees(("fl", "fr", "rl", "rr"))
+            result = await guided.says(lambda said: "result" in said)
+            assert 'front_left = "+a"' in result["result"]
+            await guided.answer(await guided.asks(str(alone.config)), "write")
+            end = await guided.ended()
+            assert (end["ended"], end["meaning"]) == (1, "failure")  # the map was another
+            found.extend(s["guide"]["finding"] for s in guided.ours.heard if "finding" in str(s))
+
+    with Page(alone, tmp_path) as served:
+        run(story)
+    names = [one["name"] for one in found]
+    assert names[0] == "baud rate"
+    assert "watchdog" in names
+    written = tomllib.loads(alone.config.read_text())["mcu"]
+    assert written["wheels"] == {"front_right": "+b", "front_left": "+a"}
+    assert written["port"] == "sim"
+
+
+def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, bus: Bus) -> None:
+    before = page.refused()
+
+    async def story() -> None:
+        async with guiding(page) as guided, guiding(page) as other:
+            await drives(guided, bus)
+            about = await other.says(lambda said: said.get("running"))
+            assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
+            # One at a time; and nobody else answers, presses or ends.
+            await other.begin("check", port="sim")
+            refused = await other.ours.find(lambda said: said.get("refused") == "begin")
+            assert "here goes through a calibrate already" in refused["reason"]
+            await other.ours.say(press="key")
+            await other.ours.say(press="leave")
+            for number in range(100):
+                await other.ours.say(reply=number, value=1)
+            # Answers that nobody has asked for do nothing, however many come.
+            for number in range(150):
+                await guided.ours.say(reply=number, value="start")
+            refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
+            assert "is open" in refused["reason"]
+            assert bus.state()["linear"] > 0.25
+            pressed = time.monotonic()
+            await guided.ours.say(press="key")
+            await beside(bus.at_rest)
+            took = time.monotonic() - pressed
+            # 0.3 m/s at 1 m/s2, and some of the way.
+            assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
+            end = await guided.ended()
+            assert (end["ended"], end["meaning"]) == (1, "failure")
+            assert "a key was pressed" in end["text"]
+            assert "nothing is written" in end["text"]
+            await other.says(lambda said: said.get("running") == "")
+
+    run(story)
+    none_left(page)
+    assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
+
+
+def gone(guided: Guided, page: Page) -> None:
+    """As a browser that is killed."""
+    cast(Any, guided.ours.socket)._response.connection.transport.abort()
+
+
+def left(guided: Guided, page: Page) -> None:
+    asyncio.get_running_loop().create_task(guided.ours.say(press="leave"))
+
+
+@pytest.mark.parametrize("how", [gone, left])
+def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
+    page: Page, bus: Bus, how: Callable[[Guided, Page], None]
+) -> None:
+    async def story() -> None:
+        async with guiding(page) as guided:
+            await drives(guided, bus)
+            (child,) = commands(page)
+            begun = time.monotonic()
+            how(guided, page)
+            await beside(bus.at_rest)
+            took = time.monotonic() - begun
+            assert took < 0.3 + 0.4 + lost(begun, begun + took)
+            await beside(lambda: none_left(page))
+            assert not Path(f"/proc/{child}").exists()
+        async with guiding(page) as another:
+            await another.begin("calibrate", way="tape")
+            await another.asks("How far apart")
+
+    run(story)
+    none_left(page)
+
+
+def test_who_is_not_heard_any_more_drives_no_more(page: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with guiding(page, pings=False) as guided:
+            for _ in range(4):  # a busy machine may end it before
+                await guided.begin("calibrate", way="umbmark")
+                await guided.answer(await guided.asks("How wide"), 300)
+                await guided.starts()
+                end = await guided.ended()
+                if "nothing was heard" in end["text"]:
+                    break
+                await guided.says(lambda said: said.get("running") == "")
+            assert f"nothing was heard for {HEARD_S:g} s" in end["text"]
+            await beside(bus.at_rest)
+
+    run(story)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGSTOP])
+def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
+    daemon: Daemon, bus: Bus, tmp_path: Path, number: signal.Signals
+) -> None:
+    with Page(daemon, tmp_path) as page:
+
+        async def story() -> None:
+            async with guiding(page) as guided:
+                await drives(guided, bus)
+                (child,) = commands(page)
+                page.signal(number)
+                await beside(bus.at_rest)
+                await beside(
+                    lambda: until(lambda: ended(child), 8.0, "the child ends with its server")
+                )
+
+        try:
+            with pytest.raises((AssertionError, aiohttp.ClientError, ConnectionError)):
+                run(lambda: _then_fail(story))
+        finally:
+            page.signal(signal.SIGCONT)
+
+
+async def _then_fail(story: Callable[[], Any]) -> None:
+    await story()
+    raise ConnectionError("the server is gone")
+
+
+def ended(pid: int) -> bool:
+    """Gone, or waiting for a parent that hangs."""
+    try:
+        return " Z " in Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.network
+def test_who_is_no_maintainer_begins_nothing(page: Page, bus: Bus) -> None:
+    async def story(token: str) -> None:
+        async with guiding(page, token=token) as theirs:
+            for what in ("calibrate", "check"):
+                await theirs.begin(what)
+            refused = await theirs.ours.find(lambda said: said.get("refused") == "begin")
+            assert "for maintainers" in refused["reason"]
+            url = f"{page.away}/api/guide"
+            async with page.client(token) as session, session.get(url) as answer:
+                assert answer.status == 403
+
+    before = page.refused().get("role", 0)
+    for role in ("viewer", "operator"):
+        token = page.invite(role, role)
+        run(lambda: story(token))  # noqa: B023
+    assert page.refused()["role"] == before + 6
+    assert commands(page) == []
+
+
+INJECTED: list[dict[str, object]] = [
+    {"begin": "run"},
+    {"begin": "calibrate", "words": ["--write"]},
+    {"begin": "calibrate", "way": "tape --write"},
+    {"begin": "calibrate", "way": "--log=/etc/passwd"},
+    {"begin": "calibrate", "way": "positions", "positions": "--yes"},
+    {"begin": "calibrate", "way": "positions", "positions": "**"},
+    {"begin": "calibrate", "way": "positions"},
+    {"begin": "calibrate", "way": "tape", "positions": "sim/pose"},
+    {"begin": "calibrate", "port": "sim"},
+    {"begin": "check", "port": "/etc/passwd"},
+    {"begin": "check", "port": "sim --yes"},
+    {"begin": "check", "port": ""},
+    {"begin": "check", "port": "--yes"},
+    {"begin": "check", "port": "sim", "way": "tape"},
+    {"begin": "check", "port": "x" * 300},
+]
+
+
+def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
+    async def story() -> None:
+        async with guiding(page) as guided:
+            for wish in INJECTED:
+                await guided.ours.say(**wish)
+
+                def refused(said: Any) -> bool:
+                    return "refused" in said or "ended" in said.get("guide", {})
+
+                said = await guided.ours.find(refused)
+                if "guide" in said:
+                    assert said["guide"]["ended"] == 2, said
+                    assert said["guide"]["text"], said
+                else:
+                    await asyncio.sleep(1.0)  # a refusal is told once a second
+            assert not any("question" in str(said) for said in guided.ours.heard)
+
+    run(story, 120.0)
+    assert commands(page) == []
+
+
+def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -> None:
+    with Program(acsard("sim"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+
+        async def story() -> None:
+            async with guiding(served) as guided:
+                await guided.begin("check", port=port)
+                end = await guided.ended()
+                assert end["ended"] == 75
+                assert end["meaning"] == "port, bus address or robot id in use"
+                assert f"process {holder.pid}" in end["text"]
+                assert "systemctl stop acsard" in end["text"]
+
+        with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
+            with Bus(holder.endpoint) as bus:
+                bus.linked()
+            run(story)
+
+
+def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+
+        async def story() -> None:
+            async with guiding(served) as guided:
+                await guided.begin("check", port=port)
+                await guided.lifted()
+                await guided.says(lambda said: "motor a" in said.get("doing", ""))
+                gone(guided, served)
+            await beside(lambda: none_left(served))
+
+        with Page(NoDaemon(tmp_path, port), tmp_path) as served:
+            run(story)
+        # The next one finds the wheels standing, and the port free.
+        with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as again:
+            again.says("PASS    motor a", 30.0)
+
+
+def test_what_may_be_begun_is_listed(page: Page) -> None:
+    async def story() -> None:
+        told = json.loads(await text(f"{page.here}/api/guide"))
+        assert sorted(told["ways"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+        assert told["ports"][-1]["port"] == "sim"
+        if len(told["ports"]) == 1:
+            assert "systemctl stop acsard" in told["note"]
+
+    run(story)

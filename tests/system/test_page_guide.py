@@ -1,0 +1,227 @@
+"""Checks and calibrations in a real browser: asked, answered, stopped, looked at."""
+
+from __future__ import annotations
+
+import math
+import time
+import tomllib
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from acsard.config.parsing import parse
+from tests.system.browser import Page
+from tests.system.bystander import lost
+from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.guided import NoDaemon, commands, none_left
+from tests.system.harness import Bus, Daemon, until
+from tests.system.test_calibrate import RIDES_S, SKIDDING
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+]
+
+
+class Person:
+    """Somebody with a phone, at the view Set."""
+
+    def __init__(self, browser: Browser, server: Page) -> None:
+        self.browser, self.server = browser, server
+        browser.size(*PHONE)
+        browser.said.clear()
+        browser.open(server.here)
+        until(lambda: browser.text("robot") == "acsar", 5.0, "it is connected")
+        self.click("tab-set")
+        until(lambda: browser.js("document.querySelectorAll('#way option').length"), 5.0, "ways")
+
+    def click(self, name: str) -> None:
+        self.browser.js(f"document.getElementById({name!r}).click()")
+
+    def shows(self, name: str, words: str, within: float = 10.0) -> None:
+        try:
+            until(lambda: words in self.browser.text(name), within, f"{name} says {words!r}")
+        except AssertionError as error:
+            told = [self.browser.text(f"guide-{one}") for one in ("note", "doing", "story")]
+            raise AssertionError(f"{error}: {told}") from None
+
+    def begin(self, what: str, **chosen: str) -> None:
+        for name, value in chosen.items():
+            self.browser.js(f"document.getElementById({name!r}).value = {value!r}")
+        self.click(what)
+
+    def asked(self, words: str, within: float = 10.0) -> None:
+        """This is the question now, and the eye is led there."""
+        self.shows("guide-words", words, within)
+        until(lambda: not self.hidden("guide-question"), 5.0, "a question")
+        focus = self.browser.js("document.activeElement.id")
+        assert focus in ("guide-words", "guide-number"), focus
+
+    def hidden(self, name: str) -> bool:
+        return bool(self.browser.js(f"document.getElementById({name!r}).hidden"))
+
+    def press(self, answer: str) -> None:
+        """The button of this answer."""
+        self.browser.js(f"document.querySelector('[data-answer={answer}]').click()")
+
+    def types(self, value: str) -> None:
+        """A number."""
+        self.browser.js(f"document.getElementById('guide-number').value = {value!r}")
+        self.browser.js("document.querySelector('#guide-answers .go').click()")
+
+    def ended(self, words: str, within: float = 10.0) -> None:
+        self.shows("guide-doing", words, within)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as browser:
+        yield browser
+
+
+def sound(browser: Browser) -> None:
+    """Nothing is wider than the screen, nothing in the way of a screen reader, in any light."""
+    browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
+    for size in (PHONE, DESKTOP):
+        for dark in (False, True):
+            browser.size(*size, touch=size == PHONE, dark=dark)
+            assert browser.js("document.documentElement.scrollWidth") <= size[0]
+            found = browser.js(
+                "axe.run().then(told =>"
+                " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
+            )
+            assert [one for one in found if one[0] in ("serious", "critical")] == []
+    browser.size(*PHONE)
+
+
+def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
+    browser: Browser, tmp_path: Path
+) -> None:
+    alone = NoDaemon(tmp_path)
+    with Page(alone, tmp_path) as server:
+        person = Person(browser, server)
+        sound(browser)
+        person.begin("check", **{"check-port": "sim"})
+        person.asked("tick this")
+        person.shows("guide-where", "SIMULATED")
+        # Not ticked: it does not go on.
+        person.press("lifted")
+        assert "tick this" in browser.text("guide-words")
+        assert browser.js("document.activeElement.id") == "guide-words"
+        sound(browser)
+        person.click("guide-tick")
+        person.press("lifted")
+        for n, wheel in enumerate(("fl", "fr", "rl", "rr")):
+            person.asked(f"which wheel did motor {'abcd'[n]} turn")
+            if n == 0:
+                sound(browser)
+            person.press(wheel)
+            person.asked("which way")
+            person.press("forward")
+        person.asked("Write these lines")
+        person.shows("guide-result", 'front_left = "+a"')
+        assert browser.js("document.getElementById('guide-progress').value") == 1
+        person.press("write")
+        person.ended("failure (exit 1)")
+        assert "FAIL wheel map" in browser.text("guide-story")
+        assert "written" in browser.text("guide-story")
+        sound(browser)
+        person.click("guide-close")
+        assert not person.hidden("check")
+    assert [one for one in browser.said if "exception" in one.lower() or "Refused to" in one] == []
+    written = tomllib.loads(alone.config.read_text())["mcu"]["wheels"]
+    assert written == {"front_right": "+b", "front_left": "+a"}
+
+
+@pytest.fixture
+def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as server:
+            yield daemon, bus, server
+
+
+def drives(person: Person, bus: Bus) -> None:
+    """The first leg moves; it is begun again where a busy machine has ended it."""
+    told: list[str] = []
+
+    def moves() -> bool:
+        if person.hidden("guide"):
+            person.begin("calibrate")
+            person.asked("1. Set the robot", 30.0)
+            person.shows("guide-where", "SIMULATED")
+            person.press("start")
+        elif not person.hidden("guide-close"):
+            told.append(person.browser.text("guide-story"))
+            person.click("guide-close")
+        return bool(bus.state()["linear"] > 0.25)
+
+    try:
+        until(moves, 30.0, "the leg moves")
+    except AssertionError as error:
+        raise AssertionError(f"{error}; it said {told}") from None
+
+
+WAYS = ("a key", "the button", "escape", "stop", "hidden")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_whatever_a_person_does_while_it_drives_stops_it(
+    browser: Browser, skidding: tuple[Daemon, Bus, Page], way: str
+) -> None:
+    _, bus, server = skidding
+    person = Person(browser, server)
+    drives(person, bus)
+    begun = time.monotonic()
+    if way == "a key":
+        browser.key("Down", "KeyX", "x")
+    elif way == "the button":
+        browser.tap("guide-halt")
+    elif way == "escape":
+        browser.key("Down", "Escape", "Escape")
+    elif way == "stop":
+        browser.tap("stop")
+    else:
+        browser.js(
+            "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+            "document.dispatchEvent(new Event('visibilitychange'))"
+        )
+    until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
+    took = time.monotonic() - begun
+    print(f"{way}: at rest after {took:.2f} s")
+    # 0.3 m/s at 1 m/s2, and some of the way.
+    assert took < 0.3 + 0.5 + lost(begun, begun + took)
+    person.ended("failure" if way in ("a key", "the button") else "stopped")
+    none_left(server)
+    browser.open("about:blank")
+
+
+@pytest.mark.soak
+def test_the_simulator_is_calibrated_from_the_first_question_to_the_written_lines(
+    browser: Browser, skidding: tuple[Daemon, Bus, Page]
+) -> None:
+    daemon, bus, server = skidding
+    person = Person(browser, server)
+    drives(person, bus)
+    assert commands(server)
+    person.asked("from its mark", RIDES_S)
+    where = bus.get("sim/pose")["pose"]["position"]
+    person.types("far")
+    person.shows("guide-wrong", "a number of m")
+    person.types(f"{math.hypot(where['x'], where['y']):.3f}".replace(".", ","))
+    person.asked("2. It drives back")
+    person.press("start")
+    until(
+        lambda: browser.js("document.getElementById('guide-progress').value") > 0.1, 60.0, "a bar"
+    )
+    person.asked("Write these lines", RIDES_S)
+    person.shows("guide-result", "standard deviation")
+    sound(browser)
+    person.press("write")
+    person.ended("done (exit 0)")
+    assert "restart the daemon" in browser.text("guide-story")
+    written = parse(daemon.config.read_bytes())
+    assert abs(written.drive.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
+    assert written.odometry.wheel_separation_multiplier_std > 0

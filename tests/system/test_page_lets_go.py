@@ -1,0 +1,424 @@
+"""Each way to let go of the stick in a real browser, which is on another host than the robot.
+
+What counts is what the far end of the port sees: when its lines begin to slow down, and whether any
+of them ever grows again. The browser comes by HTTPS, with an invitation.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import itertools
+import os
+import signal
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from acsard.lan.authority import Authority
+from tests.system.browser import Page, hands, run
+from tests.system.bystander import lost
+from tests.system.chromium import CHROMIUM, PHONE, browsing
+from tests.system.harness import ZERO_LINE, Daemon, FarPeer, Heard, until, wheels
+from tests.system.hosts import Hosts, inside, on
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+
+TIMEOUT_S, TICK_S = 0.25, 0.01
+"""Of source teleop; of the control loop."""
+
+STEADY, LINES = b"ap04.00", 10
+"""0.2 m/s, with which the page begins, for so long."""
+
+EMPTY = b"-"
+"""With which the daemon begins anew when a busy machine kept the answers from it."""
+
+QUIET = 30
+"""Lines that are looked at when all that was on the way has arrived."""
+
+HANDS = 4
+"""Browser, page, server and daemon, through which it goes: a busy machine keeps each waiting."""
+
+GOLDEN = 0.618
+"""Spreads what is tried evenly, however often."""
+
+
+class Round(NamedTuple):
+    """What letting go once came to."""
+
+    took_s: float
+    """To the first slower line."""
+    allowed_s: float
+    """With what the machine itself lost meanwhile."""
+    obeyed: int
+    """Lines that grew after that."""
+
+
+class Field:
+    """A robot on one host and a browser on another."""
+
+    def __init__(self, hosts: Hosts, where: Path, peer: FarPeer, daemon: Daemon) -> None:
+        self.hosts, self.peer, self._where, self._daemon = hosts, peer, where, daemon
+        self.longest_s = 3.0
+        """That a network is away."""
+        Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [hosts.address], 1)
+        self._servers, self._browsers = ExitStack(), ExitStack()
+        self.serve()
+        self.token = self.server.invite("operator", "phone")
+        self.browse()
+
+    def end(self) -> None:
+        self._browsers.close()
+        self._servers.close()
+
+    def serve(self) -> None:
+        """A page's server."""
+        self._servers.close()
+        page = Page(self._daemon, self._where, at=self.hosts.address)
+        self.server = self._servers.enter_context(on(self.hosts.robot, page))
+
+    def browse(self) -> None:
+        """A browser that trusts the robot's certificate."""
+        self._browsers.close()
+        held = x509.load_pem_x509_certificate((self._where / "tls/certificate.pem").read_bytes())
+        key = held.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+        digest = base64.b64encode(hashlib.sha256(key).digest()).decode()
+        trusting = (f"--ignore-certificate-errors-spki-list={digest}",)
+        self.browser = self._browsers.enter_context(browsing(self.hosts.stranger, trusting))
+        self.browser.size(*PHONE)
+
+    @property
+    def browser_pid(self) -> int:
+        assert self.browser.process is not None
+        return self.browser.process.pid
+
+    def ready(self) -> None:
+        """The page is open and live, and nobody touches it."""
+        if self.server.process.poll() is not None:
+            self.serve()
+        assert self.browser.process is not None
+        if self.browser.process.poll() is not None:
+            self.browse()
+        self.browser.lift()
+        if not str(self.browser.js("location.href")).startswith(self.server.away):
+            self.browser.open("about:blank")
+            self.browser.open(f"{self.server.away}/#token={self.token}")
+        for name, words in (("mode", "READY"), ("age", "live")):
+            until(lambda n=name, w=words: w in self.browser.text(n), 30.0, f"{name}: {words}")  # type: ignore[misc]
+
+    def hold(self) -> None:
+        """A finger drives until the speed is steady."""
+        begun = time.monotonic()
+        self.browser.hold(lambda: self.steady_since(begun))
+
+    def steady_since(self, at: float) -> bool:
+        """Have the last lines all had the speed?"""
+        last = self.peer.since(at)[-LINES:]
+        return len(last) == LINES and all(one.line.startswith(STEADY) for one in last)
+
+    def settle(self) -> None:
+        """All that was on the way has arrived, or whoever had it is gone."""
+        until(lambda: not self._on_the_way(), 90.0, "nothing is on the way any more")
+        now = time.monotonic()
+        until(lambda: len(self.peer.since(now)) >= QUIET, 5.0, "some lines more")
+
+    def _on_the_way(self) -> bool:
+        """Does a kernel hold anything that was sent and has not arrived, or was not read?"""
+        for host in (self.hosts.robot, self.hosts.stranger):
+            with inside(host):
+                rows = Path("/proc/thread-self/net/tcp").read_text().splitlines()[1:]
+            if any(row.split()[4] != "00000000:00000000" for row in rows):
+                return True
+        return False
+
+    def braking(self, gone: float) -> tuple[float, float]:
+        """Seconds from then to the first slower line, and what it may take; the robot stands."""
+
+        def slower() -> Heard | None:
+            since = self.peer.since(gone)
+            return next((one for one in since if not one.line.startswith(STEADY)), None)
+
+        at = until(slower, 5.0, "it slows down").at
+        allowed = TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
+        self.peer.awaits(ZERO_LINE.strip(), after=at)
+        return at - gone, allowed
+
+    def obeyed(self, since: float) -> int:
+        """The lines that grew after the first slower one."""
+        lines = [one.line for one in self.peer.since(since) if one.line != EMPTY]
+        speeds = [abs(wheels(line)[0]) for line in lines]
+        braking = list(itertools.dropwhile(lambda speed: speed == speeds[0], speeds))
+        return sum(after > before for before, after in itertools.pairwise(braking))
+
+    def lets_go(self, way: Way, number: int) -> Round:
+        """Drive, let go, and look until nothing of it can come any more."""
+        self.ready()
+        self.hold()
+        with way(self, number) as gone:
+            took, allowed = self.braking(gone)
+        self.settle()
+        return Round(took, allowed, self.obeyed(gone))
+
+
+Way = Callable[[Field, int], AbstractContextManager[float]]
+"""Enters when it has let go, with the time from which that counts; leaves when all is as before.
+The number is that of the round."""
+
+
+@contextmanager
+def finger_lifted(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    field.browser.touch("End")
+    yield begun
+
+
+@contextmanager
+def second_finger(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    field.browser.tap("stick")
+    yield begun
+
+
+@contextmanager
+def window_blurred(field: Field, number: int) -> Iterator[float]:
+    """The focus goes to another program. Without a screen there is none: the event alone."""
+    begun = time.monotonic()
+    field.browser.js("window.dispatchEvent(new Event('blur'))")
+    yield begun
+
+
+@contextmanager
+def window_minimised(field: Field, number: int) -> Iterator[float]:
+    """It loses the focus, and is hidden."""
+    window = field.browser.ask("Browser.getWindowForTarget")["windowId"]
+    begun = time.monotonic()
+    field.browser.ask(
+        "Browser.setWindowBounds", windowId=window, bounds={"windowState": "minimized"}
+    )
+    yield begun
+    field.browser.ask("Browser.setWindowBounds", windowId=window, bounds={"windowState": "normal"})
+    field.browser.ask("Page.bringToFront")
+
+
+@contextmanager
+def tab_hidden(field: Field, number: int) -> Iterator[float]:
+    """Another tab comes to the front."""
+    begun = time.monotonic()
+    other = field.browser.another()
+    yield begun
+    field.browser.close(other)
+    field.browser.ask("Page.bringToFront")
+
+
+@contextmanager
+def tab_closed(field: Field, number: int) -> Iterator[float]:
+    new = field.browser.another(background=True)
+    begun = time.monotonic()
+    field.browser.close(field.browser.tab)
+    yield begun
+    field.browser.attend(new)
+    field.browser.size(*PHONE)
+
+
+@contextmanager
+def tab_killed(field: Field, number: int) -> Iterator[float]:
+    """The process that draws it dies."""
+    begun = time.monotonic()
+    for pid in renderers(field.browser_pid):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    yield begun
+    field.browse()
+
+
+@contextmanager
+def page_left(field: Field, number: int) -> Iterator[float]:
+    """What the finger was on is gone: Chromium would wait there for its end."""
+    begun = time.monotonic()
+    field.browser.open("about:blank")
+    yield begun
+    field.browser.attend(field.browser.tab)
+    field.browser.size(*PHONE)
+
+
+@contextmanager
+def page_stalled(field: Field, number: int) -> Iterator[float]:
+    """Script runs for longer than a page may stand still; the finger is still down after it."""
+    begun = time.monotonic()
+    field.browser.js(
+        "(() => { const end = performance.now() + 1200; while (performance.now() < end); })()"
+    )
+    yield begun
+
+
+@contextmanager
+def browser_killed(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    os.killpg(field.browser_pid, signal.SIGKILL)
+    yield begun
+    assert field.browser.process is not None
+    field.browser.process.wait(10.0)
+
+
+@contextmanager
+def browser_frozen(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    os.killpg(field.browser_pid, signal.SIGSTOP)
+    try:
+        yield begun
+        wait_until(begun + 1.5)  # longer than a page may stand still
+    finally:
+        os.killpg(field.browser_pid, signal.SIGCONT)
+    field.browser.js("new Promise(done => setTimeout(done, 300))")
+    assert not field.browser.js("document.getElementById('stick').matches('.held')")
+
+
+@contextmanager
+def network_gone(field: Field, number: int) -> Iterator[float]:
+    """Nothing arrives, either way, and nobody is told; for a second to the longest."""
+    length_s = 1.0 + (field.longest_s - 1.0) * ((number * GOLDEN) % 1.0)
+    field.hosts.cut()
+    gone = time.monotonic()
+    try:
+        yield gone
+        wait_until(gone + length_s)
+    finally:
+        field.hosts.heal()
+
+
+@contextmanager
+def server_killed(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    field.server.signal(signal.SIGKILL)
+    yield begun
+    field.server.process.wait(10.0)
+
+
+@contextmanager
+def server_frozen(field: Field, number: int) -> Iterator[float]:
+    begun = time.monotonic()
+    field.server.signal(signal.SIGSTOP)
+    try:
+        yield begun
+        wait_until(begun + 1.5)
+    finally:
+        field.server.signal(signal.SIGCONT)
+
+
+WAYS: tuple[Way, ...] = (
+    finger_lifted, second_finger, window_blurred, window_minimised, tab_hidden, tab_closed,
+    tab_killed, page_left, page_stalled, browser_killed, browser_frozen, network_gone,
+    server_killed, server_frozen,
+)  # fmt: skip
+
+
+def wait_until(at: float) -> None:
+    time.sleep(max(0.0, at - time.monotonic()))
+
+
+def renderers(pid: int) -> list[int]:
+    """The processes of a browser that draw its pages."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            group = int((place / "stat").read_text().rpartition(")")[2].split()[2])
+            if group == pid and b"--type=renderer" in (place / "cmdline").read_bytes():
+                found.append(int(place.name))
+        except (OSError, IndexError):
+            continue  # gone meanwhile
+    return found
+
+
+@pytest.fixture(scope="module")
+def field(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
+    where = tmp_path_factory.mktemp("field")
+    with FarPeer(where) as peer, on(hosts.robot, Daemon(where, peer.path)) as daemon:
+        field = Field(hosts, where, peer, daemon)
+        yield field
+        field.end()
+
+
+def tell(what: str, rounds: list[Round]) -> None:
+    """One row of the table, asserted."""
+    ticks = sorted(one.took_s / TICK_S for one in rounds)
+    print(
+        f"\n{what:16} {len(rounds):4} times  slower after {statistics.median(ticks):5.1f} ticks "
+        f"(p50), {ticks[-1]:5.1f} (most; {TIMEOUT_S / TICK_S + 2:.0f} are allowed)  "
+        f"{sum(one.obeyed for one in rounds)} lines grew again"
+    )
+    assert [one for one in rounds if one.took_s > one.allowed_s] == []
+    assert sum(one.obeyed for one in rounds) == 0
+
+
+@pytest.mark.network
+@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
+def test_whoever_lets_go_in_whatever_way_the_robot_brakes(field: Field, way: Way) -> None:
+    tell(way.__name__, [field.lets_go(way, number) for number in range(3)])
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(10800)
+@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
+def test_a_hundred_times(field: Field, way: Way) -> None:
+    field.longest_s = 30.0
+    tell(way.__name__, [field.lets_go(way, number) for number in range(100)])
+
+
+@contextmanager
+def program(field: Field) -> Iterator[None]:
+    """A program on the other host drives all the time, come what may, and never says zero again."""
+    ends = threading.Event()
+
+    async def story() -> None:
+        async with hands(field.server, field.token) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.2)
+            with suppress(ConnectionError):
+                while not ends.is_set():
+                    await ours.drive(0.2)
+                    await asyncio.sleep(0.05)
+
+    def there() -> None:
+        with inside(field.hosts.stranger):
+            run(story, 300.0)
+
+    thread = threading.Thread(target=there)
+    thread.start()
+    try:
+        begun = time.monotonic()
+        until(lambda: field.steady_since(begun), 10.0, "it drives")
+        yield
+    finally:
+        ends.set()
+        thread.join()
+
+
+def goes_on(field: Field, number: int) -> Round:
+    """The network is away, and the program has not noticed."""
+    with program(field):
+        with network_gone(field, number) as gone:
+            took, allowed = field.braking(gone)
+        wait_until(time.monotonic() + 1.0)
+    field.settle()
+    return Round(took, allowed, field.obeyed(gone))
+
+
+@pytest.mark.network
+def test_a_program_that_goes_on_without_a_network_is_not_obeyed_later(field: Field) -> None:
+    tell("program_goes_on", [goes_on(field, number) for number in range(2)])
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(10800)
+def test_a_program_goes_on_a_hundred_times(field: Field) -> None:
+    field.longest_s = 30.0
+    tell("program_goes_on", [goes_on(field, number) for number in range(100)])

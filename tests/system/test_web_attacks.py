@@ -1,0 +1,386 @@
+"""Who comes to the robot's page and may not: each is refused and counted, and nothing moves.
+
+With `-s` all of it is printed as a table.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, contextmanager, suppress
+from typing import Any
+
+import aiohttp
+import pytest
+from yarl import URL
+
+from acsard.web.gate import REQUEST_S
+from acsard.web.requests import BODY_S
+from acsard.web.tokens import Vault
+from tests.system.browser import NAME, Hands, Page, hands, run
+from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
+
+pytestmark = pytest.mark.network
+
+MOVED_M = 0.005
+
+
+class Table:
+    """What was tried, what came of it, and that the robot stood meanwhile."""
+
+    def __init__(self, page: Page, daemon: Daemon) -> None:
+        self.page, self._daemon = page, daemon
+        self.rows: list[str] = []
+
+    @contextmanager
+    def attack(
+        self,
+        what: str,
+        answer: str,
+        reason: str,
+        times: int = 1,
+        by: str = "page",
+        *,
+        stands: bool = True,
+    ) -> Iterator[None]:
+        """One attempt: refused so often for that reason, by the page or the robot; nothing moves,
+        unless somebody else may drive."""
+        with Bus(self._daemon.endpoint) as bus:
+            before, counted = bus.comes_to("ready"), self._refused(bus, reason, by)
+            yield
+            after, more = bus.comes_to("ready"), self._refused(bus, reason, by) - counted
+        assert more >= times
+        moved = abs(after["x"] - before["x"])
+        assert moved < MOVED_M or not stands
+        told = f"{more:.0f} x {reason}"
+        missed = Periods.between(before, after).missed
+        self.rows.append(
+            f"{what:44} {answer:22} {told:28} "
+            f"{f'{1000 * moved:.0f} mm' if stands else 'driven':>6} {missed:6}"
+        )
+
+    def _refused(self, bus: Bus, reason: str, by: str) -> float:
+        if by == "page":
+            return self.page.refused().get(reason, 0)
+        return float(bus.count(reason))
+
+
+@pytest.fixture(scope="module")
+def table(page: Page, daemon: Daemon) -> Iterator[Table]:
+    pid, kb = page.pid, resident_kb(page.pid)
+    table = Table(page, daemon)
+    yield table
+    print(f"\n\n{'who tries what':44} {'answer':22} {'counted as':28}  moved missed periods")
+    print("\n".join(table.rows))
+    assert page.process.poll() is None
+    print(f"the page's process {pid} goes on, {(resident_kb(pid) - kb) / 1000:+.1f} MB")
+
+
+@pytest.fixture(scope="module")
+def tokens(page: Page) -> dict[str, str]:
+    """By what they are worth."""
+    revoked = page.invite("maintainer", "revoked")
+    page.tokens("--revoke", "revoked")
+    vault = Vault(page.state / "acsard-web")
+    return {
+        "": "",
+        "wrong": "x" * 43,
+        "expired": vault.invite("maintainer", "expired", 0)[0],
+        "revoked": revoked,
+        "viewer": page.invite("viewer", "tv"),
+    }
+
+
+@pytest.fixture
+def bus(standing: Bus) -> Bus:
+    return standing
+
+
+EVIL = {"Origin": "https://evil.example"}
+UPGRADE = {
+    "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}  # fmt: skip
+FORM = "application/x-www-form-urlencoded"
+
+ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
+    "no token": ("away", "/api/state", {}, 401, "no_token"),
+    "no token on the socket": ("away", "/ws", {"headers": UPGRADE}, 401, "no_token"),
+    "a wrong token": ("away", "/api/state", {"token": "wrong"}, 401, "bad_token"),
+    "an expired token": ("away", "/api/state", {"token": "expired"}, 401, "bad_token"),
+    "an expired token on the socket": (
+        "away", "/ws", {"token": "expired", "headers": UPGRADE}, 401, "bad_token"),
+    "a revoked token": ("away", "/api/srv/clear", {"token": "revoked", "method": "POST"},
+        401, "bad_token"),
+    "a viewer who clears": (
+        "away", "/api/srv/clear", {"token": "viewer", "method": "POST"}, 403, "role"),
+    "a viewer at the settings": ("away", "/api/config", {"token": "viewer"}, 403, "role"),
+    "a viewer at a recording": (
+        "away", "/api/recordings/x.mcap", {"token": "viewer"}, 403, "role"),
+    "another page's socket": ("here", "/ws", {"headers": UPGRADE | EVIL}, 403, "origin"),
+    "another page's socket, with a token": (
+        "away", "/ws", {"token": "viewer", "headers": UPGRADE | EVIL}, 403, "origin"),
+    "another page's post": (
+        "here", "/api/srv/stop", {"method": "POST", "headers": EVIL}, 403, "origin"),
+    "another page's look": (
+        "here", "/api/state", {"headers": {"Sec-Fetch-Site": "cross-site"}}, 403, "origin"),
+    "a name pointed at 127.0.0.1": (
+        "here", "/", {"headers": {"Host": "evil.example:8080"}}, 403, "host"),
+    "a name that is none of the robot's": (
+        "away", "/", {"headers": {"Host": "evil.example"}}, 403, "host"),
+    "localhost from elsewhere, without a token": (
+        "away", "/api/state", {"headers": {"Host": NAME}}, 401, "no_token"),
+    "through a proxy that says so": (
+        "here", "/api/state", {"headers": {"X-Forwarded-For": "203.0.113.5"}}, 403, "proxy"),
+    "through a proxy that says so otherwise": (
+        "here", "/", {"headers": {"Forwarded": "for=203.0.113.5"}}, 403, "proxy"),
+    "through a proxy, to the socket": (
+        "here", "/ws", {"headers": UPGRADE | {"Via": "1.1 proxy"}}, 403, "proxy"),
+    "a token in parts without a boundary": (
+        "away", "/token", {"method": "POST", "data": b"token=x",
+        "headers": {"Content-Type": "multipart/form-data"}}, 400, "malformed"),
+    "a token in letters that are none": (
+        "away", "/token", {"method": "POST", "data": b"token=x",
+        "headers": {"Content-Type": f"{FORM}; charset=foo"}}, 400, "malformed"),
+    "a token that is no text": (
+        "away", "/token", {"method": "POST", "data": b"token=\xff",
+        "headers": {"Content-Type": FORM}}, 400, "malformed"),
+    "a token in JSON that is none": (
+        "away", "/token", {"method": "POST", "data": b"{\xff",
+        "headers": {"Content-Type": "application/json"}}, 400, "malformed"),
+    "a viewer who has a recording drawn": (
+        "away", "/api/recordings/x.mcap/report", {"token": "viewer", "method": "POST"}, 403,
+        "role"),
+    "a viewer at a report": ("away", "/report/x.mcap", {"token": "viewer"}, 403, "role"),
+    "another page's link to a report": (
+        "here", "/report/x.mcap", {"headers": {"Sec-Fetch-Site": "cross-site"}}, 403, "origin"),
+    "a report that nobody drew": ("here", "/report/x.mcap", {}, 404, "path"),
+    "a report of a file upwards": (
+        "here", "/api/recordings/..%2f..%2fetc%2fpasswd/report", {"method": "POST"}, 404, "path"),
+    "a path upwards": ("here", "/page/../app.py", {}, 404, "path"),
+    "a path upwards, encoded": ("here", "/page/%2e%2e%2fapp.py", {}, 404, "path"),
+    "a recording upwards": ("here", "/api/recordings/..%2f..%2fetc%2fpasswd", {}, 404, "path"),
+    "a key with a wildcard": ("here", "/api/**", {}, 404, "path"),
+    "a service that is none": ("here", "/api/srv/**", {"method": "POST"}, 404, "path"),
+    "a body that is no JSON": (
+        "here", "/api/srv/set", {"method": "POST", "data": b"\xff{"}, 400, "malformed"),
+    "a body of 10 MB": (
+        "here", "/api/srv/set", {"method": "POST", "data": bytes(10_000_000)}, 413, "too_big"),
+}  # fmt: skip
+"""What somebody asks for: where, what, and the status and reason it is refused with."""
+
+
+@pytest.mark.parametrize("what", ASKS)
+def test_who_asks_for_what_he_may_not_have_is_refused(
+    table: Table, bus: Bus, tokens: dict[str, str], what: str
+) -> None:
+    where, path, how, status, reason = ASKS[what]
+
+    async def asked() -> int:
+        method, data = how.get("method", "GET"), how.get("data")
+        async with table.page.client(tokens[how.get("token", "")]) as session:
+            url = URL(f"{getattr(table.page, where)}{path}", encoded=True)
+            headers = how.get("headers", {})
+            async with session.request(method, url, headers=headers, data=data) as answer:
+                return answer.status
+
+    with table.attack(what, str(status), reason):
+        assert asyncio.run(asked()) == status
+
+
+STOP = "POST /api/srv/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+
+RAW: dict[str, str] = {
+    "no Host": "GET /api/state HTTP/1.1\r\n\r\n",
+    "two Hosts": "GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n",
+    "two lengths of a body": f"{STOP}Content-Length: 2\r\nContent-Length: 50\r\n\r\n{{}}",
+    "a length, and pieces": (
+        f"{STOP}Content-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n{STOP}\r\n"),
+    "pieces, with a blank before the colon": (
+        f"{STOP}Transfer-Encoding : chunked\r\n\r\n0\r\n\r\n"),
+    "a header folded over two lines": f"{STOP}X-A: b\r\n Content-Length: 4\r\n\r\n",
+    "a head of 100 kB": f"{STOP}X: {'x' * 100_000}\r\n\r\n",
+    "no HTTP": "\x16\x03\x01\x02\r\n\r\n",
+}  # fmt: skip
+"""Bytes on a connection that are no request, or by another's reading two."""
+
+
+@pytest.mark.parametrize("what", RAW)
+def test_what_is_no_plain_request_is_refused_whole(table: Table, bus: Bus, what: str) -> None:
+    # In the end it is ready: no second request, for a stop, was found in the first.
+    with table.attack(what, "400", "malformed"), _opened(table.page) as opened:
+        opened.sendall(RAW[what].encode("latin-1"))
+        answer = opened.recv(4096)
+        assert answer.split()[1] == b"400", answer
+
+
+def _opened(page: Page) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", int(page.here.rpartition(":")[2])), 30.0)
+
+
+def test_who_only_looks_drives_nothing_whatever_he_sends(
+    table: Table, bus: Bus, tokens: dict[str, str]
+) -> None:
+    commands = bus.count("commands")
+
+    async def story() -> None:
+        async with hands(table.page, tokens["viewer"]) as theirs:
+            for _ in range(20):
+                await theirs.drive(0.5)
+                await asyncio.sleep(0.02)
+            refused = await theirs.find(lambda said: said.get("refused") == "cmd")
+            assert "viewer" in refused["reason"]
+            assert not (await theirs.call("set", settings={"limits.linear_speed": 9.0}))["ok"]
+
+    with table.attack("a viewer who drives", "told that he may not", "role", 21):
+        run(story)
+    assert bus.count("commands") == commands
+
+
+async def _known(ours: Hands, bus: Bus) -> None:
+    """Known to the robot by his own clock, which drives no more."""
+    await ours.say(subscribe="state", rate=50)
+    await ours.until_driving(0.3)
+    await ours.drive(0.0)
+    bus.at_rest()
+
+
+@pytest.mark.parametrize(
+    ("what", "late_s", "by", "reason"),
+    [
+        ("100 stamps from before", 5.0, "page", "replayed"),
+        ("20 stamps of tomorrow", -86400.0, "robot", "command_stale"),
+    ],
+)
+def test_nobody_obeys_a_stamp_that_is_not_of_now(
+    table: Table, bus: Bus, what: str, late_s: float, by: str, reason: str
+) -> None:
+    number = int(what.split()[0])
+
+    async def story() -> None:
+        async with hands(table.page) as ours:
+            await _known(ours, bus)
+            answer = "not handed on" if by == "page" else "not obeyed"
+            with table.attack(what, answer, reason, number, by):
+                for _ in range(number):
+                    await ours.drive(0.5, late_ms=1000 * late_s)
+                    await asyncio.sleep(0.01)
+                await asyncio.sleep(0.3)
+
+    run(story)
+
+
+@pytest.mark.parametrize("size", [100_000, 10_000_000])
+def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
+    table: Table, bus: Bus, size: int
+) -> None:
+    page = table.page
+
+    async def story() -> None:
+        async with hands(page) as ours, hands(page) as theirs:
+            before = resident_kb(page.pid)
+            with suppress(ConnectionError):  # closed while it is still being sent
+                await theirs.socket.send_str("x" * size)
+            async with asyncio.timeout(PATIENCE_S):
+                while (await theirs.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                    pass
+            await ours.say(ping=1)
+            await ours.find(lambda said: "pong" in said)
+            assert resident_kb(page.pid) < before + 5_000
+
+    with table.attack(f"a message of {size / 1e6:g} MB", "its connection ends", "too_big"):
+        run(story)
+
+
+def test_what_is_no_message_is_told_once_a_second_and_a_flood_ends(table: Table, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(table.page) as ours:
+            for _ in range(1200):
+                await ours.socket.send_str("{}")
+            async with asyncio.timeout(PATIENCE_S):
+                told = []
+                while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                    told.append(message.data)
+            assert ours.socket.close_code == 1008
+            assert sum("refused" in one for one in told) < 50  # by what goes out a second
+
+    with table.attack("1200 messages that are none", "its connection ends", "malformed", 600):
+        run(story)
+
+
+def test_a_thousand_connections_leave_the_one_who_drives_his_page(table: Table, bus: Bus) -> None:
+    page = table.page
+    place = page.here.removeprefix("http://").split(":")
+
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            with table.attack("1000 connections", "64 have places", "crowded", stands=False):
+                await ours.until_driving(0.3)
+                holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+                idle = await _idle(place[0], int(place[1]), 1000)
+                await ours.say(ping=7)
+                await ours.find(lambda said: said.get("pong") == 7)
+                await ours.state(lambda s: s["mode"] == "driving")
+                holding.cancel()
+                for one in idle:
+                    one.close()
+                await ours.drive(0.0)
+                bus.at_rest()
+
+    run(story)
+
+
+async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
+    """Connections that say nothing."""
+    idle: list[socket.socket] = []
+    for _ in range(number):
+        one = socket.socket()
+        one.setblocking(False)
+        one.connect_ex((host, port))
+        idle.append(one)
+        await asyncio.sleep(0)
+    return idle
+
+
+def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
+    where = f"{table.page.here}/ws"
+
+    async def story() -> None:
+        async with aiohttp.ClientSession() as session, AsyncExitStack() as stack:
+            for _ in range(20):
+                await stack.enter_async_context(session.ws_connect(where))
+            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+                await session.ws_connect(where)
+            assert caught.value.status == 503
+
+    with table.attack("the 21st page of an address", "503", "too_many"):
+        run(story)
+
+
+def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
+    """A head by one byte a second, nothing at all, and a body that is announced and kept."""
+    begun = time.monotonic()
+    with (
+        table.attack("a slow loris, and who says nothing", "cut off", "slow", 2),
+        _opened(table.page) as drips, _opened(table.page) as says_nothing,
+        _opened(table.page) as keeps,
+    ):  # fmt: skip
+        keeps.sendall(b"POST /api/srv/clear HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        keeps.sendall(b"Content-Length: 100\r\n\r\n")
+        drips.settimeout(1.0)
+        with suppress(ConnectionError):
+            for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: very":
+                drips.sendall(bytes([byte]))
+                with suppress(TimeoutError):
+                    assert drips.recv(4096) == b""
+                    break
+            else:
+                raise AssertionError("nobody cut it off")
+        with suppress(ConnectionError):
+            assert says_nothing.recv(4096) == b""
+        answer = keeps.recv(4096)
+    assert answer.startswith(b"HTTP/1.1 408"), answer
+    assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S

@@ -1,0 +1,148 @@
+"""The other robots of a router on the page of one: seen and stopped there, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import zenoh
+
+from tests.system.browser import Page, hands, run
+from tests.system.chromium import CHROMIUM, PHONE, browsing
+from tests.system.harness import Bus, Daemon, Tables, client_config, free_endpoint, until
+
+pytestmark = pytest.mark.slow
+
+OURS, THEIRS = "robot1", "robot2"
+
+
+class Two(NamedTuple):
+    """Two robots behind a router, and the page of the first."""
+
+    ours: Bus
+    theirs: Bus
+    daemon: Daemon
+    page: Page
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Two]:
+    where, router = tmp_path_factory.mktemp("two"), free_endpoint()
+    with ExitStack() as stack:
+        stack.enter_context(zenoh.open(client_config(router, "router")))
+        buses, daemons = [], []
+        for name in (OURS, THEIRS):
+            settings: Tables = {"robot": {"id": name}, "bus": {"connect": [router]}}
+            daemons.append(stack.enter_context(Daemon(where, config=settings, name=name)))
+            buses.append(stack.enter_context(Bus(daemons[-1].endpoint, name)))
+            buses[-1].linked()
+        page = stack.enter_context(Page(daemons[0], where, "--connect", router))
+        yield Two(buses[0], buses[1], daemons[0], page)
+
+
+@pytest.fixture(autouse=True)
+def cleared(two: Two) -> None:
+    for bus in (two.ours, two.theirs):
+        bus.ask("srv/clear")
+        bus.at_rest()
+
+
+def test_another_robot_is_followed_and_stopped_and_only_that(two: Two) -> None:
+    async def story() -> None:
+        async with hands(two.page) as ours:
+            await ours.say(subscribe="fleet")
+            seen = await ours.find(lambda said: len(said.get("fleet", ())) == 2)
+            assert [one["robot"] for one in seen["fleet"]] == [OURS, THEIRS]
+            assert seen["note"] == ""
+            await ours.say(subscribe="state", robot=THEIRS)
+            state = await ours.find(lambda said: said.get("robot") == THEIRS)
+            assert state["value"]["mode"] == "ready"
+            await ours.say(call="stop", id=1, robot=THEIRS)
+            assert (await ours.find(lambda said: said.get("answer") == 1))["ok"]
+            await ours.say(call="clear", id=2, robot=THEIRS)
+            refused = await ours.find(lambda said: said.get("answer") == 2)
+            assert not refused["ok"]
+            assert "its own page" in refused["text"]
+
+    run(story)
+    assert two.theirs.state()["mode"] == "stopped"
+    assert two.ours.state()["mode"] == "ready"
+    (stopped,) = [one for one in two.theirs.get("events")["events"] if one["name"] == "stop"][-1:]
+    assert stopped["by"].startswith("here@page")
+
+
+def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(two: Two) -> None:
+    async def story() -> None:
+        async with hands(two.page) as ours:
+            names = {"robot3": "no answer", "a/**": "not a robot's id"}
+            for name, why in names.items():
+                await ours.say(call="stop", robot=name)
+                answer = await ours.find(lambda said: "answer" in said)
+                assert not answer["ok"]
+                assert why in answer["text"]
+
+    run(story)
+
+
+def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path: Path) -> None:
+    async def story() -> None:
+        async with hands(beside) as ours:
+            await ours.say(subscribe="fleet")
+            seen = await ours.find(lambda said: said.get("fleet"))
+            assert [one["robot"] for one in seen["fleet"]] == [OURS]
+            assert "daemons hand on nothing" in seen["note"]
+            assert f"acsard web --connect ROUTER --id {OURS}" in seen["note"]
+
+    with Page(two.daemon, tmp_path) as beside:
+        run(story)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two: Two) -> None:
+    with browsing() as browser:
+        browser.size(*PHONE)
+        browser.open(two.page.here)
+
+        def shows(name: str, words: str) -> None:
+            until(lambda: words in browser.text(name), 10.0, f"{name} says {words!r}")
+
+        shows("mode", "READY")
+        browser.tap("tab-robots")
+        shows("cards", THEIRS)
+        link = f"document.querySelector('#cards a[href*={THEIRS}]')"
+        until(lambda: browser.js(f"Boolean({link})"), 10.0, "a card to open")
+        browser.js(f"{link}.click()")
+        shows("other", f"{THEIRS}, seen by the page of {OURS}")
+        shows("robot", THEIRS)
+        shows("mode", "READY")
+        shows("age", "live")
+        shows("stop", f"STOP {THEIRS}")
+        assert browser.js("document.getElementById('simulated').hidden") is False
+        assert browser.js("document.getElementById('tab-set').hidden") is True
+        stick = "document.getElementById('stick')"
+        assert browser.js(f"{stick}.getAttribute('aria-disabled')") == "true"
+        assert THEIRS in browser.js(f"{stick}.title")
+        before = two.theirs.count("commands"), two.ours.count("commands")
+        browser.touch("Start", browser.middle("stick"))
+        x, y = browser.middle("stick")
+        browser.touch("Move", (x, y - 60))
+        browser.touch("End")
+        browser.tap("stop")
+        until(lambda: two.theirs.state()["mode"] == "stopped", 5.0, "it stops")
+        shows("mode", "STOPPED")
+        assert two.ours.state()["mode"] == "ready"
+        assert before == (two.theirs.count("commands"), two.ours.count("commands"))
+        two.theirs.ask("srv/clear")
+        shows("mode", "READY")
+        # Seen while it is driven by somebody else, and then not heard.
+        with two.theirs.commanding(0.1):
+            shows("mode", "DRIVING")
+            shows("who", "app")
+        browser.js("document.querySelector('#other a').click()")
+        shows("robot", OURS)
+        shows("mode", "READY")
+        assert browser.js(f"{stick}.getAttribute('aria-disabled')") == "false"
+        assert browser.said == []
