@@ -161,7 +161,8 @@ class Arbiter:
 
     def choose(self, now_ns: int) -> Choice:
         """Whose command counts now, and which."""
-        live = [(source, found[0]) for source in self._ranking if (found := source.live(now_ns))]
+        heard = [source for source in self._ranking if source.senders]
+        live = [(source, found[0]) for source in heard if (found := source.live(now_ns))]
         if not live:
             self._holder = None
             doubtful = (source.proof for source in self._ranking if source.doubtful(now_ns))

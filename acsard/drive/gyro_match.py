@@ -61,30 +61,22 @@ class Match:
         self._lag = LAG_S
         self.blocks = 0.0
         """How many blocks of turning are remembered."""
+        self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
         """The wheels' rate now, and when the block began."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 
-    @property
-    def ratio(self) -> float:
-        """rad the robot turns per rad its wheels say."""
-        return self._solved()[0]
-
-    @property
-    def deviation(self) -> float:
-        """How certain the ratio is."""
-        return max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
-
     def delay(self) -> float | None:
         """s by which the gyro is later than assumed, once that is certain; then it is assumed."""
-        ratio, slope = self._solved()
+        ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
         if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0:
             return None
         self._wd, self._dg, self._dd = NO_DELAY
         self._lag = CERTAIN_S
+        self._solve()
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
@@ -137,11 +129,13 @@ class Match:
         self._dg = MEMORY * self._dg + weight * change * gyro
         if abs(wheels) >= LEAST_RATE:
             self.blocks = MEMORY * self.blocks + 1.0
+        self._solve()
 
-    def _solved(self) -> tuple[float, float]:
-        """The coefficients of w and dw/dt."""
+    def _solve(self) -> None:
+        """The coefficients of w and dw/dt, which stay the same until a block says more."""
         det = self._ww * self._dd - self._wd * self._wd
-        return (
-            (self._wg * self._dd - self._dg * self._wd) / det,
-            (self._dg * self._ww - self._wg * self._wd) / det,
-        )
+        self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
+        """rad the robot turns per rad its wheels say."""
+        self._slope = (self._dg * self._ww - self._wg * self._wd) / det
+        self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
+        """How certain the ratio is."""

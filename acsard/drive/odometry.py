@@ -67,7 +67,9 @@ class Odometry:
         self._held = NOWHERE
         """rad of counts at rest, whose way is not clear yet."""
         self._steps_seen = NOWHERE
-        """Those of the lines of which the counts are known."""
+        """Those of the lines of which the counts are known,"""
+        self._coarsest = 0.0
+        """and the largest of the last such line's, rad/s."""
         self._path = Path()
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
@@ -181,6 +183,7 @@ class Odometry:
 
     def _see(self, line: Feedback) -> None:
         """The counts that a line shows are the covariance's; all four, once every wheel turns."""
+        self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
         self._uncertainty.show_count(count_of(line))
@@ -274,7 +277,7 @@ class Odometry:
     ) -> TwistVariances:
         spread, step = self._twist_uncertainty, 0.0
         if feedback.counted is not None:
-            step = max([one for one in feedback.steps if one < math.inf], default=0.0)
+            step = self._coarsest
         variances = spread.at_rest(self._still) if at_rest else spread.of(twist, feedback.dt, step)
         if self._slips(gyro):
             variances = spread.slipping(variances)

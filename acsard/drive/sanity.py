@@ -74,20 +74,20 @@ class _Wheel:
         `share` is how far towards its command it should have come; `still` that all wheels should
         stand.
         """
-        self.expected += (told - self.expected) * share
-        self.driven = not still or (self.driven and abs(speed) > SLACK)
+        expected = self.expected = self.expected + (told - self.expected) * share
+        size, turns = abs(expected), abs(speed)
+        driven = self.driven = not still or (self.driven and turns > SLACK)
         constant, self.seen = speed == self.seen, speed
-        expected = self.expected
-        size, most = abs(expected), max(abs(expected), abs(told))
-        fast = self.driven and abs(speed) > 1.5 * most + SLACK
-        slowing = abs(speed) < self.slowest - SLACK
+        most = max(size, abs(told))
+        fast = driven and turns > 1.5 * most + SLACK
+        slowing = turns < self.slowest - SLACK
         if slowing or not fast:
-            self.slowest = abs(speed)
+            self.slowest = turns
         moving = size > SLACK and expected * told > 0
-        constant = constant and self.driven and speed != 0.0
+        constant = constant and driven and speed != 0.0
         return (
-            moving and abs(speed) < 0.1 * size,
-            moving and speed * expected < 0 and abs(speed) > 0.3 * size,
+            moving and turns < 0.1 * size,
+            moving and speed * expected < 0 and turns > 0.3 * size,
             fast and not slowing,
             constant and abs(speed - expected) > SLACK + 0.3 * most,
         )
@@ -135,16 +135,19 @@ class Sanity:
         return ""
 
     def _objection(self, line: Feedback) -> str:
-        settings, speeds = self._settings, line.speeds
+        speeds, fastest = line.speeds, self._settings.wheel_speed
         before = speeds if self._last is None else self._last
-        most = settings.wheel_acceleration * self._since + SLACK
+        most = self._settings.wheel_acceleration * self._since + SLACK
         rows = zip(WHEELS, speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
         for name, now, then, step in rows:
+            size, change = abs(now), abs(now - then)
+            if size <= fastest and change <= most:
+                continue  # whatever its encoder's steps are
             # Of steps that are not proven counts a lying encoder may make as many as it likes.
             room = 0.0 if line.counted is None or step == math.inf else step
-            if abs(now) > settings.wheel_speed + room:
+            if size > fastest + room:
                 return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
-            if abs(now - then) > most + STEPS * step:
+            if change > most + STEPS * step:
                 leap = f"{name} from {then:.2f} to {now:.2f} rad/s"
                 return f"{leap} is over feedback.wheel_acceleration"
         return ""

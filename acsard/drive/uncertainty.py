@@ -137,13 +137,7 @@ class PoseUncertainty:
             yaw, both = variance, 0.0
         self._p = added(carried(self._p, dx, dy), along, yaw, both, c, s)
         if self._effects:
-            self._columns = [
-                _bent(
-                    column, effect if variance is None else (*effect[:2], 0.0, 0.0),
-                    distance, turn, dx, dy, c, s,
-                )
-                for column, effect in zip(self._columns, self._effects, strict=True)
-            ]  # fmt: skip
+            self._bend(distance, turn, dx, dy, by_wheels=variance is None)
         self._dx, self._dy = self._dx + dx, self._dy + dy
         self._rolled += abs(distance) + self._half * abs(turn)
         if self._rolled > STRETCH:
@@ -195,6 +189,16 @@ class PoseUncertainty:
         self._middle += math.copysign(beyond, off)
         return beyond
 
+    def _bend(self, distance: float, turn: float, dx: float, dy: float, by_wheels: bool) -> None:
+        """F J + G_p; half of the step's own turn, as far as wheels tell it, has it as its lever."""
+        c, s, columns = self._cos, self._sin, []
+        for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
+            along = effect[0] * distance + effect[1] * turn
+            more = effect[2] * distance + effect[3] * turn if by_wheels else 0.0
+            lever = yaw + more / 2
+            columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
+        self._columns = columns
+
     def _begin_stretch(self) -> None:
         self._before = self._p
         self._columns_before = self._columns
@@ -227,17 +231,6 @@ class PoseUncertainty:
             self._lost = True
             published = _capped(published)
         self.covariance = published
-
-
-def _bent(
-    column: Vector, effect: Column, distance: float, turn: float,
-    dx: float, dy: float, c: float, s: float,
-) -> Vector:  # fmt: skip
-    """F J + G_p for one parameter; half of the step's own turn has the step as its lever."""
-    along = effect[0] * distance + effect[1] * turn
-    yaw = effect[2] * distance + effect[3] * turn
-    lever = column[2] + yaw / 2
-    return column[0] + c * along - dy * lever, column[1] + s * along + dx * lever, column[2] + yaw
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:

@@ -26,7 +26,7 @@ Reason = Literal[
     "malformed", "wheel_twice", "over_range", "unchecked", "wrong_check", "stale_sequence"
 ]
 
-_TOKEN = rb"([abcd])([pn])([0-9]{1,2}\.[0-9]{1,3})"
+_TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
 TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
 """The four values of a line, as an expression."""
 _LINE = re.compile(TOKENS + rb"(?:, *)?")
@@ -50,7 +50,11 @@ class Codec:
             (letter, place[letter], -1.0 if motors[place[letter]][0] == "-" else 1.0)
             for letter in LETTERS
         )
-        self._by_letter = {ord(letter): (index, sign) for letter, index, sign in self._wiring}
+        self._by_word = {
+            letter.encode() + direction: (index, sign * way)
+            for letter, index, sign in self._wiring
+            for direction, way in ((b"p", 1.0), (b"n", -1.0))
+        }
         self._end = b",\r\n" if trailing_comma else b"\r\n"
         self.stop = self._written(STILL)
         """The line that says zero on all wheels."""
@@ -87,12 +91,12 @@ class Codec:
             raise FrameError("malformed", line)
         wheel: list[float | None] = [None] * 4
         parts = match.groups()
-        for letter, direction, digits in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
-            index, sign = self._by_letter[letter[0]]
+        for word, digits in zip(parts[::2], parts[1::2], strict=True):
+            index, sign = self._by_word[word]
             speed = float(digits)
             if speed > MAX_SPEED:
                 raise FrameError("over_range", line)
-            wheel[index] = speed * sign if direction == b"p" else -speed * sign
+            wheel[index] = speed * sign
         front_right, front_left, rear_left, rear_right = wheel
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
             raise FrameError("wheel_twice", line)

@@ -190,12 +190,12 @@ class McuSession:
     def _judge(self, now_ns: int) -> None:
         # Never up in the update that saw a restart: who drives has to see the link go first.
         self._link.judge(now_ns, may_rise=not self._starting_over)
-        check = self.negotiation
-        settled = check.state == "plain" or check.checked
-        if settled and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns:
+        check, up = self.negotiation, self.link == "up"
+        quiet = not up and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
+        if quiet and (check.state == "plain" or check.checked):
             check.begin()
         check.judge(now_ns)
-        if self.link == "up":
+        if up:
             self._hearing.forget()
         elif self._hearing.judge(now_ns):
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))

@@ -10,6 +10,7 @@ like one with a dead encoder, and is left out too: the other one is what is driv
 from __future__ import annotations
 
 import math
+from operator import eq
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lying_wheels.residual import MEMORY_S, Residual
@@ -96,8 +97,9 @@ class _Side:
             return False
         front, rear = self.wheels
         for i, (own, other) in enumerate(((front, rear), (rear, front))):
-            alike = turned[own] * self.residual.stand_in(front=i == 1)
-            apart = turned[other] - alike
+            apart = 0.0
+            if same[own]:
+                apart = turned[other] - turned[own] * self.residual.stand_in(front=i == 1)
             if self._stuck[i].says(same[own], apart, dt, count, slow, wish):
                 self._leave_out(i, "stuck")
                 return True
@@ -220,7 +222,7 @@ class Witness:
         left = self._left.residual.add(front_left, rear_left, keep, dt, count)
         right = self._right.residual.add(front_right, rear_right, keep, dt, count)
         last, self._last = self._last, speeds
-        same = [a == b for a, b in zip(speeds.as_tuple(), last.as_tuple(), strict=True)]
+        same = list(map(eq, speeds.as_tuple(), last.as_tuple()))
         stood, self._stands = self._stands, True in same
         self._found = None
         if stood or self._stands:

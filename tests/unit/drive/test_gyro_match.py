@@ -107,3 +107,10 @@ def test_what_slips_is_not_learned() -> None:
     before = match.ratio
     slipping(match, 20.0, 1.0, 0.0)
     assert match.ratio == before
+
+
+def test_a_delay_that_is_put_right_is_in_the_ratio_at_once() -> None:
+    match = matched(20.0, delay=0.02)
+    before = match.ratio
+    assert match.delay() is not None
+    assert match.ratio != before
