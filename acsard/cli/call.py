@@ -28,7 +28,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="call a service: " + ", ".join(CALLED),
         description="Call a service and print its answer; exit 1 when it was refused.",
     )
-    parser.add_argument("service", choices=CALLED, metavar="SERVICE", help=", ".join(CALLED))
+    parser.add_argument(
+        "service",
+        type=lambda word: word.removeprefix("srv/"),  # as `state` and the key table name it
+        choices=CALLED,
+        metavar="SERVICE",
+        help=", ".join(CALLED),
+    )
     parser.add_argument(
         "values", nargs="*", type=float, metavar="X Y YAW", help="for set_pose: m, m, rad"
     )

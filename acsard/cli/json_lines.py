@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import count
 from typing import TYPE_CHECKING, Self, TypeVar
 
@@ -178,24 +179,33 @@ class JsonLines:
             return pressed
 
     def _listen(self) -> None:
+        """Whatever ends it but the end of the conversation ends what is done."""
+        try:
+            self._end(self._heard_out())
+        except BaseException as error:
+            self._end(f"what comes in cannot be read: {error}")
+            raise
+
+    def _heard_out(self) -> str:
+        """Take what comes in; why no more does, or "" when the conversation is over."""
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if select.select([self._input], [], [], LISTEN_S)[0]:
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
                 if not read or len(held) > LINE_BYTES:
-                    return self._end("the program that asks is gone")
+                    return "the program that asks is gone"
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()
             elif self._moves and time.monotonic() - heard_s > HEARD_S:
-                return self._end(f"nothing was heard for {HEARD_S:g} s of who is to stop it")
-        return None
+                return f"nothing was heard for {HEARD_S:g} s of who is to stop it"
+        return ""
 
     def _take(self, line: bytes) -> None:
         try:
             said = self._lines.decode(line)
-        except msgspec.MsgspecError:
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             return  # the question stays open
         with self._news:
             if said.key:
@@ -210,8 +220,10 @@ class JsonLines:
         assert main is not None
         with self._news:
             if not self._left:
-                print(f"acsard: {why}", file=sys.stderr, flush=True)
+                # First what stops the wheels: nobody may be there any more to be told.
                 signal.pthread_kill(main, signal.SIGINT)
+                with suppress(OSError):
+                    print(f"acsard: {why}", file=sys.stderr, flush=True)
 
 
 class JsonAttendant(JsonLines):

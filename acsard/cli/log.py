@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -115,7 +116,8 @@ def _row_of_all(recording: Recording) -> str:
     for topic, wall_ns, data in recording.messages():
         last = max(last, wall_ns)
         if topic == "events":
-            events.append(msgspec.json.decode(data, type=Told))
+            with suppress(msgspec.MsgspecError):  # what it tells is left out, not all of it
+                events.append(msgspec.json.decode(data, type=Told))
     row = _row(recording.path, Closing(first, last, summary(events)))
     return row + _state(recording)
 

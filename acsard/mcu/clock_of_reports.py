@@ -198,11 +198,14 @@ class Slots:
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
         own = plain
-        if len(alone) >= LONE * len(gaps):
-            own = _slots(reads, median(alone))
+        # Bytes that come faster than the wire can carry them have times that are one and the same.
+        if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
+            own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
         yield from ((plain, LATE_BATCHED, period) for period in known)
         slope = _slope(reads, own)
+        if slope <= 0:
+            return
         if own is not plain:
             yield own, LATE_ALONE, slope
         elif all(abs(slope / period - 1) > DRIFT for period in known):

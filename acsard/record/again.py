@@ -9,6 +9,7 @@ from typing import NamedTuple
 from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
+from acsard.messages.text import printable
 from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
@@ -204,8 +205,8 @@ def differs(difference: Difference, began_ns: int) -> list[str]:
 
 
 def _side(name: str, seen: Seen) -> list[str]:
-    mode, reason, link, source = seen.status
-    line = "no line" if seen.line is None else seen.line.decode(errors="replace").strip()
+    mode, reason, link, source = map(printable, seen.status)
+    line = "no line" if seen.line is None else printable(seen.line.decode(errors="replace").strip())
     poses = [[f"{value / MICRO:.6f}" for value in pose] for pose in seen.poses]
     rows = [
         f"  {name:4}  {line}",

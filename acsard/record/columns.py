@@ -22,7 +22,7 @@ as the simulated microcontroller does eight, takes a time of its own for each.""
 EXACT = -1
 """In place of an order: all are exactly where they are expected, and nothing is left to tell."""
 
-MOST = 1 << 24
+MOST = 1 << 16
 """Numbers in a column: those that are exact take no room, so a damaged count could ask for any."""
 
 LONGEST = 64
@@ -152,6 +152,8 @@ def _numbers(column: Column, count: int) -> list[int]:
     at, more, found = 1, 1 << order, []
     for _ in range(count):
         begin = text.index("1", at)
+        if begin - at > LONGEST:
+            raise ValueError("a number of too many bits")
         at = 2 * begin - at + order + 1
         value = int(text[begin:at], 2) - more
         found.append(value >> 1 if value & 1 == 0 else ~(value >> 1))

@@ -40,7 +40,12 @@ STAMP = "%Y%m%dT%H%M%SZ"
 
 def listed(directory: Path) -> list[Path]:
     """The recordings in it, oldest first."""
-    found = [path for path in directory.iterdir() if _number(path) is not None]
+    found = [
+        path
+        for path in directory.iterdir()
+        # A link or a pipe of such a name is none of ours, and may not even end.
+        if _number(path) is not None and path.is_file() and not path.is_symlink()
+    ]
     return sorted(found, key=lambda path: (_number(path), path.name))
 
 

@@ -24,7 +24,7 @@ class Board(Struct, frozen=True):
 
 
 def boards(configured: str) -> list[Board]:
-    """The configured one, those that are plugged in, and the simulator; slow."""
+    """The configured one first, those that are plugged in, and the simulator; slow."""
     found: dict[str, str] = {}
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
@@ -35,7 +35,7 @@ def boards(configured: str) -> list[Board]:
     if configured != SIMULATOR and configured not in found:
         there = "" if os.path.exists(configured) else ", not there now"
         found = {configured: f"configured{there}", **found}
-    return [
-        *(Board(port, what) for port, what in found.items()),
-        Board(SIMULATOR, "the built-in simulator; no real robot moves"),
-    ]
+    found[SIMULATOR] = "the built-in simulator; no real robot moves"
+    # What is begun without a look at the list is of the robot that is seen: no other's wheels turn.
+    ports = sorted(found, key=lambda port: port != configured)
+    return [Board(port, found[port]) for port in ports]

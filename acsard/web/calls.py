@@ -46,8 +46,9 @@ class RefusedError(AcsardError):
 class Calls:
     """What is under way, at most so much."""
 
-    def __init__(self, robots: Robots) -> None:
-        self._robots = robots
+    def __init__(self, robots: Robots, ends: Callable[[], str] = str) -> None:
+        """`ends` ends what the page's server has begun beside the daemon, and says what it was."""
+        self._robots, self._ends = robots, ends
         self._running, self._stops, self._elsewhere = 0, Stops(), 0
 
     async def call(
@@ -59,6 +60,14 @@ class Calls:
         other = "" if robot == self._robots.id else robot
         if other:
             _require_stop(verb, other)
+        ended = self._ends() if verb == "stop" and not other else ""
+        reply = await self._called(who, verb, payload, other)
+        # A check has the port, and its wheels turn: the daemon, if there is one, cannot stop them.
+        return ServiceReply(True, f"{ended}; {reply.message}") if ended else reply
+
+    async def _called(
+        self, who: Who, verb: str, payload: Mapping[str, Any], other: str
+    ) -> ServiceReply:
         client = self._robots.client
         if client is None:
             return ServiceReply(False, self._robots.gone)

@@ -16,7 +16,7 @@ from acsard.web.frames import Begin, FrameError
 
 POSITIONS = "positions"
 
-KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/-]{0,79}\Z")
+KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 
 class Reach(Struct, frozen=True):

@@ -116,6 +116,14 @@ class Guide:
         else:
             errand.leave()
 
+    def stop(self) -> str:
+        """Somebody stops the robot: whoever began it, it ends, and that is said; "" when nothing
+        goes on. The daemon does not hear of a check: it cannot have the port."""
+        if self._errand is None:
+            return ""
+        self._errand.leave()
+        return f"the {self._errand.name} of {self._errand.by} is stopped"
+
     def heard(self, viewer: object) -> None:
         """He says something: the child hears that he is there."""
         if (errand := self._of(viewer)) is not None:

@@ -34,8 +34,7 @@ def rows(directory: Path) -> list[Listed]:
 
 def named(directory: Path, name: str) -> Path | None:
     """The file of this name, if it is one of them; raises `OSError`."""
-    found = (path for path in listed(directory) if path.name == name)
-    return next((path for path in found if path.is_file() and not path.is_symlink()), None)
+    return next((path for path in listed(directory) if path.name == name), None)
 
 
 def stamp(path: Path) -> tuple[int, int]:

@@ -156,9 +156,9 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
     hand = Hand(lambda: robots.client, counts)
-    calls, fleet = Calls(robots), Fleet(robots)
-    vault, gate = Vault(wanted.state), Gate(counts)
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
+    calls, fleet = Calls(robots, guide.stop), Fleet(robots)
+    vault, gate = Vault(wanted.state), Gate(counts)
     page = Page(robots, hand, calls, fleet, counts, vault, names, gate, guide, wanted.page)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,

@@ -1086,3 +1086,23 @@ def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> N
     bench = Bench(slow).driving(Twist(1.0), steps=30)
     speeds = [bench.step(REST).applied.linear for _ in range(3)]
     assert speeds == pytest.approx([0.9, 0.8, 0.7])
+
+
+def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
+    """A board that babbles over USB, or a baud rate set too low: reads that have one and the same
+    time are no clock."""
+    robot = Robot(Config())
+    good = b"a0.00,b0.00,c0.00,d0.00\r\n"
+    for n in range(2000):
+        odd, after = n % 12 == 0, n % 12 == 1
+        data = (b"" if after else b"xxxxxxxxxx\n") + good + (b"" if odd else b"y" * 120)
+        now = Instant(10**12 + n * 1_000_000, 0)
+        robot.step(
+            Inputs(
+                now=now,
+                tick=n % 10 == 0,
+                port_open=True,
+                opened=1,
+                received=(Received(now, data),),
+            )
+        )

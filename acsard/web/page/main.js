@@ -128,6 +128,8 @@ function looked() {
 function stated({ detail }) {
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
   if (since > 0) period = Math.min(since, 2);
+  // What was said of a stop is not true any more once that is cleared.
+  if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   views.banner(state, hello?.role === "viewer");

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -146,6 +147,30 @@ def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Progr
     with program.hears(JsonPerson()) as person:
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_it_ends_although_nobody_is_there_to_be_told(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program that asks has died, and what it read of standard error with it."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    gone = open(writer, "wb", buffering=0)  # noqa: SIM115
+    with gone, program.hears(JsonPerson()) as person:
+        monkeypatch.setattr("sys.stderr", io.TextIOWrapper(gone, write_through=True))
+        program.answers = [lambda number: program.hang_up()]
+        interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> None:
+    with program.hears(JsonPerson()) as person:
+
+        def nested(number: int) -> None:
+            program.say(raw=b'{"x":' + b"[" * 30_000 + b"\n")
+            program.say({"answer": number, "value": "lifted"})
+
+        program.answers = [nested]
+        assert person.ask("lifted?", ("lifted",)) == "lifted"
 
 
 def test_a_line_without_an_end_ends_it(program: Program) -> None:

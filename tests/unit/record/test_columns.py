@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.record.columns import Column, pack, unpack
+from acsard.record.columns import EMPTY, MOST, Column, pack, unpack
 
 NUMBERS = st.integers(-(1 << 61), (1 << 61) - 1) | st.integers(-9, 9)
 
@@ -92,3 +92,18 @@ def test_what_there_is_not_is_refused(what: dict[str, int]) -> None:
 def test_more_numbers_than_there_can_be_are_refused() -> None:
     with pytest.raises(ValueError, match="too many"):
         unpack(pack([7] * COUNT), 1 << 60)
+
+
+def test_a_code_of_any_length_is_none() -> None:
+    """A few bytes must not ask for numbers of thousands of bits, each added to all that follow."""
+    zeros = 100_000
+    bits = "1" + "1" + "0" * zeros + "1" + "0" * zeros + "1"
+    held = int(bits, 2).to_bytes((len(bits) + 7) // 8)
+    with pytest.raises(ValueError, match="too many bits"):
+        unpack(Column(1, 0, 0, 1, 0, held), 3)
+
+
+def test_more_numbers_than_a_batch_can_have_are_none() -> None:
+    with pytest.raises(ValueError, match="too many numbers"):
+        unpack(EMPTY, MOST + 1)
+    assert MOST < 100_000

@@ -151,3 +151,14 @@ def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
     assert writing.path.exists()
     one.close()
     ring(tmp_path).close()
+
+
+def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> None:
+    """A pipe would keep its reader for ever, and a link leads elsewhere."""
+    whole = tmp_path / "000001-20260101T000000Z.mcap"
+    whole.touch()
+    os.mkfifo(tmp_path / "000002-20260101T000000Z.mcap")
+    (tmp_path / "000003-20260101T000000Z.mcap").symlink_to("/etc/passwd")
+    (tmp_path / "000004-20260101T000000Z.mcap").symlink_to(tmp_path / "nothing")
+    (tmp_path / "000005-20260101T000000Z.mcap").mkdir()
+    assert listed(tmp_path) == [whole]

@@ -38,3 +38,12 @@ def test_the_simulator_is_there_once_whatever_is_configured(
 ) -> None:
     monkeypatch.setattr("acsard.web.boards.serial_devices", list)
     assert [one.port for one in boards("sim")] == ["sim"]
+
+
+@pytest.mark.parametrize("configured", ["sim", "/dev/ttyUSB0"])
+def test_the_configured_one_is_the_first_choice(
+    configured: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that shows the simulator must not begin at a real port by itself."""
+    monkeypatch.setattr("acsard.web.boards.serial_devices", lambda: [MEGA, HELD])
+    assert boards(configured)[0].port == configured

@@ -8,6 +8,7 @@ from collections import Counter
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from acsard.client import Client
 from acsard.messages.encodings import encode, encoding_name
@@ -84,6 +85,17 @@ def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_hav
             await calls.call(MAINTAINER, "stop", {}, "**")
         # Its own by name is its own.
         assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
+
+    asyncio.run(story())
+
+
+def test_a_stop_ends_a_check_for_which_the_daemon_has_no_port() -> None:
+    async def story() -> None:
+        calls = Calls(robots(None), lambda: "the check of phone is stopped")
+        told = await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
+        assert told.success
+        assert told.message.startswith("the check of phone is stopped; ")
+        assert not (await calls.call(MAINTAINER, "clear", {})).success
 
     asyncio.run(story())
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from acsard.calibration.guided.needs import NEEDS
 from acsard.calibration.guided.ways import KINDS
 from acsard.cli import calibrate, mcu
-from acsard.web.errands import Reach, words
+from acsard.web.errands import KEY, Reach, words
 from acsard.web.frames import Begin, FrameError
 
 REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
@@ -92,3 +92,9 @@ def test_no_text_becomes_an_option_of_its_own(
 
 def test_the_ways_are_those_there_are() -> None:
     assert {name: kind.needs for name, kind in KINDS.items()} == NEEDS
+
+
+@pytest.mark.parametrize("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
+def test_what_is_no_key_is_no_positions(key: str) -> None:
+    assert not KEY.match(key)
+    assert KEY.match("sim/pose")
