@@ -19,7 +19,7 @@ from collections import deque
 from itertools import takewhile
 
 from acsard.config.settings import FeedbackConfig, OdometryConfig
-from acsard.drive.distance import NOWHERE, Rolled, Rolling, Step, count_of, plus
+from acsard.drive.bridging import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.gap_variance import Gaps
 from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics

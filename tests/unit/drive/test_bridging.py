@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from acsard.drive.distance import MAX_LOST_S, NOWHERE, Rolled, Rolling
+from acsard.drive.bridging import MAX_LOST_S, NOWHERE, Rolled, Rolling
 from acsard.mcu.feedback import Feedback
 from acsard.values import Instant, WheelSpeeds
 
