@@ -21,7 +21,7 @@ from tests.system.bystander import lost
 from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
 from tests.system.harness import Bus, Daemon, Program, acsard, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_who_is_not_heard_any_more_drives_no_more(page: Page, bus: Bus) -> None:
     run(story)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
     daemon: Daemon, bus: Bus, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -24,6 +24,7 @@ from tests.system.harness import Bus, Daemon, Program, until
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.xdist_group("pages"),
     pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
 ]
 

@@ -64,7 +64,7 @@ def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_counter_says(c
     assert one.ours == pytest.approx(one.raw, abs=0.004)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("counts", COUNTS + FINER)
 def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int) -> None:

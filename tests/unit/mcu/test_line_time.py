@@ -91,9 +91,9 @@ def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, s
 @pytest.mark.parametrize(
     ("prompted", "seconds", "seeds"),
     [
-        pytest.param(False, 60.0, 12, marks=pytest.mark.slow, id="reporting-45 m"),
+        pytest.param(False, 60.0, 4, marks=pytest.mark.slow, id="reporting-45 m"),
         # What answers around a stall get lost decides a minute.
-        pytest.param(True, 600.0, 3, marks=pytest.mark.slow, id="prompted-450 m thrice"),
+        pytest.param(True, 600.0, 3, marks=pytest.mark.soak, id="prompted-450 m thrice"),
         pytest.param(False, *FULL.values, marks=FULL.marks, id="reporting-450 m"),
         pytest.param(True, *FULL.values, marks=FULL.marks, id="prompted-450 m"),
     ],
