@@ -108,7 +108,7 @@ class Begin(_Frame, frozen=True):
 class Reply(_Frame, frozen=True):
     """The answer to the question of this number, of what was begun; none is what is usual."""
 
-    reply: Annotated[int, Meta(ge=1, le=1 << 31)]
+    reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
 
 
