@@ -20,10 +20,11 @@ def named() -> set[str]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and node.args):
                 continue
-            called, first = ast.unparse(node.func), node.args[0]
-            events = called == "Event" or called.endswith("log.info")
-            if events and isinstance(first, ast.Constant):
-                found.add(str(first.value))
+            first = node.args[0]
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                called = ast.unparse(node.func)
+                if called == "Event" or called.endswith("log.info"):
+                    found.add(first.value)
     return found
 
 

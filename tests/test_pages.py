@@ -5,7 +5,6 @@ What they say to type is run by `tests/system/test_pages.py`, or by what `tests/
 
 from __future__ import annotations
 
-import argparse
 import ast
 import re
 import shlex
@@ -22,9 +21,10 @@ import msgspec
 import pytest
 import zenoh
 
-from acsard.cli import VERBS
+from acsard import cli
 from acsard.config.settings import Config
 from acsard.host.extras import Extra
+from tests.each import each
 from tests.pages import (
     COMMANDS,
     LANGUAGES,
@@ -76,9 +76,7 @@ def named_tests(file: str) -> set[str]:
     return {name for name in functions if name.startswith("test_")}
 
 
-@pytest.mark.parametrize(
-    "how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}), ids=" ".join
-)
+@each("how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}))
 def test_what_is_said_to_run_a_command_is_a_test(how: Elsewhere) -> None:
     assert how.test in named_tests(how.file)
 
@@ -90,7 +88,7 @@ def test_ci_has_what_it_is_said_to_run() -> None:
     assert not {one for one in words if one not in told}
 
 
-@pytest.mark.parametrize("block", blocks(), ids=at)
+@each("block", blocks())
 def test_a_block_is_of_a_kind_that_is_checked(block: Block) -> None:
     assert block.language in LANGUAGES
     if block.language != "console":
@@ -106,13 +104,7 @@ def test_every_block_of_commands_is_shell() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@cache
-def parser() -> argparse.ArgumentParser:
-    found = argparse.ArgumentParser("acsard")
-    verbs = found.add_subparsers(required=True)
-    for verb in VERBS:
-        verb.add(verbs)
-    return found
+parser = cache(cli.parser)
 
 
 def calls(command: str) -> Iterator[list[str]]:
@@ -128,7 +120,7 @@ def calls(command: str) -> Iterator[list[str]]:
             yield one[1 : one.index(">") if ">" in one else None]
 
 
-@pytest.mark.parametrize("command", [text for text in COMMANDS if "acsard" in text])
+@each("command", [text for text in COMMANDS if "acsard" in text])
 def test_a_call_of_acsard_has_the_options_it_is_given(command: str) -> None:
     for words in calls(command):
         parser().parse_args(words)
@@ -141,7 +133,7 @@ def inline() -> Iterator[tuple[str, list[str]]]:
             yield page, span.split()
 
 
-@pytest.mark.parametrize(("page", "words"), list(inline()), ids=str)
+@each(("page", "words"), list(inline()))
 def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
     page: str, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,7 +165,7 @@ def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
 # calls of pytest
 
 
-@pytest.mark.parametrize("arguments", promises(), ids=" ".join)
+@each("arguments", promises())
 def test_what_proves_a_promise_is_there(arguments: list[str]) -> None:
     files: list[Path] = []
     for path in (ROOT / word for word in arguments if word.startswith("tests/")):

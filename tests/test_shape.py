@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.each import each
+
 PACKAGE = Path(__file__).parents[1] / "acsard"
 UNIT = Path(__file__).parent / "unit"
 
@@ -170,7 +172,7 @@ def prefixes(name: str) -> Iterator[str]:
     yield from modules[-1:]
 
 
-@pytest.mark.parametrize("module", PURE)
+@each("module", PURE)
 def test_a_pure_module_imports_only_what_is_pure(module: str) -> None:
     assert impure(imported(tree_of(path_of(module)))) == set()
 
@@ -195,7 +197,7 @@ def test_an_impure_import_is_seen_however_it_is_written(line: str) -> None:
     assert impure(imported(ast.parse(line))) != set()
 
 
-@pytest.mark.parametrize("module", PURE)
+@each("module", PURE)
 def test_a_pure_module_neither_opens_nor_prints(module: str) -> None:
     called = {
         node.func.id
@@ -205,7 +207,7 @@ def test_a_pure_module_neither_opens_nor_prints(module: str) -> None:
     assert not called & IMPURE_CALLS
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m.partition(".")[0] in DAEMON_ROOMS])
+@each("module", [m for m in MODULES if m.partition(".")[0] in DAEMON_ROOMS])
 def test_only_the_clock_reads_a_clock(module: str) -> None:
     tree = tree_of(path_of(module))
     read = {
@@ -224,7 +226,7 @@ def test_only_the_clock_reads_a_clock(module: str) -> None:
         assert "datetime" not in roots
 
 
-@pytest.mark.parametrize("module", PURE)
+@each("module", PURE)
 def test_a_pure_module_has_a_test_module_at_the_mirrored_path(module: str) -> None:
     if not has_behaviour(tree_of(path_of(module))):
         return

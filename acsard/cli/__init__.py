@@ -1,6 +1,6 @@
 """The command line: one verb per file, each with `add` (its options) and `main` (its work).
 
-Verbs import what is heavy inside `main`, so that `acsard --help` is quick.
+Only the verb that is called is imported, and what is heavy inside its `main`.
 """
 
 from __future__ import annotations
@@ -11,39 +11,12 @@ import os
 import re
 import sys
 import traceback
+from collections.abc import Sequence
 from decimal import Decimal
+from importlib import import_module
 from typing import NoReturn
 
 from acsard import __version__
-from acsard.cli import (
-    bench,
-    calibrate,
-    call,
-    check,
-    completion,
-    doctor,
-    door,
-    drive,
-    echo,
-    fleet,
-    foxglove,
-    get,
-    hz,
-    lan,
-    log,
-    mcu,
-    odom,
-    ports,
-    router,
-    run,
-    service,
-    sim,
-    top,
-    topics,
-    web,
-    whoami,
-)
-from acsard.cli import set as setting
 from acsard.cli.exits import code_of
 from acsard.config.nearest import nearest
 from acsard.host.errors import MendableError
@@ -52,34 +25,35 @@ from acsard.messages.text import lines
 from acsard.values import AcsardError
 
 VERBS = (
-    run,
-    sim,
-    check,
-    topics,
-    echo,
-    get,
-    hz,
-    top,
-    fleet,
-    foxglove,
-    drive,
-    web,
-    call,
-    whoami,
-    setting,
-    bench,
-    doctor,
-    ports,
-    mcu,
-    odom,
-    calibrate,
-    log,
-    lan,
-    door,
-    router,
-    service,
-    completion,
+    "run",
+    "sim",
+    "check",
+    "topics",
+    "echo",
+    "get",
+    "hz",
+    "top",
+    "fleet",
+    "foxglove",
+    "drive",
+    "web",
+    "call",
+    "whoami",
+    "set",
+    "bench",
+    "doctor",
+    "ports",
+    "mcu",
+    "odom",
+    "calibrate",
+    "log",
+    "lan",
+    "door",
+    "router",
+    "service",
+    "completion",
 )
+"""Each is the module of its name in here, in the order of the help."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
@@ -105,8 +79,8 @@ class _Parser(argparse.ArgumentParser):
             raise
 
 
-def parser() -> argparse.ArgumentParser:
-    """Every verb with its options."""
+def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
+    """These verbs with their options."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
@@ -116,8 +90,8 @@ def parser() -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action="version", version=f"acsard {__version__}")
     verbs = whole.add_subparsers(title="verbs", metavar="VERB", dest="verb")
-    for verb in VERBS:
-        verb.add(verbs)
+    for name in names:
+        import_module(f"acsard.cli.{name}").add(verbs)
     return whole
 
 
@@ -129,7 +103,7 @@ def main(argv: list[str] | None = None) -> int:
         words.insert(0, "run")
     try:
         try:
-            args = parser().parse_args(words)
+            args = parser(_needed(words[0])).parse_args(words)
             return int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
@@ -144,6 +118,13 @@ def main(argv: list[str] | None = None) -> int:
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
+
+
+def _needed(word: str) -> Sequence[str]:
+    """The verbs to import for this first word: for a verb only itself."""
+    if word == "--version":
+        return ()
+    return (word,) if word in VERBS else VERBS
 
 
 _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")

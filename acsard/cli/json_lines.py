@@ -39,6 +39,9 @@ HEARD_S = 3.0
 
 LISTEN_S = 0.1
 
+LEAVING_S = 1.0
+"""Whoever does not read why it ends is waited for so long."""
+
 LINE_BYTES = 65536
 """Of a line that comes; who sends a longer one has lost his mind, and is not listened to."""
 
@@ -96,7 +99,7 @@ class JsonLines:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        self._reader.join()
+        self._reader.join(LEAVING_S)
 
     # out
 
@@ -155,9 +158,10 @@ class JsonLines:
             question = msgspec.convert(
                 {"question": next(self._numbers), "wrong": wrong, **about}, Question
             )
+            self._open = question.question
+            # Without the lock: who does not read what he is told is listened to all the same.
+            self._tell(question)
             with self._news:
-                self._open = question.question
-                self._tell(question)
                 while self._open:
                     # Not for ever: a signal just before it begins to wait would not wake it.
                     self._news.wait(LISTEN_S)
@@ -219,11 +223,12 @@ class JsonLines:
         main = threading.main_thread().ident
         assert main is not None
         with self._news:
-            if not self._left:
-                # First what stops the wheels: nobody may be there any more to be told.
-                signal.pthread_kill(main, signal.SIGINT)
-                with suppress(OSError):
-                    print(f"acsard: {why}", file=sys.stderr, flush=True)
+            if self._left:
+                return
+            # First what stops the wheels: nobody may be there any more to be told.
+            signal.pthread_kill(main, signal.SIGINT)
+        with suppress(OSError):
+            print(f"acsard: {why}", file=sys.stderr, flush=True)
 
 
 class JsonAttendant(JsonLines):

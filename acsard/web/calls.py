@@ -63,7 +63,8 @@ class Calls:
         ended = self._ends() if verb == "stop" and not other else ""
         reply = await self._called(who, verb, payload, other)
         # A check has the port, and its wheels turn: the daemon, if there is one, cannot stop them.
-        return ServiceReply(True, f"{ended}; {reply.message}") if ended else reply
+        # What is ended stands only when it has; what was confirmed is what the daemon says.
+        return ServiceReply(reply.success, f"{ended}; {reply.message}") if ended else reply
 
     async def _called(
         self, who: Who, verb: str, payload: Mapping[str, Any], other: str

@@ -117,12 +117,12 @@ class Guide:
             errand.leave()
 
     def stop(self) -> str:
-        """Somebody stops the robot: whoever began it, it ends, and that is said; "" when nothing
-        goes on. The daemon does not hear of a check: it cannot have the port."""
+        """Somebody stops the robot: whoever began it, it is ended, and that is said; "" when
+        nothing goes on. The daemon does not hear of a check: it cannot have the port."""
         if self._errand is None:
             return ""
         self._errand.leave()
-        return f"the {self._errand.name} of {self._errand.by} is stopped"
+        return f"the {self._errand.name} of {self._errand.by} is being ended"
 
     def heard(self, viewer: object) -> None:
         """He says something: the child hears that he is there."""

@@ -103,6 +103,7 @@ def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missi
     assert world.state.mode == "driving"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
 )
@@ -268,6 +269,7 @@ def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
         assert check_of(world) == "checked"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
     world = started(config("require", 3200))
@@ -461,6 +463,7 @@ def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
     assert off_by(world) < 0.001
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("motor", range(4))
 def test_a_lying_encoder_is_still_found_out_with_counts(motor: int) -> None:
     world = started(config("require", 3200))
@@ -554,6 +557,7 @@ class Echo(FakeMcu):
         self._schedule(now_ns + 5 * MS, "sent", data)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("check", ["auto", "require"])
 @pytest.mark.parametrize("counts", [0, 3200])
 def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:

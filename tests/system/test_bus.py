@@ -95,6 +95,7 @@ def restored(bus: Bus) -> Iterator[None]:
 # last values
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("key", PUBLISHED)
 def test_a_get_on_a_published_key_answers_with_its_last_value_in_json(bus: Bus, key: str) -> None:
     (answer,) = bus.ask(key)
@@ -103,6 +104,7 @@ def test_a_get_on_a_published_key_answers_with_its_last_value_in_json(bus: Bus, 
     assert set(json.loads(answer.payload)) == FIELDS[key]
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("key", PUBLISHED)
 def test_a_get_with_fmt_msgpack_answers_in_msgpack(bus: Bus, key: str) -> None:
     (answer,) = bus.ask(f"{key}?fmt=msgpack")
@@ -511,6 +513,7 @@ def test_a_late_advanced_subscriber_gets_tf_static_at_once(bus: Bus) -> None:
 # the token
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_the_alive_token_is_there_while_the_daemon_runs_and_gone_after(
     tmp_path: Path, number: signal.Signals

@@ -268,6 +268,7 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
     assert lines[1]["hz"] == pytest.approx(100.0, abs=3.0 + 100.0 * late)
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
 def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
     shared: Daemon, words: list[str]
@@ -655,6 +656,7 @@ def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]
         yield terminal, program
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("columns", [40, 80])
 def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
     shared: Daemon, bus: Bus, columns: int
@@ -710,6 +712,7 @@ def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
     bus.at_rest()
 
 
+@pytest.mark.slow
 def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):

@@ -492,6 +492,7 @@ def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: B
     assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
 
 
+@pytest.mark.slow
 def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh: Bus) -> None:
     cancelled = 0.0
 

@@ -652,6 +652,7 @@ def full_pipe() -> Iterator[int]:
         os.close(writer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [pytest.param("stdout", marks=pytest.mark.slow), "stderr"])
 def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
     tmp_path: Path, peer: Peer, which: str

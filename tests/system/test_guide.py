@@ -7,7 +7,7 @@ import json
 import signal
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,8 +15,7 @@ import aiohttp
 import pytest
 
 from acsard.cli.json_lines import HEARD_S
-from acsard.lan.authority import Authority
-from tests.system.browser import NAME, Page, run, text
+from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
 from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
 from tests.system.harness import Bus, Daemon, Program, acsard, until
@@ -24,35 +23,12 @@ from tests.system.harness import Bus, Daemon, Program, acsard, until
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
 
 
-@pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with Daemon(tmp_path_factory.mktemp("daemon")) as daemon:
-        yield daemon
-
-
-@pytest.fixture(scope="module")
-def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    where = tmp_path_factory.mktemp("page")
-    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
-    with Page(daemon, where) as page:
-        yield page
-
-
-@pytest.fixture
-def bus(daemon: Daemon) -> Iterator[Bus]:
-    """The robot stands and may be driven."""
-    with Bus(daemon.endpoint) as bus:
-        bus.ask("srv/clear")
-        bus.at_rest()
-        yield bus
-
-
 async def beside(call: Callable[[], Any]) -> Any:
     """What waits, while the pings go on."""
     return await asyncio.to_thread(call)
 
 
-async def drives(guided: Guided, bus: Bus) -> None:
+async def drives(guided: Guided, standing: Bus) -> None:
     """The first leg moves; it is begun again where a busy machine has ended it."""
     for _ in range(4):
         await guided.begin("calibrate", way="umbmark")
@@ -62,8 +38,8 @@ async def drives(guided: Guided, bus: Bus) -> None:
         if "ended" not in said:
             break
         await guided.says(lambda said: said.get("running") == "")
-    await beside(lambda: until(lambda: bus.state()["linear"] > 0.25, 10.0, "the leg moves"))
-    assert bus.state()["source"] == "app"
+    await beside(lambda: until(lambda: standing.state()["linear"] > 0.25, 10.0, "the leg moves"))
+    assert standing.state()["source"] == "app"
 
 
 def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
@@ -102,12 +78,12 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
     assert written["port"] == "sim"
 
 
-def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, bus: Bus) -> None:
+def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, standing: Bus) -> None:
     before = page.refused()
 
     async def story() -> None:
         async with guiding(page) as guided, guiding(page) as other:
-            await drives(guided, bus)
+            await drives(guided, standing)
             about = await other.says(lambda said: said.get("running"))
             assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
             # One at a time; and nobody else answers, presses or ends.
@@ -123,10 +99,10 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, bus:
                 await guided.ours.say(reply=number, value="start")
             refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
             assert "is open" in refused["reason"]
-            assert bus.state()["linear"] > 0.25
+            assert standing.state()["linear"] > 0.25
             pressed = time.monotonic()
             await guided.ours.say(press="key")
-            await beside(bus.at_rest)
+            await beside(standing.at_rest)
             took = time.monotonic() - pressed
             # 0.3 m/s at 1 m/s2, and some of the way.
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
@@ -152,15 +128,15 @@ def left(guided: Guided, page: Page) -> None:
 
 @pytest.mark.parametrize("how", [gone, left])
 def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
-    page: Page, bus: Bus, how: Callable[[Guided, Page], None]
+    page: Page, standing: Bus, how: Callable[[Guided, Page], None]
 ) -> None:
     async def story() -> None:
         async with guiding(page) as guided:
-            await drives(guided, bus)
+            await drives(guided, standing)
             (child,) = commands(page)
             begun = time.monotonic()
             how(guided, page)
-            await beside(bus.at_rest)
+            await beside(standing.at_rest)
             took = time.monotonic() - begun
             assert took < 0.3 + 0.4 + lost(begun, begun + took)
             await beside(lambda: none_left(page))
@@ -173,7 +149,7 @@ def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
     none_left(page)
 
 
-def test_who_is_not_heard_any_more_drives_no_more(page: Page, bus: Bus) -> None:
+def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
     async def story() -> None:
         async with guiding(page, pings=False) as guided:
             for _ in range(4):  # a busy machine may end it before
@@ -185,23 +161,40 @@ def test_who_is_not_heard_any_more_drives_no_more(page: Page, bus: Bus) -> None:
                     break
                 await guided.says(lambda said: said.get("running") == "")
             assert f"nothing was heard for {HEARD_S:g} s" in end["text"]
-            await beside(bus.at_rest)
+            await beside(standing.at_rest)
 
     run(story)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
-    daemon: Daemon, bus: Bus, tmp_path: Path, number: signal.Signals
+def test_a_server_that_is_killed_at_a_question_takes_its_child_with_it(
+    daemon: Daemon, tmp_path: Path
 ) -> None:
     with Page(daemon, tmp_path) as page:
 
         async def story() -> None:
             async with guiding(page) as guided:
-                await drives(guided, bus)
+                await guided.begin("calibrate", way="umbmark")
+                await guided.asks("How wide")
+                (child,) = commands(page)
+                page.signal(signal.SIGKILL)
+                await beside(lambda: until(lambda: ended(child), 8.0, "the child ends"))
+
+        with pytest.raises((AssertionError, aiohttp.ClientError, ConnectionError)):
+            run(lambda: _then_fail(story))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
+    daemon: Daemon, standing: Bus, tmp_path: Path, number: signal.Signals
+) -> None:
+    with Page(daemon, tmp_path) as page:
+
+        async def story() -> None:
+            async with guiding(page) as guided:
+                await drives(guided, standing)
                 (child,) = commands(page)
                 page.signal(number)
-                await beside(bus.at_rest)
+                await beside(standing.at_rest)
                 await beside(
                     lambda: until(lambda: ended(child), 8.0, "the child ends with its server")
                 )
@@ -227,7 +220,7 @@ def ended(pid: int) -> bool:
 
 
 @pytest.mark.network
-def test_who_is_no_maintainer_begins_nothing(page: Page, bus: Bus) -> None:
+def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
     async def story(token: str) -> None:
         async with guiding(page, token=token) as theirs:
             for what in ("calibrate", "check"):

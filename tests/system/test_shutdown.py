@@ -42,6 +42,7 @@ def last_speed(ramp: list[Heard]) -> float:
     return next(wheels(heard.line)[0] for heard in reversed(ramp) if heard.line != ZERO_LINE)
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
     tmp_path: Path, peer: Peer, number: signal.Signals

@@ -144,6 +144,7 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
             assert line != ZERO_LINE or wheels(before)[0] < 1.0
 
 
+@pytest.mark.slow
 def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_own_port(
     tmp_path: Path, peer: Peer
 ) -> None:

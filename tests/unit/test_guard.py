@@ -37,6 +37,7 @@ from acsard.values import (
     Verb,
     WheelSpeeds,
 )
+from tests.each import each
 
 MS = 1_000_000
 NOW_NS = 50_000 * MS
@@ -535,8 +536,8 @@ def test_what_a_checked_line_says_is_judged_as_ever(guard: Guarded) -> None:
     assert objection(guard, outputs(seal(STOP, 7), mode="fault", linked=False)) == ""
 
 
-@pytest.mark.parametrize("place", range(42))
-@pytest.mark.parametrize("bit", range(8))
+@each("place", range(42))
+@each("bit", range(8))
 def test_a_checked_line_with_one_bit_wrong_is_none(guard: Guarded, place: int, bit: int) -> None:
     good = seal(line(12.5, -8.75, 15.0, -10.25), 7, b"S")
     bad = b"%b%c%b" % (good[:place], good[place] ^ 1 << bit, good[place + 1 :])

@@ -42,6 +42,7 @@ WRONG = {
 }
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("what", "gyro", "places", "words"),
     [

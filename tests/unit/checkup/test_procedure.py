@@ -52,6 +52,7 @@ def test_a_robot_that_is_right_passes(
     assert set(checked.changes) == new
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("baud", [9600, 19200, 38400, 57600])
 def test_a_slow_wire_passes(baud: int) -> None:
     config = configured(Config(), baud_rate=baud)
@@ -74,6 +75,7 @@ def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -
     assert check(*fault, config=config).failed == []
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("per_turn", [16, 48, 400])
 def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_turn: int) -> None:
     config = Config(sim=SimConfig(encoder_counts=per_turn))
@@ -168,6 +170,7 @@ def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
     assert not any(key.startswith("mcu.wheels") for key in checked.changes)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("motor", range(4))
 def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) -> None:
     checked = check("plain_only", f"reversed_wheel={MOTORS[motor]}", person=True)
@@ -176,6 +179,7 @@ def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) ->
     assert wheels == {f"mcu.wheels.{WHEELS[motor]}": f"-{MOTORS[motor]}"}
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(("one", "other"), list(combinations(range(4), 2)))
 def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
     checked = check("plain_only", f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
@@ -286,6 +290,7 @@ LINES = 560
 """Nearly as many lines as a whole check sends."""
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
 @pytest.mark.parametrize("number", range(2, LINES, 43))
 def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
@@ -343,6 +348,7 @@ def test_a_person_who_leaves_while_asked_leaves_a_robot_that_stands() -> None:
     assert robot.later() == [0.0] * 4
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("number", [5, 200, 400])
 def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
     robot = Trouble(number, WireLostError("unplugged"))
@@ -462,6 +468,7 @@ def test_an_echo_is_not_taken_for_a_robot() -> None:
     assert checked["identification"].figure == "an echo"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["mute", "noise", "partial_line"])
 def test_an_mcu_that_says_nothing_good_is_never_driven(fault: str) -> None:
     robot = Robot(fault)
@@ -485,6 +492,7 @@ def test_mute_noise_and_half_lines_are_three_mends_with_what_was_heard() -> None
     assert "bytes heard but no line end, the last `" in found["partial_line"].text
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("gain", [0.8, 0.93, 1.07])
 def test_a_motor_that_is_off_by_more_than_a_twentieth_is_a_warning(gain: float) -> None:
     checked = check(f"bias=c:{gain}")
@@ -493,6 +501,7 @@ def test_a_motor_that_is_off_by_more_than_a_twentieth_is_a_warning(gain: float) 
     assert checked["watchdog"].verdict == "PASS"
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     "robot", [(0.2, 3200), (1.0, 3200), slow((0.05, 16)), (0.05, 48), slow((0.5, 64))]
 )
@@ -518,6 +527,7 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
     assert all(said[n - 1] not in procedure.STEPS for n in told)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors", "slow_reply"])
 def test_a_poor_line_ends_in_a_stop_whatever_is_found(fault: str) -> None:
     assert not check(fault).left_turning

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import os
@@ -160,6 +161,18 @@ def test_it_ends_although_nobody_is_there_to_be_told(
         monkeypatch.setattr("sys.stderr", io.TextIOWrapper(gone, write_through=True))
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
+    """The program that asks hangs with a full pipe, and then it is gone."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writer, b"x" * 4096)
+    with os.fdopen(reader), os.fdopen(writer, "w") as full:
+        with redirect_stdout(full), JsonPerson() as person:
+            threading.Timer(0.3, program.hang_up).start()
+            interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+        os.read(reader, 4096)
 
 
 def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> None:

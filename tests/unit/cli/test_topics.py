@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
+from acsard.cli import VERBS
 from acsard.cli.topics import ros_table
 from acsard.config.settings import Config, RosConfig
 from acsard.messages.topics import PUBLISHED
@@ -38,3 +42,12 @@ def test_one_tree_is_enough_to_be_listed(bridge: bool, rmw: bool) -> None:
 
 def test_without_any_tree_there_is_nothing_to_list() -> None:
     assert ros_table(Config(ros=RosConfig(bridge=False, rmw=False))).topics == []
+
+
+def test_no_verb_but_the_one_that_is_called_is_loaded() -> None:
+    code = "import sys\nfrom acsard.cli import main\nmain(['topics'])\nprint(*sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0, check=True
+    )
+    loaded = {name.removeprefix("acsard.cli.") for name in run.stdout.splitlines()[-1].split()}
+    assert loaded & set(VERBS) == {"topics"}

@@ -14,6 +14,7 @@ from msgspec import inspect
 from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, effective, from_builtins, parse
 from acsard.config.settings import Config, Source
+from tests.each import each
 from tests.unit.keys import KEYS, Key
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
@@ -49,7 +50,7 @@ def test_the_reference_file_has_every_key_of_every_table_and_no_other() -> None:
     assert table == msgspec.json.decode(msgspec.json.encode(effective(Config())))
 
 
-@pytest.mark.parametrize("key", KEYS, ids=lambda key: key.path)
+@each("key", KEYS)
 def test_the_reference_file_gives_each_key_its_default(key: Key) -> None:
     place = tomllib.loads(REFERENCE.read_text(encoding="utf-8"))
     *tables, name = key.path.replace("[0]", "").split(".")
@@ -383,8 +384,8 @@ def test_the_error_says_all_its_problems() -> None:
 # numbers
 
 
-@pytest.mark.parametrize("text", ["inf", "-inf", "nan"])
-@pytest.mark.parametrize("key", FLOATS, ids=lambda key: key.path)
+@each("text", ["inf", "-inf", "nan"])
+@each("key", FLOATS)
 def test_a_number_that_is_not_finite_is_refused_at_every_key(key: Key, text: str) -> None:
     items = len(key.field.default) if isinstance(key.field.default, tuple) else 0
     for place in range(max(1, items)):

@@ -12,6 +12,7 @@ from msgspec import inspect
 from acsard.config.settings import Config, ControlConfig, JointsConfig, McuConfig, Source, WheelMap
 from acsard.config.validation import build
 from acsard.values import WHEELS
+from tests.each import each
 from tests.unit.keys import KEYS, Key
 
 NUMBERS = [key for key in KEYS if key.numbers()]
@@ -78,7 +79,7 @@ def test_every_table_is_frozen() -> None:
     assert Config.__struct_config__.frozen
 
 
-@pytest.mark.parametrize("key", NUMBERS, ids=lambda key: key.path)
+@each("key", NUMBERS)
 def test_every_number_has_a_range_and_takes_its_ends(key: Key) -> None:
     (kind, *_) = key.numbers()
     assert kind.ge is not None
@@ -87,7 +88,7 @@ def test_every_number_has_a_range_and_takes_its_ends(key: Key) -> None:
     assert accepts(key, kind.le)
 
 
-@pytest.mark.parametrize("key", NUMBERS, ids=lambda key: key.path)
+@each("key", NUMBERS)
 def test_no_number_beyond_its_range_is_taken(key: Key) -> None:
     (kind, *_) = key.numbers()
     assert kind.ge is not None
@@ -100,14 +101,14 @@ def test_no_number_beyond_its_range_is_taken(key: Key) -> None:
     assert not accepts(key, beyond[1])
 
 
-@pytest.mark.parametrize("key", FLOATS, ids=lambda key: key.path)
+@each("key", FLOATS)
 def test_the_ranges_themselves_are_finite(key: Key) -> None:
     assert all(
         math.isfinite(kind.ge or 0) and math.isfinite(kind.le or 0) for kind in key.numbers()
     )
 
 
-@pytest.mark.parametrize("key", KEYS, ids=lambda key: key.path)
+@each("key", KEYS)
 def test_every_default_is_a_value_the_key_takes(key: Key) -> None:
     if not key.field.required:
         assert msgspec.convert(key.field.default, key.field.type, strict=True) == key.field.default

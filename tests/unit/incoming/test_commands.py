@@ -20,6 +20,7 @@ from acsard.messages.schema import JointState, TwistStamped
 from acsard.messages.schema import Twist as TwistMessage
 from acsard.ros.attachments import Attachment
 from acsard.values import Command, Pose, Request, Twist, WheelSpeeds
+from tests.each import each
 
 KINEMATICS = Kinematics(DriveConfig())
 RECEIVER = Receiver(JointsConfig(), KINEMATICS)
@@ -357,9 +358,9 @@ TOLD = {
 """What an rmw key says that it carries."""
 
 
-@pytest.mark.parametrize("surplus", [*range(9), 16, 24, 200])
-@pytest.mark.parametrize("fill", [b"\x00", b"\xff"])
-@pytest.mark.parametrize("header", ORDERS)
+@each("surplus", [*range(9), 16, 24, 200])
+@each("fill", [b"\x00", b"\xff"])
+@each("header", ORDERS)
 def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_told(
     header: bytes, fill: bytes, surplus: int
 ) -> None:
@@ -374,14 +375,14 @@ def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_tol
         assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
 
 
-@pytest.mark.parametrize("size", range(4, 68))
+@each("size", range(4, 68))
 def test_where_the_type_is_told_a_twist_is_no_stamped_twist_of_that_length(size: int) -> None:
     payload = (native_twist() + bytes(68))[:size]
     assert refusal(arrival(payload, encoding=TOLD["TwistStamped"])) == "malformed"
 
 
-@pytest.mark.parametrize("size", range(4, 76))
-@pytest.mark.parametrize("encoding", ["", "application/cdr", TOLD["TwistStamped"]])
+@each("size", range(4, 76))
+@each("encoding", ["", "application/cdr", TOLD["TwistStamped"]])
 def test_a_native_stamped_twist_that_is_cut_is_never_a_stamped_twist(
     encoding: str, size: int
 ) -> None:
@@ -416,7 +417,7 @@ def test_a_native_number_that_is_not_finite_is_refused(header: bytes, bad: float
         assert refusal(arrival(payload, key="wheel_cmd/app")) == "not_finite"
 
 
-@pytest.mark.parametrize("size", [n for n in range(4, 68) if not 52 <= n <= 55])
+@each("size", [n for n in range(4, 68) if not 52 <= n <= 55])
 def test_no_native_twist_has_another_length(size: int) -> None:
     payload = (native_twist() + bytes(68))[:size]
     assert refusal(arrival(payload)) == ("malformed" if size < 52 else "wrong_shape")

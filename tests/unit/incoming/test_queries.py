@@ -23,6 +23,7 @@ from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
 from acsard.ros.transports import PARAMETER_SERVICES, TRIGGERS
 from acsard.values import ROLES, Answer, Outputs, Plain, Pose, Request
+from tests.each import each
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
@@ -198,8 +199,8 @@ def test_a_key_that_is_not_in_the_table_has_no_answer() -> None:
     assert answers(query("nonsense")) == []
 
 
-@pytest.mark.parametrize("key", [t.key for t in TOPICS if t.direction != "in" and t.key != "alive"])
-@pytest.mark.parametrize("fmt", ["xml", "JSON", "CDR", " json"])
+@each("key", [t.key for t in TOPICS if t.direction != "in" and t.key != "alive"])
+@each("fmt", ["xml", "JSON", "CDR", " json"])
 def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str) -> None:
     reply = answer(query(key, fmt=fmt))
     assert not reply.ok
@@ -279,8 +280,8 @@ def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -
     assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings)
 
 
-@pytest.mark.parametrize("asked", WILDCARDS)
-@pytest.mark.parametrize("verb", SERVICES)
+@each("asked", WILDCARDS)
+@each("verb", SERVICES)
 def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
     made = queries()
     assert made.serve(query(f"srv/{verb}", asked, payload=payload_for(verb)), nothing, None) == []

@@ -17,6 +17,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.values import Twist, WheelSpeeds
+from tests.each import each
 from tests.vectors.lines import (
     ACCEPTED,
     REFUSED,
@@ -164,7 +165,7 @@ def test_the_wheels_may_come_in_any_order(codec: Codec, order: str) -> None:
     assert codec.decode(b",".join(token[letter] for letter in order)) == SEED_SPEEDS
 
 
-@pytest.mark.parametrize(
+@each(
     "letters",
     ["".join(w) for w in itertools.product("abcd", repeat=4) if len(set(w)) < 4],
 )

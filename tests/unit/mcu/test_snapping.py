@@ -66,6 +66,7 @@ def known(counts: int = 400) -> Snapping:
     return snapping
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("counts", [16, 20, 40, 96, 400, 1000, 4000])
 def test_the_counts_are_found_within_seconds_and_no_rounding_is_left(counts: int) -> None:
     snapping = Snapping()
@@ -136,6 +137,7 @@ def test_a_firmware_that_divides_by_the_time_it_measured_shows_no_counts() -> No
     assert snapping.counts == (0,) * 4
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("share", [0.995, 1.0002, 1.005])
 def test_an_oscillator_that_is_off_makes_no_other_angle(share: float) -> None:
     snapping, rows = Snapping(), speeds(400)
@@ -145,6 +147,7 @@ def test_an_oscillator_that_is_off_makes_no_other_angle(share: float) -> None:
     assert total(look(snapping, rows, PERIOD * share)) == pytest.approx(turned, abs=1e-9)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("period", [0.005, 0.02, 0.1, 1 / 60])
 def test_any_round_period_will_do(period: float) -> None:
     wheels = drive()[:: max(1, round(period / PERIOD))]

@@ -52,6 +52,7 @@ from acsard.messages.schema import (
     Vector3,
 )
 from acsard.ros.parameters import ListRequest, Names, SetRequest
+from tests.each import each
 
 LITTLE, BIG = b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"
 
@@ -193,8 +194,8 @@ def test_a_message_has_this_size(message: Struct, size: int) -> None:
     assert len(encoded(message)) == size
 
 
-@pytest.mark.parametrize("frame", range(10))
-@pytest.mark.parametrize("child", range(10))
+@each("frame", range(10))
+@each("child", range(10))
 def test_the_size_of_odometry_follows_from_its_two_names(frame: int, child: int) -> None:
     names = -(-(8 + 4 + frame + 1) // 4) * 4 + 4 + child + 1
     size = 4 + -(-names // 8) * 8 + 680
@@ -357,8 +358,8 @@ def test_a_number_after_a_text_of_any_length_stands_at_a_multiple_of_its_size(
         assert encoded(message) == payload.replace(b"\xaa", b"\0")
 
 
-@pytest.mark.parametrize("length", range(10))
-@pytest.mark.parametrize("count", range(3))
+@each("length", range(10))
+@each("count", range(3))
 def test_a_sequence_after_a_text_of_any_length_is_padded_only_before_its_items(
     length: int, count: int
 ) -> None:
@@ -618,7 +619,7 @@ def test_a_second_has_no_more_nanoseconds_than_there_are() -> None:
                 Cdr(Time).decode(stamp(bad, order))
 
 
-@pytest.mark.parametrize("value", range(256))
+@each("value", range(256))
 def test_a_boolean_is_zero_or_one(value: int) -> None:
     payload = LITTLE + bytes([value, 0, 0, 0]) + struct.pack("<I1s", 1, b"\0")
     if value < 2:
@@ -678,9 +679,9 @@ NO_ITEMS: list[tuple[Message, int]] = [
 """Empty messages, and where in their body the length of a sequence stands."""
 
 
-@pytest.mark.parametrize(("empty", "at"), NO_ITEMS, ids=lambda value: type(value).__name__)
-@pytest.mark.parametrize("length", [2**32 - 1, 2**31, 2**29, 2**20, 1])
-@pytest.mark.parametrize("surplus", [0, 3])
+@each(("empty", "at"), NO_ITEMS)
+@each("length", [2**32 - 1, 2**31, 2**29, 2**20, 1])
+@each("surplus", [0, 3])
 def test_a_sequence_longer_than_what_there_is_is_refused_before_it_is_made(
     empty: Message, at: int, length: int, surplus: int
 ) -> None:

@@ -19,6 +19,7 @@ from acsard.messages.encodings import (
     encoding_name,
 )
 from acsard.messages.schema import Info, RobotState, Time, Twist, Vector3
+from tests.each import each
 
 TWIST = Twist(Vector3(0.5), Vector3(z=0.2))
 AS_CDR = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0.2)
@@ -106,8 +107,8 @@ def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload:
     assert detect(encoding, payload) == form
 
 
-@pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "text/plain", "zenoh/string", "x"])
-@pytest.mark.parametrize(
+@each("encoding", ["", "zenoh/bytes", "text/plain", "zenoh/string", "x"])
+@each(
     ("payload", "form"),
     [
         (b"{}", "json"),

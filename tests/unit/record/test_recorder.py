@@ -150,6 +150,7 @@ def happen_fault(world: World) -> None:
         world.hold(0.5, seconds=3.0)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     "happen",
     [happen_stop, happen_fault]

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.sim.fake_mcu import MS, RESET_NS, WATCHDOG_NS, FakeMcu
 from acsard.sim.faults import FAULTS
+from tests.each import each
 
 LINE = b"ap12.50,bn08.75,cp15.00,dn10.25\r\n"
 SPEEDS = [12.5, -8.75, 15.0, -10.25]
@@ -222,7 +223,7 @@ INVALID = [
 ]
 
 
-@pytest.mark.parametrize("line", INVALID)
+@each("line", INVALID)
 def test_a_line_that_is_not_whole_and_valid_is_heard_and_nothing_else(line: bytes) -> None:
     mcu = told(line)
     assert mcu.vehicle.set_points == STILL

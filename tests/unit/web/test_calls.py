@@ -91,10 +91,11 @@ def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_hav
 
 def test_a_stop_ends_a_check_for_which_the_daemon_has_no_port() -> None:
     async def story() -> None:
-        calls = Calls(robots(None), lambda: "the check of phone is stopped")
+        calls = Calls(robots(None), lambda: "the check of phone is being ended")
         told = await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
-        assert told.success
-        assert told.message.startswith("the check of phone is stopped; ")
+        # No daemon has confirmed anything.
+        assert not told.success
+        assert told.message.startswith("the check of phone is being ended; ")
         assert not (await calls.call(MAINTAINER, "clear", {})).success
 
     asyncio.run(story())

@@ -1,0 +1,41 @@
+"""One test for many sets runs all of them, and says which one failed."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+from tests.each import each
+
+
+def test_all_combinations_are_run_and_fixtures_are_left_to_pytest() -> None:
+    seen: list[tuple[int, str, int]] = []
+
+    @each("first", [1, 2])
+    @each(("second", "third"), [("a", 3), ("b", 4)])
+    def test(fixture: list[tuple[int, str, int]], first: int, second: str, third: int) -> None:
+        fixture.append((first, second, third))
+
+    assert list(inspect.signature(test).parameters) == ["fixture"]
+    test(fixture=seen)
+    assert seen == [(1, "a", 3), (1, "b", 4), (2, "a", 3), (2, "b", 4)]
+
+
+def test_what_fails_says_with_which_set() -> None:
+    @each("value", range(5))
+    def test(value: int) -> None:
+        assert value < 3
+
+    with pytest.raises(AssertionError) as caught:
+        test()
+    assert caught.value.__notes__ == ["with {'value': 3}"]
+
+
+def test_no_sets_at_all_fail() -> None:
+    @each("value", [])
+    def test(value: int) -> None:
+        """Never run."""
+
+    with pytest.raises(AssertionError, match="nothing to test"):
+        test()
