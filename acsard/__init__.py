@@ -17,7 +17,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
 
     values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
     config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
-    mcu/           P  the serial line: frames, the check, link (is the MCU there?), the port
+    mcu/           P  the serial line: codec, the check, link (is the MCU there?), the port
     drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is
                       followed?), neutral (who may drive?), freshness (what came too late), words
                       (all that in sentences), limits, modes (the table), tally (the log)

@@ -1,6 +1,6 @@
 """The last look at every outgoing line, with code of its own.
 
-Shares nothing with `limits.py`, `frames.py` or `check.py`: it reads the finished bytes as the MCU
+Shares nothing with `limits.py`, `codec.py` or `check.py`: it reads the finished bytes as the MCU
 will, and lets them pass only if they are finite, within the hard limit, with a right check if they
 have one, and no faster than the last line sent unless a fresh command, a live link and mode DRIVING
 agreed (invariant 2). Without a link only zero passes. Anything else becomes the stop line, and the

@@ -7,7 +7,7 @@ from msgspec import Struct
 from acsard.bench.matching import Chunk, Fed, commands_to_lines, lines_of, lines_to_samples
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.values import Instant
 
 

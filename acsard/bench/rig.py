@@ -37,7 +37,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.host.exits import Exit, ExitError
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.messages.topics import full_key

@@ -18,8 +18,8 @@ from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.mcu.codec import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.contract import WATCHDOG_S
-from acsard.mcu.frames import LETTERS, Codec, FrameError, Motors
 from acsard.mcu.hearing import Heard
 from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, WheelSpeeds

@@ -10,7 +10,7 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.limits import GLANCE_S, SPEED
 from acsard.checkup.motion import ZERO, moving
 from acsard.mcu.check import seal
-from acsard.mcu.frames import LETTERS
+from acsard.mcu.codec import LETTERS
 
 REPEATS = 3
 """How often each broken line goes out: a motor needs a moment to show that it took it."""

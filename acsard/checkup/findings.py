@@ -8,7 +8,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.config.settings import McuConfig
-from acsard.mcu.frames import LETTERS
+from acsard.mcu.codec import LETTERS
 from acsard.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]

@@ -13,7 +13,7 @@ from msgspec import Struct
 from acsard.checkup.limits import GLANCE_S, MOVES, SPEED
 from acsard.config.wire_time import FIELD
 from acsard.mcu.check import Reading
-from acsard.mcu.frames import Motors
+from acsard.mcu.codec import Motors
 
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 

@@ -17,7 +17,7 @@ from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.motion import ZERO, Reply
 from acsard.config.settings import McuConfig
-from acsard.mcu.frames import Motors
+from acsard.mcu.codec import Motors
 from acsard.mcu.session import IDENTITY
 from acsard.values import AcsardError
 

@@ -15,7 +15,7 @@ from acsard.checkup.findings import motor_name
 from acsard.checkup.motion import ZERO, moving
 from acsard.checkup.outside import Operator
 from acsard.checkup.wheels import OFF, TOLERANCE, Channel
-from acsard.mcu.frames import LETTERS, Motors
+from acsard.mcu.codec import LETTERS, Motors
 
 NEAR = 0.8
 """Of what is off: a first look is no surer."""

@@ -22,7 +22,7 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import Reply
 from acsard.checkup.turning import run_up
 from acsard.config.wire_time import FIELD
-from acsard.mcu.frames import LETTERS, Motors
+from acsard.mcu.codec import LETTERS, Motors
 
 FED = 0.75
 """Of the full speed, over all of that time: a watchdog that is right leaves less."""

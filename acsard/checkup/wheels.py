@@ -15,7 +15,7 @@ from acsard.checkup.findings import Finding, motor_name, wheel_of, words
 from acsard.checkup.limits import PROBE_MOVES, SPEED
 from acsard.checkup.motion import moving
 from acsard.config.settings import McuConfig
-from acsard.mcu.frames import LETTERS, Motors
+from acsard.mcu.codec import LETTERS, Motors
 from acsard.values import WHEELS
 
 TOLERANCE = 0.25

@@ -133,7 +133,7 @@ def show_one(args: argparse.Namespace) -> int:
     """Tell its story."""
     import msgspec
 
-    from acsard.record.again import steps
+    from acsard.record.replayed import steps
     from acsard.record.story import Story
 
     recording = _recording(args)
@@ -151,7 +151,7 @@ def show_one(args: argparse.Namespace) -> int:
 
 def replay_one(args: argparse.Namespace) -> int:
     """Live it again; 1 where it does not come out the same."""
-    from acsard.record.again import differs, live, otherwise, verdict
+    from acsard.record.replayed import differs, live, otherwise, verdict
 
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]

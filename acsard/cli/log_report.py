@@ -111,7 +111,7 @@ def _drawn(
     tell: Callable[[int], None],
 ) -> tuple[str, list[str]]:
     """The file, and what is to be known of it; `tell` hears the wall-clock time it has come to."""
-    from acsard.record.again import EVERY, Onlooker, verdict
+    from acsard.record.replayed import EVERY, Onlooker, verdict
     from acsard.report.account import Origin, notes
     from acsard.report.course import Course
     from acsard.report.page import page

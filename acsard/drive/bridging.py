@@ -13,8 +13,8 @@ import math
 from msgspec import Struct
 
 from acsard.drive.gyro import Turn
+from acsard.mcu.codec import Motors
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.frames import Motors
 from acsard.mcu.lattice import on
 from acsard.values import Pose, WheelSpeeds
 

@@ -23,12 +23,12 @@ from acsard.drive.bridging import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.gap_variance import Gaps
 from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.lying_wheels.witness import Witness
+from acsard.drive.lying_wheels.verdict import Witness
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
+from acsard.mcu.codec import Motors
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.frames import Motors
 from acsard.values import (
     REST,
     STILL,

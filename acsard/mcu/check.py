@@ -5,7 +5,7 @@
 
 `#` and the sequence, two digits; then the letters of a command's requests, or the sample fields of
 a reply that was asked for them; `*` and the CRC-16/XMODEM of everything before it. All digits are
-hexadecimal and upper-case: a line has one right form. The plain part is `frames.py`'s.
+hexadecimal and upper-case: a line has one right form. The plain part is `codec.py`'s.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import re
 
 from msgspec import Struct
 
-from acsard.mcu.frames import FrameError
+from acsard.mcu.codec import FrameError
 
 SEQUENCES = 256
 """The sequence counts modulo this."""

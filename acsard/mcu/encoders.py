@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.config.wire_time import FIELD
 from acsard.mcu.check import Reading
-from acsard.mcu.frames import Motors
+from acsard.mcu.codec import Motors
 from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S
 

@@ -19,8 +19,8 @@ from acsard.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.mcu.check import Reading
 from acsard.mcu.clock_of_answers import Prompts
 from acsard.mcu.clock_of_reports import Slots
+from acsard.mcu.codec import Codec, Motors
 from acsard.mcu.encoders import Encoders, Turned
-from acsard.mcu.frames import Codec, Motors
 from acsard.mcu.habit import Habit
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.mcu.frames import TOKENS
+from acsard.mcu.codec import TOKENS
 from acsard.values import NS_PER_S
 
 PATIENCE_NS = 3 * NS_PER_S

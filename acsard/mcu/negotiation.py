@@ -20,8 +20,8 @@ from typing import Literal
 from acsard.config.settings import McuConfig
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.mcu.codec import FrameError
 from acsard.mcu.contract import WATCHDOG_S
-from acsard.mcu.frames import FrameError
 from acsard.mcu.throttle import Throttle
 from acsard.values import NS_PER_S
 

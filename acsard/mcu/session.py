@@ -2,7 +2,7 @@
 
 Takes what the port received, gives feedback with the time each line was complete, and puts the
 lines that leave into the form in force. Decides nothing about motion itself: whether the link may
-carry any says `link.py`, what a good line is `negotiation.py`; while it asks, the link is not up.
+carry any says `link_state.py`, what a good line is `negotiation.py`; while it asks, it is not up.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections import Counter
 
 from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu.check import Reading, unseal
+from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.feedback import Feedback, Timeline
-from acsard.mcu.frames import Codec, FrameError
 from acsard.mcu.hearing import Hearing
 from acsard.mcu.lines import LineReader
-from acsard.mcu.link import Link
-from acsard.mcu.link import State as LinkState
+from acsard.mcu.link_state import Link
+from acsard.mcu.link_state import State as LinkState
 from acsard.mcu.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
 from acsard.mcu.snapping import Snapping
 from acsard.mcu.throttle import Throttle

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
+from acsard.mcu.codec import Motors
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.frames import Motors
 from acsard.mcu.wheel_counter import WheelCounter
 
 LOOK = 50

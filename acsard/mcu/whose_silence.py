@@ -4,8 +4,8 @@ heard it. For the person who has to find out why: the link is judged by the sile
 
 from __future__ import annotations
 
-from acsard.mcu.link import WORDS
-from acsard.mcu.link import State as LinkState
+from acsard.mcu.link_state import WORDS
+from acsard.mcu.link_state import State as LinkState
 from acsard.values import NS_PER_S
 
 SHARE = 0.5

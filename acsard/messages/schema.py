@@ -12,7 +12,7 @@ from typing import Annotated, get_args
 from msgspec import Meta, Struct
 
 from acsard.drive.modes import Mode
-from acsard.mcu.link import State
+from acsard.mcu.link_state import State
 from acsard.messages.topics import Direction
 from acsard.values import NS_PER_S, EventName, GyroDoes, Level, Plain
 

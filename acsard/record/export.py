@@ -12,11 +12,11 @@ from acsard import __version__
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.record import bag, table
-from acsard.record.again import EVERY, Course, Progress, quietly
 from acsard.record.beside import beside, synced
 from acsard.record.file import About, Recording
 from acsard.record.published import Published, Publisher
 from acsard.record.replay import lived
+from acsard.record.replayed import EVERY, Course, Progress, quietly
 from acsard.record.steps import Step
 from acsard.robot import Robot
 from acsard.ros.channels import ENCODING, SCHEMA_ENCODING, Channel

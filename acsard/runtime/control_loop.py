@@ -14,7 +14,7 @@ from acsard.config.wire_time import wire_ns
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.asker import asker
-from acsard.incoming.bus import NOTHING, Bus
+from acsard.incoming.bus import NOTHING, Bus, BusInput
 from acsard.incoming.commands import Receiver, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
@@ -190,15 +190,7 @@ class ControlLoop:
         commands: list[Command] = []
         refusals: list[Refusal] = []
         requests: list[Request] = []
-        if got.overrun:
-            self.robot.counters["bus_overrun"] += got.overrun
-        if got.dropped:
-            self.robot.counters["bus_dropped"] += got.dropped
-        if got.routers is not None:
-            self._routers.hear(got.routers, self.robot.counters, self._others)
-        if got.stuck:
-            self.robot.counters["bus_stuck"] += 1
-            self._others.append(BUS_STUCK)
+        self._note(got)
         for arrival in got.arrivals:
             if arrival.key == DOOR:
                 ends_ns = self._door.hear(arrival, self.robot.counters)
@@ -233,6 +225,18 @@ class ControlLoop:
             if served is not None:
                 requests.append(served)
         return tuple(commands), tuple(refusals), tuple(requests)
+
+    def _note(self, got: BusInput) -> None:
+        """What is the matter with the bus itself."""
+        if got.overrun:
+            self.robot.counters["bus_overrun"] += got.overrun
+        if got.dropped:
+            self.robot.counters["bus_dropped"] += got.dropped
+        if got.routers is not None:
+            self._routers.hear(got.routers, self.robot.counters, self._others)
+        if got.stuck:
+            self.robot.counters["bus_stuck"] += 1
+            self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
         """Answer a query, or have the robot decide: then what it is asked for."""

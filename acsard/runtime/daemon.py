@@ -24,7 +24,7 @@ from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.messages.schema import Info
 from acsard.messages.topics import offered, published
 from acsard.record.recorder import Recorder
@@ -93,10 +93,8 @@ async def _run(
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
         events: list[Event] = []
-        recorder, start = None, clock.now()
-        if config.record.directory:
-            recorder = Recorder(config, events.append, start.wall_ns)
-            stack.callback(recorder.close)
+        start = clock.now()
+        recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
         path = config.mcu.port if simulated is None else simulated.path
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
@@ -129,12 +127,21 @@ async def _run(
         manager.ready()
         departure.started()
         helpers = [port.keep_open(), _repeat_latched(bus, control)]
-        if door is not None and config.bus.outside:
-            helpers.append(_keep(door, events.append, DOOR))
-        if page is not None:
-            helpers.append(_keep(page, events.append, PAGE))
+        kept = ((door if config.bus.outside else None, DOOR), (page, PAGE))
+        helpers += [_keep(words, events.append, kind) for words, kind in kept if words is not None]
         async with _beside(helpers):
             await _control(config, control, departure, wake, manager)
+
+
+def _recorder(
+    config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
+) -> Recorder | None:
+    """The black box, where one is wanted; it closes with the stack."""
+    if not config.record.directory:
+        return None
+    recorder = Recorder(config, log, wall_ns)
+    stack.callback(recorder.close)
+    return recorder
 
 
 def _bus(config: Config, wake: Wakeup) -> ZenohBus:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, get_args
 
 from acsard.drive.modes import Mode
-from acsard.mcu.link import State
+from acsard.mcu.link_state import State
 from acsard.messages.schema import RobotState
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

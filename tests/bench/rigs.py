@@ -29,6 +29,15 @@ DRAINING = (*POLLED, "--drain")
 """The same with its obvious mend."""
 
 
+def trees() -> dict[str, Sequence[str]]:
+    """acsard, and beside it the acsard of another tree where $ACSARD_BESIDE names one."""
+    other = os.environ.get("ACSARD_BESIDE")
+    if other is None:
+        return {"acsard": ACSARD}
+    before = ("env", f"PYTHONPATH={other}", sys.executable, "-P", *ACSARD[1:])
+    return {"acsard": ACSARD, "another tree": before}
+
+
 def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
     """As `acsard bench` measures with."""
     wanted = Config(control=ControlConfig(rate=rate), mcu=McuConfig(reply_period=reply_period))

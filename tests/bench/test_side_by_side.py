@@ -2,6 +2,8 @@
 
 pytest -s -m bench tests/bench/test_side_by_side.py
 
+With ACSARD_BESIDE=DIRECTORY the acsard of another checkout takes its turns as well.
+
 Asserted are ratios and counts; the figures themselves are printed. The polled program
 (`polled.py`) waits for its 100 Hz tick, half a period on average, and once a reply has been late it
 is a line behind for ever; draining mends that, and is shown as well. A busy machine adds the same
@@ -26,6 +28,7 @@ from tests.bench.rigs import (
     driven,
     rig,
     share,
+    trees,
     waits_us,
 )
 
@@ -58,7 +61,7 @@ def ratio(what: str, ours: list[list[float]], theirs: list[list[float]]) -> floa
 
 
 def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
-    ways = {"acsard": ACSARD, "polled": POLLED, "polled, draining": DRAINING}
+    ways = trees() | {"polled": POLLED, "polled, draining": DRAINING}
     waits: Turns = {name: [] for name in ways}
     delays: Turns = {name: [] for name in ways}
     for number in range(ROUNDS):
@@ -82,7 +85,7 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
 
 
 def test_what_a_commanded_robot_costs_beside_polled() -> None:
-    ways = {"acsard": ACSARD, "by events": BY_EVENTS, "polled": POLLED}
+    ways = trees() | {"by events": BY_EVENTS, "polled": POLLED}
     costs: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(ROUNDS):
         for name, words in ways.items():

@@ -23,7 +23,7 @@ import pytest
 from acsard.config.settings import Config, DriveConfig, OdometryConfig, SimConfig, WheelMap
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.path import arc
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.mcu.lines import LineReader
 from acsard.messages.encodings import encode
 from acsard.runtime.period import NO_PERIOD, Period

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.config.settings import WheelMap
-from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.values import WheelSpeeds
 from tests.firmware.board import checked, read_identity, read_reply, speeds_line

@@ -38,7 +38,7 @@ CORE = (
     "acsard/guard.py",
     "acsard/mcu/check.py",
     "acsard/mcu/encoders.py",
-    "acsard/mcu/frames.py",
+    "acsard/mcu/codec.py",
     "acsard/mcu/negotiation.py",
     "acsard/mcu/promptest.py",
     "acsard/robot.py",

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 EQUIVALENT: dict[str, str] = {
-    "acsard/mcu/frames.py Codec.decode: 'index, sign = self._by_letter[letter[0]]' -> 'index, sign = self._by_letter[letter[-1]]'": "the first of one byte is its last",
+    "acsard/mcu/codec.py Codec.decode: 'index, sign = self._by_letter[letter[0]]' -> 'index, sign = self._by_letter[letter[-1]]'": "the first of one byte is its last",
     "acsard/drive/sanity.py Sanity._objection: 'if abs(now - then) > most:' -> 'if abs(then - now) > most:'": "the size of a difference",
     "acsard/drive/sanity.py _Wheel.signs: 'apart = abs(speed - expected) > SLACK + 0.3 * most' -> 'apart = abs(expected - speed) > SLACK + 0.3 * most'": "the size of a difference",
     "acsard/drive/limits.py _approach: 'most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))' -> 'most = min(most, abs(slope) + step, _flattenable(abs(speed - target), step, dt))'": "the size of a difference",
@@ -22,11 +22,11 @@ EQUIVALENT: dict[str, str] = {
     "acsard/robot.py Robot.__init__: 'self._before = (self._limiter.state, 0)' -> 'self._before = (self._limiter.state, -1)'": "no robot starts with a link, and without one each step sets it",
     "acsard/robot.py Robot._drive: \"if self.session.link != 'up' or since > UNHEARD_S:\" -> 'if since > UNHEARD_S:'": "without a link `_fold` has cut the limiter, and rest coasts to rest",
     "acsard/drive/sanity.py _Wheel.forget: 'self.seen = 0.0' -> 'self.seen = -1.0'": "one line more of evidence, for a wheel first seen at just this speed",
-    "acsard/mcu/frames.py Codec.decode: \"wheel[index] = speed * sign if direction == b'p' else -speed * sign\" -> \"wheel[index] = speed / sign if direction == b'p' else -speed * sign\"": "the sign is 1 or -1",
+    "acsard/mcu/codec.py Codec.decode: \"wheel[index] = speed * sign if direction == b'p' else -speed * sign\" -> \"wheel[index] = speed / sign if direction == b'p' else -speed * sign\"": "the sign is 1 or -1",
     "acsard/drive/limits.py _approach: 'most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration' -> 'most = axis.acceleration if abs(target) >= abs(speed) else axis.deceleration'": "as fast as its target it is there: the change is none",
     "acsard/drive/sanity.py Sanity.forget: 'self._last, self._since, self._impossible = (None, 0.0, 0)' -> 'self._last, self._since, self._impossible = (None, 1.0, 0)'": "counts only against a last line, and there is none",
     "acsard/guard.py Guard._commanded: 'return abs(outputs.now.mono_ns - arrived) <= timeout' -> 'return abs(arrived - outputs.now.mono_ns) <= timeout'": "the size of a difference",
-    "acsard/mcu/frames.py Codec.decode: \"direction == b'p' else -speed * sign\" -> \"direction == b'p' else -speed / sign\"": "the sign is 1 or -1",
+    "acsard/mcu/codec.py Codec.decode: \"direction == b'p' else -speed * sign\" -> \"direction == b'p' else -speed / sign\"": "the sign is 1 or -1",
     "acsard/drive/limits.py _approach: 'slope = slope if slope * wanted > 0 else 0.0' -> 'slope = slope if slope * wanted >= 0 else 0.0'": "where the product is 0 the slope is",
     "acsard/drive/sanity.py _Wheel.signs: 'expected < 0 and (abs(speed) > 0.3 * size), fast and (not sl' -> 'expected < 0 and (abs(speed) >= 0.3 * size), fast and (not sl'": "the model nears its command and never quite meets it: nor does a line this bound",
     "acsard/drive/neutral.py Sender.__init__: 'self.came_ns = 0' -> 'pass'": "set by the first command, before it is read",

@@ -13,10 +13,10 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config
 from acsard.messages.schema import DiagnosticArray, Events, Message, RobotState
-from acsard.record.again import Course
 from acsard.record.file import Recording
 from acsard.record.published import MEASURED, Publisher
 from acsard.record.replay import lived
+from acsard.record.replayed import Course
 from acsard.ros.channels import LOG
 from acsard.ros.shapes import log
 from tests.scenarios.taped import Tape, drive_through_faults, happenings

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
 from acsard.mcu.check import unseal
-from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.messages.schema import DiagnosticArray
 from acsard.sim import protocol

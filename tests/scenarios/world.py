@@ -16,7 +16,7 @@ from acsard.incoming.bus import BusInput
 from acsard.incoming.commands import Arrival
 from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Query, Reply
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.mcu.gate import Gate, Offered
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply

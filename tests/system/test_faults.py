@@ -476,12 +476,13 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
             begun, ended = time.monotonic(), time.monotonic() + length
             before = states.find(lambda _: True, 5.0, "a state", after=begun).value
             after = states.find(lambda _: True, length + 5, "a later one", after=ended).value
-            ended, waited = time.monotonic(), kept_waiting(daemon.pid)
+            # The peer's times are its own: it has no core either.
+            ended, waited = time.monotonic(), kept_waiting(daemon.pid) + kept_waiting(peer.pid)
             driver.signal(signal.SIGKILL)
             driver.ended(5.0)
             sent = last_put(driver)
             peer.awaits(ZERO_TEXT, after=sent)
-            waited = kept_waiting(daemon.pid) - waited
+            waited = kept_waiting(daemon.pid) + kept_waiting(peer.pid) - waited
         puts = [float(line.split()[1]) for line in driver.out[:-1]]
         silent = max(b - a for a, b in itertools.pairwise([begun, *puts, ended]) if begun < b)
         lines = peer.since(begun, ended)

@@ -49,9 +49,9 @@ def replayed(where: Path, path: Path) -> int:
 def last_s(where: Path, path: Path) -> float:
     """When the last step that can be read was, wall clock."""
     code = (
-        "import sys, pathlib; from acsard.record import again, file;"
+        "import sys, pathlib; from acsard.record import replayed, file;"
         "recording = file.Recording(pathlib.Path(sys.argv[1]));"
-        "print(max(step.inputs.now.wall_ns for step in again.steps(recording)))"
+        "print(max(step.inputs.now.wall_ns for step in replayed.steps(recording)))"
     )
     return int(finish([sys.executable, "-c", code, str(path)], where).out) / 1e9
 

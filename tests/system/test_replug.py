@@ -56,11 +56,20 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
             commander.wish = ZERO
             until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "the zero was heard")
             assert set(peer.session.said()[1:]) == {ZERO_LINE}
-            commander.wish = twist(0.5)
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "driving again")
+            zeros = 1
+
+            def drives() -> bool:
+                """It waits for another zero where the machine stood still for a second."""
+                nonlocal zeros
+                before = commander.wish
+                commander.wish = ZERO if "neutral first" in bus.state()["reason"] else twist(0.5)
+                zeros += commander.wish == ZERO != before
+                return peer.lines[-1].line.startswith(b"ap10.00")
+
+            until(drives, 5.0, "driving again")
             ramp = [wheels(line)[0] for line in peer.session.said()[1:]]
             # Unless the kernel's thread that carries bytes through a pty had no core for so long.
-            if not any(event["text"] for event in daemon.events("link_stale")):
+            if zeros == 1 and not any(event["text"] for event in daemon.events("link_stale")):
                 assert ramp == sorted(ramp), "it grew from zero by its ramp"
             assert bus.state()["x"] > moved, "odometry went on from where it was"
 

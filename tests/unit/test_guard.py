@@ -22,7 +22,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
 from acsard.guard import Guard
 from acsard.mcu.check import seal
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.robot import Robot
 from acsard.values import (
     REST,

@@ -19,7 +19,7 @@ from acsard.config.settings import (
     Source,
 )
 from acsard.drive.words import waiting
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,

@@ -7,7 +7,7 @@ import pytest
 
 from acsard import values
 from acsard.config.parsing import ConfigError
-from acsard.mcu.frames import FrameError
+from acsard.mcu.codec import FrameError
 from acsard.messages.encodings import DecodeError
 from acsard.values import WHEELS, AcsardError, WheelSpeeds
 

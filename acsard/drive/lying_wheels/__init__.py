@@ -1,1 +1,1 @@
-"""Wheels that lie or slip, found line by line and left out of the pose: start at `witness.py`."""
+"""Wheels that lie or slip, found line by line and left out of the pose: start at `verdict.py`."""

@@ -8,7 +8,7 @@ from acsard.bench.far_end import NumberedMcu
 from acsard.bench.matching import Fed, lines_of, staircase
 from acsard.bench.record import Record, Sample, Seen, Sent, command_waits, feedback_fates
 from acsard.config.settings import Config, McuConfig, WheelMap
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.values import Instant, WheelSpeeds
 
 MS = 1_000_000

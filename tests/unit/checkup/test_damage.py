@@ -8,7 +8,7 @@ import pytest
 
 from acsard.checkup import damage, dialect
 from acsard.config.settings import WheelMap
-from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.codec import Codec, FrameError
 from acsard.sim import protocol
 from tests.unit.checkup.robots import Robot
 

@@ -14,7 +14,7 @@ from acsard.checkup.board import FAREWELL
 from acsard.checkup.findings import Finding, WireLostError
 from acsard.checkup.limits import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.sim import protocol
 from acsard.values import WHEELS
 from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured

@@ -7,7 +7,7 @@ from msgspec import structs
 
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
 from acsard.config.settings import McuConfig, WheelMap
-from acsard.mcu.frames import Motors
+from acsard.mcu.codec import Motors
 from acsard.values import WHEELS
 
 MCU = McuConfig()

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from acsard.cli import main
-from acsard.record.again import steps
 from acsard.record.file import Recording
+from acsard.record.replayed import steps
 from acsard.record.steps import MICRO
 from tests.unit.report.seen import column
 

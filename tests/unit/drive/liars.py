@@ -1,5 +1,5 @@
 """Drives as four encoders tell them, of which one may begin to lie: what judges
-`drive/lying_wheels/witness.py`.
+`drive/lying_wheels/verdict.py`.
 
 Each wheel has a motor with its own lag, a tyre and load of its own, and stands anywhere within a
 count of its encoder; a line says counts over its period in two decimals. Written in numpy from that

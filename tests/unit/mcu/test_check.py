@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.mcu.check import Checked, Reading, seal, unseal
-from acsard.mcu.frames import FrameError
+from acsard.mcu.codec import FrameError
 from acsard.mcu.lines import MAX_LINE
 from tests.vectors.lines import SEED_LINE
 

@@ -1,6 +1,6 @@
 """What damage on the wire gets past the plain line's parser, and what of it past the slew check.
 
-Beside `test_frames.py`, which proves that the parser accepts exactly the well-formed lines: here
+Beside `test_codec.py`, which proves that the parser accepts exactly the well-formed lines: here
 the damage is counted that makes one well-formed line of another.
 
     pytest -m soak -s tests/unit/mcu/test_damage.py
@@ -16,8 +16,8 @@ import pytest
 
 from acsard.config.settings import FeedbackConfig, WheelMap
 from acsard.drive.sanity import Sanity
+from acsard.mcu.codec import Codec, FrameError, Motors
 from acsard.mcu.feedback import Feedback
-from acsard.mcu.frames import Codec, FrameError, Motors
 from acsard.mcu.lines import LineReader
 from acsard.mcu.snapping import Snapping
 from acsard.values import STILL, Instant, WheelSpeeds

@@ -10,8 +10,8 @@ import pytest
 
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.mcu.check import Reading
+from acsard.mcu.codec import Codec
 from acsard.mcu.feedback import Feedback, Timeline
-from acsard.mcu.frames import Codec
 from acsard.values import Instant, WheelSpeeds
 
 MS = 1_000_000

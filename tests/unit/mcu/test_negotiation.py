@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from acsard.config.settings import McuConfig
 from acsard.mcu.check import Checked, Reading
-from acsard.mcu.frames import FrameError
+from acsard.mcu.codec import FrameError
 from acsard.mcu.negotiation import (
     BLIND_PERIOD_NS,
     FEW_SAMPLES,

@@ -13,7 +13,7 @@ from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import wire_ns
 from acsard.mcu.check import seal
 from acsard.mcu.feedback import APART_NS, Feedback
-from acsard.mcu.link import BAD_LINES, GOOD_LINES
+from acsard.mcu.link_state import BAD_LINES, GOOD_LINES
 from acsard.mcu.session import LONG_GAP_NS, McuSession
 from acsard.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.mcu.link import WORDS
+from acsard.mcu.link_state import WORDS
 from acsard.mcu.whose_silence import Lateness
 
 MS = 1_000_000

@@ -16,7 +16,7 @@ from acsard.drive.modes import TABLE as MODES
 from acsard.incoming.commands import Arrival, Receiver
 from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import interfaces, topic_table
-from acsard.mcu.link import TABLE as LINKS
+from acsard.mcu.link_state import TABLE as LINKS
 from acsard.messages.encodings import DecodeError, encode
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.report import Report

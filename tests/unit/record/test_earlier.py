@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from acsard.record import earlier
-from acsard.record.again import live, steps
 from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording, rewrite
+from acsard.record.replayed import live, steps
 from acsard.record.steps import Step
 from tests.vectors import FORMAT_1, FORMAT_1_SUM
 

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
-from acsard.record.again import config_of, live, steps
 from acsard.record.file import MODE, Closing, Recording, closing, rewrite
+from acsard.record.replayed import config_of, live, steps
 from acsard.record.steps import status_of
 from acsard.values import Instant
 from tests.scenarios.taped import BATCH, Tape, chunks

@@ -14,11 +14,11 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config, RecordConfig
 from acsard.record import recorder as module
-from acsard.record.again import live, steps
 from acsard.record.directory import KEPT, listed
 from acsard.record.export import export
 from acsard.record.file import Recording
 from acsard.record.recorder import MOST, Recorder
+from acsard.record.replayed import live, steps
 from acsard.values import Event
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World

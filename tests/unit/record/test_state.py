@@ -11,9 +11,9 @@ import pytest
 
 from acsard.config.settings import Config
 from acsard.host.errors import RecordingError
-from acsard.record.again import Onlooker, live
 from acsard.record.export import export
 from acsard.record.file import Recording
+from acsard.record.replayed import Onlooker, live
 from acsard.record.state import StateError, freeze, thaw
 from acsard.robot import Robot
 from acsard.values import Instant

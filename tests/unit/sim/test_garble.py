@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from acsard.config.settings import Baud, WheelMap
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.sim.garble import garbled
 
 LINE = Codec(WheelMap()).stop

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.config.settings import Config, WheelMap
-from acsard.mcu.frames import Codec
+from acsard.mcu.codec import Codec
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
 

@@ -16,7 +16,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.drive.lying_wheels.residual import MEMORY_S, Residual
 from acsard.drive.lying_wheels.stuck import Stuck
 from acsard.drive.lying_wheels.suspect import WORDS, Known, Lie, Suspect, has_lied
-from acsard.mcu.frames import Motors
+from acsard.mcu.codec import Motors
 from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from acsard.config.settings import DriveConfig, Motor, WheelMap
 from acsard.drive.kinematics import Kinematics
-from acsard.mcu.frames import Codec, FrameError
+from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.lines import LineReader
 from acsard.values import Twist, WheelSpeeds
 from tests.each import each

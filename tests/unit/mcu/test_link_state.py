@@ -6,7 +6,7 @@ from typing import get_args
 
 import pytest
 
-from acsard.mcu.link import BAD_LINES, GOOD_LINES, TABLE, WORDS, Link, Sign, State
+from acsard.mcu.link_state import BAD_LINES, GOOD_LINES, TABLE, WORDS, Link, Sign, State
 
 MS = 1_000_000
 QUIET_NS = 100 * MS

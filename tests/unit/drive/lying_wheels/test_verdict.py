@@ -10,7 +10,7 @@ import pytest
 from acsard.config.settings import DriveConfig, FeedbackConfig
 from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.lying_wheels.witness import Witness
+from acsard.drive.lying_wheels.verdict import Witness
 from acsard.drive.sanity import Sanity
 from acsard.mcu.feedback import Feedback
 from acsard.values import STILL, WHEELS, WheelSpeeds
