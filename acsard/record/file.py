@@ -89,11 +89,11 @@ class Closing(Struct, frozen=True):
 class Writing:
     """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
 
-    def __init__(self, path: Path, about: About) -> None:
-        self.path = path
+    def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
+        self.path, self._mode = path, mode
         self._about, self._last_ns = about, about.wall_ns
         self._news: list[Told] = []
-        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE), "wb")
+        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
         except OSError:
@@ -101,7 +101,7 @@ class Writing:
             raise
 
     def _open(self, about: About) -> None:
-        os.fchmod(self._file.fileno(), MODE)  # whatever the umask takes away
+        os.fchmod(self._file.fileno(), self._mode)  # whatever the umask takes away
         self._writer = Writer(
             self._file, CHUNK_BYTES, index_types=IndexType.ATTACHMENT | IndexType.METADATA
         )
