@@ -11,6 +11,11 @@ messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, 
 with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them. A
 drive that the robot does not follow is an error, and one that returns has come to a stand.
 
+Where you do not say which robot you mean, the file does that ACSARD_CONFIG names, as for the
+command line (`bus.listen`, `robot.id`, `bus.tls`); without that variable it is `acsar` on this
+machine. A file in the current directory is not looked for: a program means the same robot wherever
+it runs.
+
 Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
 
     UnreachableError   ConnectionError  nobody listens at the endpoint
@@ -21,7 +26,8 @@ Errors are `AcsardError`s and mostly what Python calls such a thing too; their t
                                         behind somebody else, not allowed; the text says which
     NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
     CertificateError   ValueError       certificates that are not there, or cannot be used
-    UsageError         ValueError       an endpoint, an id, a key or a number that cannot be
+    UsageError         ValueError       an endpoint, an id, a key or a number that cannot be, or the
+                                        file that ACSARD_CONFIG names
     DecodeError                         what was sent is not one of our messages
 """
 
@@ -39,7 +45,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.address import require_id
+from acsard.bus.address import address_by_environment
 from acsard.bus.identity import Identity, identity
 from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
@@ -82,7 +88,6 @@ __all__ = (
     "connect_async",
 )
 
-ENDPOINT = "tcp/127.0.0.1:7448"
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
@@ -334,29 +339,39 @@ class AsyncClient:
 
 @contextmanager
 def connect(
-    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
+    endpoint: str | None = None,
+    *,
+    robot_id: str | None = None,
+    source: str = "app",
+    tls: str | None = None,
 ) -> Iterator[Client]:
     """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
 
-    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
+    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". What
+    is None is taken from the file that the environment variable ACSARD_CONFIG names, and without
+    one is "tcp/127.0.0.1:7448", "acsar" and no certificate.
     """
-    require_id(robot_id)
-    session = client_session(endpoint, tls)
+    where = address_by_environment(endpoint, robot_id, tls)
+    session = client_session(where.endpoint, where.tls)
     try:
-        yield Client(session, robot_id, source, tls)
+        yield Client(session, where.robot_id, source, where.tls)
     finally:
         _close(session)
 
 
 @asynccontextmanager
 async def connect_async(
-    endpoint: str = ENDPOINT, *, robot_id: str = "acsar", source: str = "app", tls: str = ""
+    endpoint: str | None = None,
+    *,
+    robot_id: str | None = None,
+    source: str = "app",
+    tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
     """`connect` for asyncio programs; opening and closing do not hold the event loop."""
-    require_id(robot_id)
-    session = await in_thread(lambda: client_session(endpoint, tls), 10.0, late=_close)
+    where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
+    session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=_close)
     try:
-        yield AsyncClient(Client(session, robot_id, source, tls))
+        yield AsyncClient(Client(session, where.robot_id, source, where.tls))
     finally:
         await in_thread(lambda: _close(session), 5.0)
 

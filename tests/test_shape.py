@@ -26,6 +26,7 @@ PURE_ROOMS = (
 
 PURE_AMONG_SHELLS = (
     "bus.access",
+    "bus.quiet",
     "runtime.at_once",
     "runtime.figures",
     "runtime.histogram",

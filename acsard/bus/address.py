@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 from msgspec import ValidationError, convert
 
 from acsard.bus.session import reachable
+from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import TLS, Config, Name
 from acsard.host.errors import UsageError
 
@@ -38,6 +41,41 @@ def address_of(
     endpoint = connect or reachable(known[0])
     certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
     return Address(endpoint, robot_id, certificates)
+
+
+def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
+    """Where the robot is for a program: what it gives, else what the file says that $ACSARD_CONFIG
+    names, else the defaults; for the certificate $ACSARD_TLS goes before the file.
+
+    Raises `UsageError` for an id that no robot can have, and for a file that cannot be used.
+    """
+    settled = endpoint is not None and robot_id is not None
+    if settled and (tls is not None or not _is_tls(endpoint or "")):
+        config = Config()  # whatever the file says
+    else:
+        config = _named_by_environment()
+    where = address_of(config, endpoint, robot_id, tls)
+    return Address(
+        where.endpoint if endpoint is None else endpoint,
+        where.robot_id,
+        where.tls if tls is None else tls,
+    )
+
+
+def _named_by_environment() -> Config:
+    named = os.environ.get("ACSARD_CONFIG")
+    tls = os.environ.get("ACSARD_TLS")
+    given: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
+    try:
+        return parse(Path(named).read_bytes() if named else b"", given)
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {named}, which ACSARD_CONFIG names: {error.strerror}; name a file that "
+            "is there, or unset it"
+        ) from None
+    except ConfigError as error:
+        where = f"{named}, which ACSARD_CONFIG names" if named else "the environment"
+        raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
 
 
 def require_id(robot_id: str) -> None:

@@ -12,6 +12,7 @@ import msgspec
 import zenoh
 
 from acsard.bus.address import require_id
+from acsard.bus.quiet import Around
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.config.settings import TLS
 from acsard.host.errors import NoAnswerError, UsageError
@@ -56,6 +57,20 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
     if not found and ALL in ids:
         raise NoAnswerError(nobody(endpoint))
     return sorted(found)
+
+
+def around(session: zenoh.Session, robot_id: str, endpoint: str) -> Around | None:
+    """Whether this robot is there, and who else; None where the session is being closed."""
+    try:
+        if not session.info.links():
+            return Around(linked=False, here=False)
+        if present(session, (robot_id,), endpoint):
+            return Around(linked=True, here=True)
+        return Around(True, False, tuple(present(session, (ALL,), endpoint)))
+    except NoAnswerError:
+        return Around(linked=True, here=False)
+    except zenoh.ZError:
+        return None
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:

@@ -47,6 +47,16 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
     return slower if fits(slower) else differing
 
 
+def withheld(simulated: bool, config: Config) -> str:
+    """Why nothing that was found is for this configuration: it is another's; "" where it is not."""
+    if not simulated or config.mcu.simulated:
+        return ""
+    return (
+        f"the simulator was checked, and mcu.port here is {config.mcu.port}: what the simulator "
+        "likes says nothing of that robot"
+    )
+
+
 def applied(given: Changes, config: Config) -> Config | None:
     """The configuration with these keys; None when they cannot be its values."""
     plain: Any = effective(config)

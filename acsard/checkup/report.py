@@ -25,15 +25,31 @@ class Report(Struct, frozen=True):
     toml: str
     written: str | None = None
     error: str | None = None
+    withheld: str | None = None
+    """Why there is nothing for the file, whatever was found."""
 
 
 def report(
-    port: str, findings: Sequence[Finding], changes: advice.Changes, written: str, error: str
+    port: str,
+    findings: Sequence[Finding],
+    changes: advice.Changes,
+    written: str,
+    error: str,
+    withheld: str = "",
 ) -> Report:
     """Put together; a board that never answered has not passed."""
     passed = advice.answered(findings) and not failed(findings)
     toml = "\n".join(excerpt(changes))
-    return Report(port, passed, findings, changes, toml, written or None, error or None)
+    return Report(
+        port,
+        passed,
+        findings,
+        changes,
+        toml,
+        written or None,
+        error or None,
+        withheld or None,
+    )
 
 
 def failed(findings: Sequence[Finding]) -> bool:
@@ -57,6 +73,8 @@ def summary(found: Report, where: str) -> str:
     """How many of each verdict, and the lines for the configuration `where`."""
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
+    if found.withheld:
+        return f"\n{counts}\nnothing is for {where}: {found.withheld}"
     if not found.toml:
         return f"\n{counts}\nacsard.toml: nothing to change"
     head = f"{where}: written" if found.written else "for acsard.toml:"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
@@ -56,13 +57,24 @@ def main(args: argparse.Namespace) -> int:
     (endpoint, robot_id, tls), many = robots_address(args)
     if many:
         if args.service != "stop":
-            raise UsageError(f"only stop goes to many robots: give {args.service} one --id")
+            raise UsageError(for_one(args.service, args.values, many))
         with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
             return _stop_all(robot, many, endpoint, as_json=args.json)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
     print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message))
     return 0 if reply.success else 1
+
+
+def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
+    """Why a service does not go to these robots at once, and what to type instead."""
+    typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
+    each = [one for one in ids if one != "*"] or ["robot1"]
+    more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
+    return (
+        f"only stop goes to many robots at once: before {service} somebody has to look at each. "
+        f"One after the other: {', '.join(f'`{typed} {one}`' for one in each)}{more}"
+    )
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bool) -> int:

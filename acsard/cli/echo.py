@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from acsard.cli.common import (
@@ -18,6 +20,8 @@ from acsard.host.exits import Exit, ExitError
 from acsard.messages import text
 
 if TYPE_CHECKING:
+    import zenoh
+
     from acsard.client import Client
     from acsard.messages.encodings import Decoder
 
@@ -57,38 +61,65 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
-    from acsard.bus.fleet import follow, robot_of
-    from acsard.bus.subscription import encoded
+    from acsard.bus.fleet import follow
+    from acsard.cli.waiting import explained, waits_for
     from acsard.client import connect
 
-    (endpoint, robot_id, tls), many = robots_address(args)
+    where, many = robots_address(args)
+    endpoint, robot_id, tls = where
     if args.csv:
         if many:
             raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
-        with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-            return _record(robot, args.topic, args.n, args.timeout)
+        with (
+            connect(endpoint, robot_id=robot_id, tls=tls) as robot,
+            explained(waits_for(robot, args.topic[0], where)) as heard,
+        ):
+            return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
         raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
-    left, topic = args.n, args.topic[0]
+    topic = args.topic[0]
     require_followed(topic)
     decoder = _shortened(topic) if args.short else None
     warn_of_unknown(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         samples = robot.samples(topic, args.timeout)
+        waiting: AbstractContextManager[Callable[[], None]]
+        waiting = explained(waits_for(robot, topic, where))
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
             _say_who(robot, many, endpoint)
+            waiting = nullcontext(_nothing)
         elif tls and (why := robot.whoami().unlisted):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
-        try:
-            for sample in samples:
-                whose = robot_of(str(sample.key_expr)) if many else ""
-                print(_shown(decoder, *encoded(sample), whose), flush=True)
-                left = None if left is None else left - 1
-                if left == 0:
-                    return 0
-        except KeyboardInterrupt:
-            return 0
+            waiting = nullcontext(_nothing)
+        with waiting as heard:
+            return _print(samples, decoder, args.n, bool(many), heard)
+
+
+def _nothing() -> None:
+    """Why nothing comes has been told already."""
+
+
+def _print(
+    samples: Iterator[zenoh.Sample],
+    decoder: Decoder[Any] | None,
+    most: int | None,
+    of_many: bool,
+    heard: Callable[[], None],
+) -> int:
+    """A line each as they come, until Ctrl-C, so many, or a silence."""
+    from acsard.bus.fleet import robot_of
+    from acsard.bus.subscription import encoded
+
+    try:
+        for number, sample in enumerate(samples, 1):
+            heard()
+            whose = robot_of(str(sample.key_expr)) if of_many else ""
+            print(_shown(decoder, *encoded(sample), whose), flush=True)
+            if number == most:
+                return 0
+    except KeyboardInterrupt:
+        return 0
     return 1
 
 
@@ -123,7 +154,13 @@ def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: s
     return of_robot(whose, line) if whose else text.json_line(line)
 
 
-def _record(robot: Client, keys: list[str], most: int | None, timeout: float | None) -> int:
+def _record(
+    robot: Client,
+    keys: list[str],
+    most: int | None,
+    timeout: float | None,
+    heard: Callable[[], None],
+) -> int:
     """Rows of all keys as they come, until Ctrl-C, so many, or a silence."""
     import time
 
@@ -141,15 +178,16 @@ def _record(robot: Client, keys: list[str], most: int | None, timeout: float | N
             raise ExitError(Exit.USAGE, f"{key} is no part of a log; --csv takes {', '.join(KEYS)}")
         queues.append((robot.subscribe(key), Decoder(MESSAGES[topic.type])))
     print(HEADER, flush=True)
-    count, heard = 0, time.monotonic()
+    count, heard_s = 0, time.monotonic()
     try:
         while most is None or count < most:
-            if timeout is not None and time.monotonic() - heard > timeout:
+            if timeout is not None and time.monotonic() - heard_s > timeout:
                 return int(Exit.FAILURE)
             for queue, decoder in queues:
                 while (sample := queue.try_recv()) is not None and count != most:
                     print(row(decoder.decode(*encoded(sample)), clock.now().wall_ns))
-                    count, heard = count + 1, time.monotonic()
+                    count, heard_s = count + 1, time.monotonic()
+                    heard()
             time.sleep(0.02)
     except KeyboardInterrupt:
         pass

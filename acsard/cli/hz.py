@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, count, require_followed, robot_address, warn_of_unknown
+
+if TYPE_CHECKING:
+    import zenoh
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,15 +33,24 @@ def main(args: argparse.Namespace) -> int:
 
     import msgspec
 
+    from acsard.cli.waiting import explained, waits_for
     from acsard.client import connect
 
     require_followed(args.topic)
     warn_of_unknown(args.topic)
-    endpoint, robot_id, tls = robot_address(args)
+    where = endpoint, robot_id, tls = robot_address(args)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-        subscriber = robot.listen(args.topic, lambda _: times.append(time.monotonic()))
+    with (
+        connect(endpoint, robot_id=robot_id, tls=tls) as robot,
+        explained(waits_for(robot, args.topic, where)) as heard,
+    ):
+
+        def take(_: zenoh.Sample) -> None:
+            times.append(time.monotonic())
+            heard()
+
+        subscriber = robot.listen(args.topic, take)
         try:
             while left is None or left > 0:
                 time.sleep(1.0)

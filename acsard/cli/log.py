@@ -151,15 +151,28 @@ def show_one(args: argparse.Namespace) -> int:
 
 def replay_one(args: argparse.Namespace) -> int:
     """Live it again; 1 where it does not come out the same."""
-    from acsard.record.replayed import differs, live, otherwise, verdict
+    from acsard.record.replayed import (
+        because,
+        compared,
+        config_of,
+        differs,
+        live,
+        otherwise,
+        verdict,
+    )
 
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with telling(recording) as tell:
         tally, trouble = live(recording, other, tell)
-    print(verdict(tally))
+    print(f"{verdict(tally)}\n{compared(other is not None)}")
+    began_ns, rows = recording.about.mono_ns, list[str]()
+    if other is not None:
+        rows = because(config_of(recording), other, tally, began_ns)
     if tally.first is not None:
-        print("\n".join([*differs(tally.first, recording.about.mono_ns), *otherwise(tally)]))
+        rows = [*differs(tally.first, began_ns), *rows, *otherwise(tally)]
+    for row in rows:
+        print(row)
     note = trouble or _state(recording).strip()
     if note:
         print(f"{recording.path}: {note}", file=sys.stderr)

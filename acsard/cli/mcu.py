@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import JSON_LINES, Overrides, add_config, load, writable
 from acsard.cli.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, UsageError
 from acsard.host.exits import Exit
 from acsard.host.files import change
 
@@ -73,6 +73,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Check and tell."""
+    from acsard.checkup.advice import withheld
+
     given: Overrides = {}
     for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
         if value is not None:
@@ -80,6 +82,8 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, given)
     if args.write:
         writable(args.config)
+        if why := withheld(config.mcu.simulated, load(args.config)[1]):
+            raise UsageError(f"nothing would be written into {where}: {why}; leave --write out")
     with answering(args, config.mcu.port) as person:
         return _checked(args, config, where, person)
 
@@ -109,14 +113,16 @@ def _checked(
             raise
         trouble = error  # programs get their object all the same
     named = args.port if args.write or (args.json_lines and not simulated) else ""
-    changes, written = advice.changes(findings, configured, named), ""
+    withheld = advice.withheld(simulated, configured)
+    changes = {} if withheld else advice.changes(findings, configured, named)
+    written = ""
     if args.write and changes and not trouble:
         try:
             change(Path(where), changes)
             written = where
         except MendableError as error:  # a minute's findings are told first
             trouble = error
-    person.result(report(port, findings, changes, written, str(trouble or "")), where)
+    person.result(report(port, findings, changes, written, str(trouble or ""), withheld), where)
     if trouble is not None:
         raise trouble
     if changes and not args.write:

@@ -16,12 +16,14 @@ _BANNER = """\
 acsard {version}, robot {robot}
   port    {port}
   bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
-  config  {where}
+{page}  config  {where}
   try, in a second terminal:
-    acsard drive{reach}                   drive it by keyboard
-    acsard echo odom -n 1 --short{reach}  where is it?
-    acsard call stop{reach}               stop it, and keep it stopped until `acsard call clear`
+    acsard drive{reach}      drive it by keyboard
+    acsard top{reach}        where it is, how it moves and why not, on one screen
+    acsard call stop{reach}  stop it, and keep it stopped until `acsard call clear`
 """
+
+_PAGE = "  page    {where}, for a browser; a line below says when it is open\n"
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -89,13 +91,14 @@ def main(args: argparse.Namespace) -> int:
 
     where, config = load(args.config, overrides(args))
     config = recorded(config)
-    log, screen = Log(config.log), Writer(sys.stdout)
+    log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)
 
     def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.simulated
         if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
             # Not print: a full pipe that nobody reads would hold up the robot.
-            screen.write(banner(config, where, device, trouble, reach(args)) + "\n")
+            told = banner(config, where, device, trouble, reach(args), served=served is not None)
+            screen.write(told + "\n")
         log.info(
             "started",
             version=__version__,
@@ -114,9 +117,7 @@ def main(args: argparse.Namespace) -> int:
     if sys.stderr is not None:  # None when it was closed before the start
         faulthandler.enable()
     try:
-        asyncio.run(
-            daemon.run(config, log, announce, None if args.no_door else door, page(config, where))
-        )
+        asyncio.run(daemon.run(config, log, announce, None if args.no_door else door, served))
     finally:
         log.close()
         screen.close(0.2)
@@ -158,8 +159,16 @@ def reach(args: argparse.Namespace) -> str:
     return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
 
 
-def banner(config: Config, where: str, device: str, trouble: str = "", reach: str = "") -> str:
-    """What a person sees first; `reach` is how the tools find it."""
+def banner(
+    config: Config,
+    where: str,
+    device: str,
+    trouble: str = "",
+    reach: str = "",
+    *,
+    served: bool = False,
+) -> str:
+    """What a person sees first; `reach` is how the tools find it, `served` whether the page is."""
     from acsard import __version__
     from acsard.values import ROOT
 
@@ -174,6 +183,7 @@ def banner(config: Config, where: str, device: str, trouble: str = "", reach: st
         port=port,
         listen=_bus(config),
         root=ROOT,
+        page=_PAGE.format(where=", ".join(config.web.address)) if served else "",
         where=where,
         reach=reach,
     )

@@ -6,6 +6,7 @@ and told with the next. So whoever floods the bus, and a wire that flaps, cannot
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from typing import get_args
 
@@ -43,7 +44,7 @@ class _Held:
             what = f"{what or f'{self.count} times'}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
         level, by = LEVELS[self._level], ", ".join(self._by)
-        return Event(last.name, text, level, by, count=self.count)
+        return Event(last.name, text, level, by, count=self.count, news=self.news)
 
 
 class Tally:
@@ -70,6 +71,21 @@ class Tally:
             return False
         self._free_ns[name] = max(free_ns, now_ns) + NS_PER_S
         return True
+
+
+NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
+"""So begins a line that has been put together of several."""
+
+
+def together(before: Event, line: Event) -> Event:
+    """Two lines of one name as one: how often in all, and the words of the last."""
+    count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
+    level = max(before.level, line.level, key=LEVELS.index)
+    names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))
+    by = [name for name in names if name != "others"]
+    more = ["others"] if len(by) > MOST or "others" in names else []
+    text = f"{count} times; the last: {last}"
+    return Event(line.name, text, level, ", ".join(by[:MOST] + more), count=count, news=False)
 
 
 def _count(counts: Counter[str], what: str, times: int) -> None:

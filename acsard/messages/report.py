@@ -6,7 +6,6 @@ Only what somebody listens to is built. All messages of one feedback line carry 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Collection, Iterator
 
 from msgspec.structs import asdict
@@ -16,11 +15,10 @@ from acsard.drive.words import waiting
 from acsard.messages.covariances import Covariances
 from acsard.messages.diagnostics import diagnostics
 from acsard.messages.expiry import expiry
+from acsard.messages.happened import Happened
 from acsard.messages.schema import (
     DiagnosticArray,
-    Events,
     Figure,
-    Happening,
     Header,
     JointState,
     Message,
@@ -52,9 +50,6 @@ from acsard.values import Twist as BodyTwist
 
 Look = Callable[[], Snapshot]
 
-LAST = 20
-"""Events that are kept: more than happens between two looks of who is slow."""
-
 
 class _Rate:
     """Lets something happen at most so often; 0 Hz means always."""
@@ -85,8 +80,7 @@ class Report:
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
-        self._events: deque[Happening] = deque(maxlen=LAST)
-        self._happened = 0
+        self._happened = Happened()
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -104,7 +98,7 @@ class Report:
         """
         self._outputs = outputs
         if outputs.events:
-            self._remember(outputs)
+            self._happened.add(outputs.events, outputs.now)
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
         elif not (outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted):
@@ -127,8 +121,8 @@ class Report:
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
-        if outputs.events and "events" in wanted:
-            yield "events", self._last_events()
+        if outputs.events and "events" in wanted and (told := self._happened.told()):
+            yield "events", told
         for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
                 yield key, build(outputs, look())
@@ -152,7 +146,7 @@ class Report:
             case "diagnostics":
                 return self._diagnostics(outputs, look()) if outputs else None
             case "events":
-                return self._last_events() if self._events else None
+                return self._happened.told()
             case _:
                 return None
 
@@ -231,17 +225,6 @@ class Report:
             sender=snapshot.sender,
             recording=snapshot.recording.trouble,
         )
-
-    def _remember(self, outputs: Outputs) -> None:
-        stamp = Time.from_ns(outputs.now.wall_ns)
-        self._events.extend(
-            Happening(stamp, one.name, one.level, one.text, one.by, one.count)
-            for one in outputs.events
-        )
-        self._happened += len(outputs.events)
-
-    def _last_events(self) -> Events:
-        return Events(self._events[-1].stamp, self._happened, list(self._events))
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
         """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""

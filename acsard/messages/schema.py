@@ -282,16 +282,18 @@ class Happening(Message, frozen=True):
     by: str
     """Who asked, sent or commands; empty when that is nobody."""
     count: int
-    """How many times, since the last of this name."""
+    """How many times: since the last of this name, or of what goes on and on, without a minute's
+    rest, since it began."""
 
 
 class Events(Message, frozen=True):
-    """The last events, oldest first."""
+    """The last events, oldest first; what goes on and on is one, as of the last time."""
 
     stamp: Time
     """When the last of them was."""
     total: int
-    """How many there were since the start: who knows an earlier total knows which are new."""
+    """How many there were since the start: who knows an earlier total knows which are new. One that
+    goes on counts each time, and is the last then."""
     events: list[Happening]
 
 

@@ -26,6 +26,8 @@ from acsard.record.steps import (
 from acsard.robot import Robot
 from acsard.values import Instant, Outputs
 
+FAULT = "fault"
+
 
 class Seen(Struct, frozen=True):
     """What one side knew of a step."""
@@ -61,6 +63,8 @@ class Tally(Struct):
     exact: bool = True
     """Every pose is the same to the last bit."""
     first: Difference | None = None
+    fault: Difference | None = None
+    """Where a fault began that was none then."""
     apart: float = 0.0
     """m between the two poses, at most."""
     fastest: tuple[int, int] = (0, 0)
@@ -114,9 +118,16 @@ class Replay:
         now = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
         difference = self._compare(step, now, line)
         self._count(step, outputs, now)
-        if difference is not None and self.tally.first is None:
-            self.tally.first = difference
+        if difference is not None:
+            self._keep(difference)
         return difference
+
+    def _keep(self, difference: Difference) -> None:
+        """What is told of them all."""
+        tally = self.tally
+        tally.first = tally.first or difference
+        if difference.now.status[0] == FAULT != difference.then.status[0]:
+            tally.fault = tally.fault or difference
 
     def _watched_by(self, config: Config) -> None:
         """A guard as the loop has it."""
@@ -150,7 +161,7 @@ class Replay:
         tally.poses += len(said.poses)
         tally.poses_same += sum(a == b for a, b in zip(said.poses, now.poses, strict=False))
         then_most, now_most = tally.fastest
-        tally.fastest = max(then_most, _fastest(said.line)), max(now_most, _fastest(now.line))
+        tally.fastest = max(then_most, fastest(said.line)), max(now_most, fastest(now.line))
         if outputs.estimates:
             self._here = now.poses[-1]
         if said.poses:
@@ -162,7 +173,7 @@ class Replay:
 
 
 @lru_cache(64)
-def _fastest(line: bytes | None) -> int:
+def fastest(line: bytes | None) -> int:
     """The fastest wheel of a line, hundredths of rad/s; 0 where there is none to read."""
     if line is None:
         return 0

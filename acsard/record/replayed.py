@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from acsard.config.parsing import ConfigError, parse
+from acsard.config.live import flat
+from acsard.config.parsing import ConfigError, effective, parse
 from acsard.config.settings import Config
+from acsard.config.validation import show
 from acsard.host.errors import RecordingError
 from acsard.messages.text import printable
 from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
-from acsard.record.replay import Difference, Replay, Seen, Tally
+from acsard.record.replay import Difference, Replay, Seen, Tally, fastest
 from acsard.record.state import State, StateError, thaw
 from acsard.record.steps import MICRO, Step
 from acsard.robot import Robot
@@ -192,6 +194,15 @@ def verdict(tally: Tally) -> str:
     return f"{lines}, {poses}, {modes}{bits}"
 
 
+def compared(other: bool) -> str:
+    """What the verdict has counted."""
+    by = "that configuration" if other else "this version"
+    return (
+        "(compared: every line to the board, every pose by odometry to the um, and the mode in "
+        f"every step, as recorded, with what {by} makes of the same inputs)"
+    )
+
+
 def differs(difference: Difference, began_ns: int) -> list[str]:
     """What each side knew where they first part, in lines."""
     seconds = (difference.at.mono_ns - began_ns) / 1e9
@@ -214,6 +225,42 @@ def _side(name: str, seen: Seen) -> list[str]:
         *[f"        pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
     ]
     return [*rows, f"        the guard: {seen.trip}"] if seen.trip else rows
+
+
+SHAPE_LINES = ("limits.", "drive.", "mcu.wheels.")
+"""The tables that make of the same command another line."""
+
+MOST_KEYS = 8
+
+
+def because(then: Config, now: Config, tally: Tally, began_ns: int) -> list[str]:
+    """What the other configuration changes, in words: which settings, what was sent by them, and
+    that the wheels of the recording did not obey it."""
+    before, after = (dict(flat(effective(config))) for config in (then, now))
+    keys = [key for key in before | after if before.get(key) != after.get(key)]
+    told = [f"{key} {_set(key, before)} then, {_set(key, after)} now" for key in keys]
+    more = [f"and {len(told) - MOST_KEYS} more"] if len(told) > MOST_KEYS else []
+    rows = [f"set otherwise: {'; '.join(told[:MOST_KEYS] + more) or 'nothing'}"]
+    first, fault = tally.first, tally.fault
+    if first is not None and "line" in first.what:
+        shaping = [key for key in keys if key.startswith(SHAPE_LINES)]
+        by = f": by {', '.join(shaping[:MOST_KEYS])}" if shaping else ""
+        most, here = (fastest(one.line) / HUNDREDTHS for one in (first.then, first.now))
+        rows.append(f"there the fastest wheel was told {most:.2f} rad/s, now {here:.2f} rad/s{by}")
+    if first is not None and fault is not None:
+        seconds = (fault.at.mono_ns - began_ns) / 1e9
+        rows.append(f"from {seconds:.3f} s on in fault: {printable(fault.now.status[1])}")
+        if first.number < fault.number:
+            rows.append(
+                "  the wheels of the recording turned as they were told then, not as they are told "
+                "now: a robot with this configuration need not have had that fault. What is before "
+                "it counts"
+            )
+    return rows
+
+
+def _set(key: str, settings: Mapping[str, object]) -> str:
+    return show(settings[key]) if key in settings else "not there"
 
 
 def otherwise(tally: Tally) -> list[str]:

@@ -30,6 +30,21 @@ COLOURS = {
 
 UNKNOWN = "#9a9a9a"
 
+COMMANDERS = (
+    "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
+)  # fmt: skip
+"""Who drives: told apart also beside each other."""
+
+PATTERNS = ("", "/", "x", ".", "-")
+"""For who comes after so many: the same colours, hatched."""
+
+
+def commander(number: int) -> tuple[str, str]:
+    """The colour and the pattern of the n-th who drives."""
+    beyond, place = divmod(number, len(COMMANDERS))
+    return COMMANDERS[place], PATTERNS[beyond % len(PATTERNS)]
+
+
 WRAP = 42
 """Characters of a line that fits on a phone."""
 

@@ -5,7 +5,7 @@ Time is in ms since 1970 by the clock on the wall here: the library knows no tim
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from acsard.report.commanders import OTHERS
@@ -19,6 +19,7 @@ from acsard.report.drawing import (
     Figure,
     Key,
     Trace,
+    commander,
     label,
     layout,
     note,
@@ -47,6 +48,41 @@ class Part(NamedTuple):
 
     title: str
     lines: list[Line]
+
+
+Row = tuple[str, list[Span]]
+"""A row of bands, and whose they are."""
+
+DRIVES = "drives"
+
+
+class Look(NamedTuple):
+    """How the bands of a kind look; of those that drive each has a look of its own."""
+
+    kind: str
+    who: str
+    """"" for whoever it is."""
+    colour: str
+    pattern: str = ""
+
+    @property
+    def told(self) -> str:
+        return f"{self.who} {self.kind}".strip()
+
+    def of(self, row: Row) -> list[Span]:
+        """The bands of a row that look so."""
+        name, spans = row
+        return [one for one in spans if one.kind == self.kind] if self.who in ("", name) else []
+
+
+def _looks(rows: list[Row]) -> Iterator[Look]:
+    drivers = [name for name, spans in rows if any(one.kind == DRIVES for one in spans)]
+    for kind in dict.fromkeys(span.kind for _, spans in rows for span in spans):
+        if kind == DRIVES:
+            for number, name in enumerate(drivers):
+                yield Look(kind, name, *commander(number))
+        else:
+            yield Look(kind, "", COLOURS.get(kind, UNKNOWN))
 
 
 class Pictures:
@@ -133,7 +169,7 @@ class Pictures:
     def who(self) -> Figure:
         """Mode, link and sources as bands."""
         course, silent = self._course, list[str]()
-        rows: list[tuple[str, list[Span]]] = [
+        rows: list[Row] = [
             ("mode", course.modes.spans()),
             ("link", course.links.spans()),
         ]
@@ -142,15 +178,10 @@ class Pictures:
                 rows.append((name, band.spans()))
             elif name != OTHERS:
                 silent.append(name)
-        kinds = dict.fromkeys(span.kind for _, spans in rows for span in spans)
-        data = [
-            self._bars(
-                kind,
-                [(at, s) for at, (_, spans) in enumerate(rows) for s in spans if s.kind == kind],
-            )
-            for kind in kinds
-        ]
-        keys = [Key("■", COLOURS.get(kind, UNKNOWN), kind) for kind in kinds]
+        looks = list(_looks(rows))
+        data = [self._bars(look, [(at, s) for at, row in enumerate(rows) for s in look.of(row)])
+                for look in looks]  # fmt: skip
+        keys = [Key("▨" if one.pattern else "■", one.colour, one.told) for one in looks]
         axes = self._timed() | {
             "barmode": "overlay",
             "uniformtext": {"mode": "hide", "minsize": 11},
@@ -163,18 +194,21 @@ class Pictures:
         height = ROW_PX * len(rows) + ROOM_PX
         return Figure("who", "Who drove, and why others did not", caption, keys, height, data, axes)
 
-    def _bars(self, kind: str, spans: list[tuple[int, Span]]) -> Trace:
-        colour = COLOURS.get(kind, UNKNOWN)
+    def _bars(self, look: Look, spans: list[tuple[int, Span]]) -> Trace:
+        kind, colour = look.kind, look.colour
+        # However short it is, a line of it is seen.
+        marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
+        if look.pattern:
+            marker["pattern"] = {"shape": look.pattern}
         return {
             "type": "bar",
             "orientation": "h",
-            "name": label(kind),
+            "name": label(look.told),
             "base": numbers(self._ms(span.begin) for _, span in spans),
             "x": numbers(1000 * (span.end - span.begin) for _, span in spans),
             "y": numbers(at for at, _ in spans),
             "width": 0.5,
-            # However short it is, a line of it is seen.
-            "marker": {"color": colour, "line": {"color": colour, "width": 1}},
+            "marker": marker,
             "hovertext": [f"<b>{label(kind)}</b><br>{label(span.words)}" for _, span in spans],
             "hovertemplate": "%{hovertext}<extra></extra>",
             "text": [label(kind) for _ in spans],

@@ -23,6 +23,8 @@ from typing import Any
 
 import pytest
 
+from acsard.bus.fleet import around
+from acsard.bus.quiet import Around
 from acsard.client import connect
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -211,6 +213,44 @@ def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: B
 def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     ended = tool(shared, "echo", "cmd/nobody", "--timeout", "0.3")
     assert (ended.code, ended.out) == (1, "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["echo", "state", "--short", "--id", "acsra"], "no robot acsra is there; there is acsar"),
+        (["hz", "odom", "--id", "acsra"], "no robot acsra is there; there is acsar"),
+        (["echo", "imu", "--csv", "--id", "acsra"], "no robot acsra is there; there is acsar"),
+        (["echo", "cmd/nobody"], "robot acsar is there, but nobody sends on cmd/nobody now"),
+    ],
+)
+def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
+    shared: Daemon, bus: Bus, words: list[str], why: str
+) -> None:
+    typed = acsard(*words, "--config", str(shared.config))
+    with Program(typed, shared.config.parent) as waiting:
+        until(lambda: why in waiting.stderr, 10.0, "why nothing comes")
+        assert waiting.process.poll() is None
+        waiting.signal(signal.SIGINT)
+        assert waiting.ended(5.0) == 0
+    (told,) = waiting.stderr.splitlines()
+    key = "state" if "state" in words else words[1]
+    assert told.startswith("acsard: waiting for acsard/acs")
+    assert f"/{key}: " in told
+
+
+@pytest.mark.slow
+def test_who_waits_sees_that_the_daemon_has_ended(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot:
+
+        def seen() -> Around | None:
+            return around(robot.session, "acsar", daemon.endpoint)
+
+        assert seen() == Around(linked=True, here=True)
+        daemon.signal(signal.SIGINT)
+        daemon.ended(5.0)
+        until(lambda: seen() == Around(linked=False, here=False), 5.0, "that it is gone")
 
 
 def test_echo_of_no_messages_prints_none(shared: Daemon) -> None:

@@ -230,6 +230,18 @@ def test_messages_of_silence_ends_after_its_timeout(shared: Daemon) -> None:
         assert 0.25 < time.monotonic() - start < 1.5 + lost(start)
 
 
+def test_who_says_nothing_means_the_robot_of_the_file_that_the_environment_names(
+    shared: Daemon, fresh: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def pid() -> Any:
+        async with connect_async() as robot:
+            return (await robot.get("info")).pid
+
+    monkeypatch.setenv("ACSARD_CONFIG", str(shared.config))
+    with connect() as robot:
+        assert robot.get("info").pid == asyncio.run(pid()) == shared.pid
+
+
 def test_connecting_to_nobody_is_a_connection_error_with_the_mend() -> None:
     endpoint = free_endpoint()
     with pytest.raises(UnreachableError) as error, connect(endpoint):

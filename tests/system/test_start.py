@@ -50,7 +50,7 @@ def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Pa
     with Program(acsard("--listen", endpoint), tmp_path) as daemon:
         assert "SIMULATOR" in daemon.says("port ")
         assert endpoint in daemon.says("bus ")
-        for hint in ("acsard drive", "acsard echo odom -n 1", "acsard call stop"):
+        for hint in ("acsard drive", "acsard top", "acsard call stop"):
             daemon.says(hint)
 
 

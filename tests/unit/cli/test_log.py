@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,15 @@ def test_a_replay_says_that_all_is_the_same(
     assert " poses, " in rest
 
 
+def test_a_replay_says_what_it_has_compared(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, out, _ = log(capsys, where, "replay", "1")
+    _, told = out.splitlines()
+    for word in ("every line to the board", "every pose", "the mode in every step", "as recorded"):
+        assert word in told
+
+
 def test_a_replay_of_what_was_cut_says_so(where: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = log(capsys, where, "replay")  # without a name: the newest
     assert code == 0
@@ -124,6 +134,36 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     assert "the first that differs, by its line, left: step " in out
     assert "  then  ap" in out
     assert "the fastest wheel: 10.00 rad/s then, 6.00 rad/s now" in out
+
+
+def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "slow.toml"
+    other.write_text("[limits]\nlinear_speed = 0.1\nlinear_acceleration = 0.5\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    assert code == 0
+    (keys,) = [line for line in out.splitlines() if line.startswith("set otherwise: ")]
+    assert "limits.linear_speed 1.0 then, 0.1 now" in keys
+    assert "limits.linear_acceleration 1.0 then, 0.5 now" in keys
+    (told,) = [line for line in out.splitlines() if line.startswith("there the fastest wheel")]
+    assert told.endswith(": by limits.linear_speed, limits.linear_acceleration")
+    then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
+    assert then > now
+    (fault,) = [line for line in out.splitlines() if " s on in fault: " in line]
+    assert "wheel" in fault
+    assert "a robot with this configuration need not have had that fault" in out
+
+
+def test_settings_that_change_no_line_are_told_all_the_same(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = tmp_path / "same.toml"
+    same.write_text("[rates]\nstate = 5.0\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
+    assert (code, "differs" in out) == (0, False)
+    assert "with what that configuration makes of the same inputs" in out
+    assert out.splitlines()[-1].startswith("set otherwise: rates.state 10.0 then, 5.0 now")
 
 
 def test_what_was_cut_is_written_as_a_finished_file(

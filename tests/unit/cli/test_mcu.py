@@ -24,7 +24,7 @@ from acsard.cli.exits import code_of
 from acsard.cli.person import Person, ended_by_signals
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
-from acsard.host.errors import NoPortError
+from acsard.host.errors import NoPortError, UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
@@ -79,6 +79,33 @@ def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
     assert called(tmp_path, "--port", "sim", "--yes", "--write") == 0
     assert "nothing to change" in capsys.readouterr().out
     assert (tmp_path / "acsard.toml").read_text() == written
+
+
+REAL = "[mcu]\nport = '/dev/acsar_mcu'\n"
+
+
+@pytest.mark.parametrize("how", [["--yes"], ["--yes", "--json"]])
+def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
+    tmp_path: Path, how: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(tmp_path, "--port", "sim", *how, text=REAL) == 0
+    out = capsys.readouterr().out
+    assert "mcu.port here is /dev/acsar_mcu" in out
+    if "--json" in how:
+        found = json.loads(out)
+        assert (found["changes"], found["toml"]) == ({}, "")
+    else:
+        assert f"nothing is for {tmp_path / 'acsard.toml'}: the simulator was checked" in out
+        assert "encoder_counts =" not in out
+
+
+def test_nor_is_it_written_there_and_that_is_said_before_anything_is_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(UsageError, match=r"nothing would be written into .*/dev/acsar_mcu"):
+        called(tmp_path, "--port", "sim", "--yes", "--write", text=REAL)
+    assert capsys.readouterr().out == ""
+    assert (tmp_path / "acsard.toml").read_text() == REAL
 
 
 def test_findings_are_told_also_when_the_file_cannot_be_written(

@@ -8,7 +8,7 @@ import pytest
 
 from acsard.cli import run
 from acsard.config.parsing import parse
-from acsard.config.settings import Config, McuConfig
+from acsard.config.settings import Config, McuConfig, WebConfig
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
@@ -59,6 +59,18 @@ def test_the_banner_tells_a_simulator_from_a_robot() -> None:
     assert "none yet: /dev/ttyUSB0 is not there" in missing
     assert "/dev/ttyUSB0 at 115200 baud" in real
     assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))
+
+
+def test_the_banner_has_what_a_newcomer_types_next_and_the_page_where_it_is_served() -> None:
+    web = WebConfig(address=("http://127.0.0.1:8080", "https://0.0.0.0:8443"))
+    config = Config(web=web)
+    silent, served = (run.banner(config, "x.toml", "/dev/x", served=one) for one in (False, True))
+    for told in (silent, served):
+        tries = [line.split("  ")[0] for line in map(str.strip, told.splitlines())]
+        assert tries[-3:] == ["acsard drive", "acsard top", "acsard call stop"]
+    assert "  page    http://127.0.0.1:8080, https://0.0.0.0:8443, for a browser; " in served
+    assert "page" not in silent
+    assert served.count("\n") == silent.count("\n") + 1
 
 
 def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:

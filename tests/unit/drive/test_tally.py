@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.drive.tally import BURST, MOST, Tally
+from acsard.drive.tally import BURST, MOST, Tally, together
 from acsard.values import NS_PER_S, Event
 
 MS = 1_000_000
@@ -116,6 +116,29 @@ def test_a_line_is_as_bad_as_the_worst_in_it() -> None:
     good, bad = Event("link_check", "fine"), Event("link_check", "no answer", "error")
     (line,) = Tally().lines([bad, good], 0)
     assert (line.level, line.text) == ("error", "2 times; the last: fine")
+
+
+def test_more_of_the_same_is_told_as_such_and_news_is_not() -> None:
+    (again,), (news,) = Tally().lines([refused()], 0), Tally().lines([mode()], 0)
+    assert not again.news
+    assert news.news
+
+
+def test_two_lines_are_one_with_how_often_in_all_and_the_words_of_the_last() -> None:
+    one = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
+    other = Event("command_refused", "3 x wildcard: a star", "warning", "ann, eve", count=3)
+    line = together(one, other)
+    assert (line.text, line.count) == ("15 times; the last: a star", 15)
+    assert (line.by, line.level) == ("joe, ann, eve", "warning")
+    assert together(line, refused()).text == "16 times; the last: late"
+    assert together(refused(), line).text == "16 times; the last: a star"
+
+
+def test_lines_of_any_number_of_senders_name_a_few() -> None:
+    line = refused(by="")
+    for number in range(100):
+        line = together(line, refused(by=f"sender{number}"))
+    assert line.by.split(", ") == [*(f"sender{n}" for n in range(MOST)), "others"]
 
 
 events = st.builds(

@@ -6,6 +6,7 @@ import json
 import os
 import shlex
 import sys
+import tomllib
 from importlib.metadata import Distribution, PathDistribution
 from pathlib import Path
 from typing import get_args
@@ -53,3 +54,12 @@ def test_what_is_told_is_for_the_venv_at_hand(extra: Extra) -> None:
         assert words.pop(0) == "sudo"
     assert words[:4] == [sys.executable, "-m", "pip", "install"]
     assert words[-1] == f"{ROOT}[{extra}]"
+
+
+def test_all_has_every_convenience_and_the_tests_have_them_too() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = {name: set(wanted) for name, wanted in project["optional-dependencies"].items()}
+    each = [extras[name] for name in get_args(Extra)]
+    assert set(extras) == {*get_args(Extra), "all", "test"}
+    assert set.union(*each) == extras["all"]
+    assert extras["all"] <= extras["test"]

@@ -24,6 +24,7 @@ from acsard.config.settings import (
     RobotConfig,
 )
 from acsard.drive.gyro import WORDS
+from acsard.drive.told import missed
 from acsard.messages.report import Report, from_rpy, from_yaw
 from acsard.messages.schema import (
     DiagnosticArray,
@@ -444,6 +445,15 @@ def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> No
     assert told.events[-1] == Happening(told.stamp, "stop", "info", "stopped", "phone", 1)
     assert told.stamp == Time.from_ns(quiet.now.wall_ns)
     assert report.current("events", never) == told
+
+
+def test_a_fault_is_not_pushed_out_by_what_goes_on_and_on() -> None:
+    report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
+    for second, event in enumerate([fault, *[missed(3)] * 100]):
+        list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), look))
+    told = report.current("events", never)
+    assert isinstance(told, Events)
+    assert [(one.name, one.count) for one in told.events] == [("fault", 1), ("missed_periods", 300)]
 
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:

@@ -9,10 +9,12 @@ from typing import Any
 import plotly.graph_objects as library
 import pytest
 
+from acsard.config.parsing import parse
 from acsard.report.drawing import Figure
 from acsard.report.figures import Pictures
-from tests.scenarios.world import START
-from tests.unit.report.driven import course_of, drive_of_two
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import START, World
+from tests.unit.report.driven import course_of, drive_of_two, followed
 from tests.unit.report.seen import column, trace
 
 OFFSET_S = 3600.0
@@ -59,6 +61,39 @@ def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
     rows = [note["text"] for note in figures["who"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
     assert "Silent all the time: app, ros2_control." in figures["who"].caption
+
+
+def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
+    """Colour and pattern of each who drove."""
+    drives = [one for one in figure.data if one["name"].endswith(" drives")]
+    looks = {one["name"].split()[0]: one["marker"] for one in drives}
+    return {
+        name: (look["color"], look.get("pattern", {}).get("shape", ""))
+        for name, look in looks.items()
+    }
+
+
+def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str, Figure]) -> None:
+    who = figures["who"]
+    looks = drivers(who)
+    assert set(looks) == {"teleop", "nav"}
+    assert len(set(looks.values())) == 2
+    keys = {key.meaning: key.colour for key in who.keys}
+    assert {name: keys[f"{name} drives"] for name in looks} == {n: c for n, (c, _) in looks.items()}
+
+
+def test_ten_who_drove_are_told_apart() -> None:
+    rows = [f'[[commands.sources]]\nname = "app{n}"\npriority = {n}\n' for n in range(10)]
+    config, tape = parse("".join(rows).encode()), Tape()
+    world = World(config, recorder=tape)
+    for n in range(10):
+        world.drive(0.3, seconds=0.1, source=f"app{n}")
+        world.run(0.3)
+    figure = Pictures(followed(tape.steps(), config), OFFSET_S).who()
+    library.Figure(data=figure.data, layout=figure.layout)
+    looks = drivers(figure)
+    assert len(looks) == len(set(looks.values())) == 10
+    assert [pattern != "" for _, pattern in looks.values()] == [False] * 8 + [True] * 2
 
 
 def test_a_robot_that_was_never_heard_is_drawn_all_the_same() -> None:

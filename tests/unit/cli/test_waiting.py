@@ -1,0 +1,65 @@
+"""A wait is explained once, and only where nothing comes."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from acsard.cli.waiting import explained
+
+NEVER_S = 3600.0
+
+
+def ended() -> bool:
+    return not any(one.name == "waiting" for one in threading.enumerate())
+
+
+def await_end() -> None:
+    end = time.monotonic() + 10.0
+    while not ended():
+        assert time.monotonic() < end, "it still waits"
+        time.sleep(0.001)
+
+
+def test_a_wait_is_explained_in_one_line_that_is_no_output(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with explained(lambda: "waiting for\x1b[2J acsard/ghost/state", 0.0):
+        await_end()
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert told.err.startswith("acsard: waiting for")
+    assert told.err.strip().isprintable()
+
+
+def test_what_has_come_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    with explained(lambda: "why", NEVER_S) as heard:
+        assert not ended()
+        heard()
+        await_end()
+    assert capsys.readouterr().err == ""
+
+
+def test_what_comes_while_it_looks_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    looking, come = threading.Event(), threading.Event()
+
+    def look() -> str:
+        looking.set()
+        come.wait(10.0)
+        return "why"
+
+    with explained(look, 0.0) as heard:
+        assert looking.wait(10.0)
+        heard()
+        come.set()
+        await_end()
+    assert capsys.readouterr().err == ""
+
+
+def test_who_leaves_leaves_nobody_behind() -> None:
+    with explained(lambda: "why", NEVER_S):
+        pass
+    await_end()
