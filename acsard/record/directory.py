@@ -143,17 +143,18 @@ class Ring:
         plain = [path for path in ended if not path.name.endswith(KEPT)]
         sizes = {path: path.stat().st_size for path in ended}
         oldest_s = wall_ns / 1e9 - self._days * S_PER_DAY
-        gone = [path for path in plain if _began_s(path) < oldest_s]
-        gone += kept[: max(0, len(kept) - KEPT_FILES)]
+        gone = {path for path in plain if _began_s(path) < oldest_s}
+        gone.update(kept[: max(0, len(kept) - KEPT_FILES)])
         room = self._bytes - self.file_bytes - sum(sizes[p] for p in ended if p not in gone)
         for path in plain + kept:
             if room >= 0:
                 break
             if path not in gone:
-                gone.append(path)
+                gone.add(path)
                 room += sizes[path]
-        for path in gone:
-            path.unlink(missing_ok=True)
+        for path in ended:
+            if path in gone:
+                path.unlink(missing_ok=True)
 
     def _sync(self) -> None:
         """The names are on the disk too."""
