@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -107,20 +108,38 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
     assert bus.state()["source"] == "app"
 
 
+TRIES = 3
+"""Of a drive of a minute, which ends where the machine stands still for a moment."""
+
+
+def found_with_a_gyro(daemon: Daemon, bus: Bus) -> dict[str, Any]:
+    """From the first question to what is written."""
+    begins = bus.get("sim/pose")["pose"]["position"]
+    with calibrating(daemon, "--write", "--json") as (terminal, program):
+        asks(terminal, program, STARTS, 1, 10.0)
+        terminal.press("\n")
+        asks(terminal, program, "from its mark", 1, RIDES_S)
+        where = bus.get("sim/pose")["pose"]["position"]
+        way = math.hypot(where["x"] - begins["x"], where["y"] - begins["y"])
+        terminal.press(f"{way:.3f}\n")
+        asks(terminal, program, STARTS, 2, 10.0)
+        terminal.press("\n")
+        assert program.ended(RIDES_S) == 0, terminal.screen
+    return cast(dict[str, Any], json.loads(program.stdout))
+
+
 @pytest.mark.slow
 def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
-        with calibrating(daemon, "--write", "--json") as (terminal, program):
-            asks(terminal, program, STARTS, 1, 10.0)
-            terminal.press("\n")
-            asks(terminal, program, "from its mark", 1, RIDES_S)
-            where = bus.get("sim/pose")["pose"]["position"]
-            terminal.press(f"{(where['x'] ** 2 + where['y'] ** 2) ** 0.5:.3f}\n")
-            asks(terminal, program, STARTS, 2, 10.0)
-            terminal.press("\n")
-            assert program.ended(RIDES_S) == 0, terminal.screen
-        found = json.loads(program.stdout)
+        for left in reversed(range(TRIES)):
+            try:
+                found = found_with_a_gyro(daemon, bus)
+                break
+            except AssertionError as error:
+                if not left or "is late" not in str(error):
+                    raise
+                bus.at_rest()
         written = parse(daemon.config.read_bytes())
     print(f"turn: {found['turn_error_before']:.0f} -> {found['turn_error_after']:.1f} deg in 360")
     assert found["turn_error_after"] < found["turn_error_before"] / 10
