@@ -1,5 +1,5 @@
 """What the robot's page looks like: `python -m tests.pictures DIRECTORY` writes every view as PNG,
-on a phone and on a desktop, light and dark, for people to look at."""
+on a phone upright and sideways and on a desktop, light and dark, for people to look at."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.system.browser import Page
-from tests.system.chromium import DESKTOP, PHONE, Browser, browsing
+from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import Bus, Daemon, until
 
 VIEWS = ("drive", "status", "events", "set", "robots")
 
-SIZES = {"phone": PHONE, "desktop": DESKTOP}
+SIZES = {"phone": PHONE, "sideways": SIDEWAYS, "desktop": DESKTOP}
 
 
 def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = True) -> list[Path]:
@@ -52,13 +52,18 @@ def _drive(bus: Bus) -> None:
     bus.put("cmd/app", {"linear": {"x": "fast"}})
 
 
-def _picture(browser: Browser, directory: Path, size: str, look: str, view: str) -> Path:
-    browser.size(*SIZES[size], touch=size == "phone", dark=look == "dark")
+def show(browser: Browser, view: str) -> None:
+    """That one, when there is something in it."""
     browser.js(f"document.getElementById('tab-{view}').click()")
     rows = {"robots": "#cards a", "set": "#settings div", "status": "#parts li"}
     if row := rows.get(view):
         there = f"document.querySelector({row!r}) !== null"
         until(lambda: browser.js(there), 5.0, row)
+
+
+def _picture(browser: Browser, directory: Path, size: str, look: str, view: str) -> Path:
+    browser.size(*SIZES[size], touch=size != "desktop", dark=look == "dark")
+    show(browser, view)
     browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 300))")
     path = directory / f"{size}-{look}-{view}.png"
     browser.picture(path)

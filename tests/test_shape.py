@@ -46,11 +46,13 @@ PURE_AMONG_SHELLS = (
     "record.earlier",
     "record.layout",
     "record.merge",
+    "record.plausible",
     "record.published",
     "record.replay",
     "record.steps",
     "record.story",
     "record.table",
+    "record.unpickling",
     "top.sections",
     "top.stacked",
     "top.roster",
@@ -71,8 +73,8 @@ PURE_AMONG_SHELLS = (
 PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
     "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math", "msgspec", "numpy",
-    "operator", "re", "rich.cells", "rich.console.Group", "rich.text", "statistics", "struct",
-    "textwrap", "tomlkit", "tomllib", "typing", "xxhash", "zlib",
+    "operator", "pickletools", "re", "rich.cells", "rich.console.Group", "rich.text", "statistics",
+    "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
 itself, knows the time or anything of chance."""

@@ -7,10 +7,12 @@ import os
 import sys
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from acsard.bus.address import Address, address_of
 from acsard.config import parsing as configuration
 from acsard.config.parsing import ConfigError
-from acsard.config.settings import Config
+from acsard.config.settings import RECORD, Config
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.messages.text import printable
@@ -111,6 +113,13 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
         raise ExitError(
             Exit.BAD_CONFIG, f"{count} problem{'s' if count > 1 else ''} in {where}"
         ) from None
+
+
+def recorded(config: Config) -> Config:
+    """Where nothing else says where it is recorded, the environment does: the service's units."""
+    if config.record.directory or RECORD not in os.environ:
+        return config
+    return replace(config, record=replace(config.record, directory=os.environ[RECORD]))
 
 
 def robot_address(args: argparse.Namespace) -> Address:

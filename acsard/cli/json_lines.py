@@ -34,10 +34,16 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-HEARD_S = 3.0
-"""While something may move, the program says something so often, if only `{}`."""
+HEARD_S = 0.9
+"""Who is to stop what moves is heard so often at least: zeros go out a second after the last sign.
 
-LISTEN_S = 0.1
+He says something every 0.1 s, if only `{}`. What a network loses TCP sends again after 0.2 s, and
+once more after 0.4 s: what is lost twice still comes in time, and a STOP that is lost three times
+would be as late. A computer too busy for this has ended the leg before, by 0.5 s without a word of
+the daemon (calibration/guided/riding.py). Driving by hand every command is a sign, and the source's
+timeout holds."""
+
+LISTEN_S = 0.05
 
 LEAVING_S = 1.0
 """Whoever does not read why it ends is waited for so long."""
@@ -194,7 +200,7 @@ class JsonLines:
         """Take what comes in; why no more does, or "" when the conversation is over."""
         held, heard_s = b"", time.monotonic()
         while not self._left:
-            if select.select([self._input], [], [], LISTEN_S)[0]:
+            if self._readable(LISTEN_S):
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
                 if not read or len(held) > LINE_BYTES:
@@ -202,9 +208,13 @@ class JsonLines:
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()
-            elif self._moves and time.monotonic() - heard_s > HEARD_S:
+            elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
                 return f"nothing was heard for {HEARD_S:g} s of who is to stop it"
         return ""
+
+    def _readable(self, wait_s: float) -> bool:
+        """Something has come, or does within so long."""
+        return bool(select.select([self._input], [], [], wait_s)[0])
 
     def _take(self, line: bytes) -> None:
         try:

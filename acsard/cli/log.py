@@ -14,6 +14,7 @@ from acsard.cli import log_export, log_report
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
+from acsard.messages.text import json_line, printable
 
 if TYPE_CHECKING:
     from acsard.record.file import Closing, Recording
@@ -101,7 +102,8 @@ def list_all(args: argparse.Namespace) -> int:
 def _row(path: Path, last: Closing) -> str:
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
-    return f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}".rstrip()
+    row = f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}"
+    return printable(row).rstrip()
 
 
 def _row_of_all(recording: Recording) -> str:
@@ -142,7 +144,8 @@ def show_one(args: argparse.Namespace) -> int:
     for step in steps(recording):
         for one in story.step(step):
             if (begin is None or one.seconds >= begin) and (end is None or one.seconds <= end):
-                print(msgspec.json.encode(one).decode() if args.json else _sentence(one))
+                text = msgspec.json.encode(one).decode() if args.json else ""
+                print(json_line(text) if args.json else printable(_sentence(one)))
     note = _state(recording)
     if note:
         print(f"{recording.path}:{note}", file=sys.stderr)

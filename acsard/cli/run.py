@@ -9,9 +9,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from msgspec.structs import replace
-
-from acsard.cli.common import Overrides, add_config, load
+from acsard.cli.common import Overrides, add_config, load, recorded
 from acsard.config.settings import Config
 
 _BANNER = """\
@@ -80,13 +78,6 @@ def overrides(args: argparse.Namespace) -> Overrides:
     return given
 
 
-def recorded(config: Config) -> Config:
-    """Where nothing else says where to record, the environment does: the service's unit."""
-    if config.record.directory or "ACSARD_RECORD" not in os.environ:
-        return config
-    return replace(config, record=replace(config.record, directory=os.environ["ACSARD_RECORD"]))
-
-
 def main(args: argparse.Namespace) -> int:
     """Run until a signal."""
     import asyncio
@@ -146,6 +137,8 @@ def page(config: Config, where: str) -> list[str] | None:
         words += ["--config", where]
     if config.bus.plain:
         words += ["--connect", reachable(config.bus.plain[0])]
+    if config.record.directory:
+        words += [f"--record={config.record.directory}"]
     return words
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, load
+from acsard.cli.common import Overrides, add_bus, load, recorded
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
@@ -41,6 +41,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="where to listen, may be repeated, in place of all of web.address; "
         "https://0.0.0.0:8443 is for other machines",
     )
+    parser.add_argument(
+        "--record", metavar="DIRECTORY", help="where the recordings are (else record.directory)"
+    )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(
         "--invite", choices=ROLES, help="print an address with a new token, and its QR code"
@@ -64,7 +67,8 @@ def main(args: argparse.Namespace) -> int:
         raise ExitError(
             Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
-    _, config = load(args.config)
+    given: Overrides = {"record": {"directory": args.record}} if args.record else {}
+    config = recorded(load(args.config, given)[1])
     if args.invite:
         return _invite(args, config)
     if args.tokens:

@@ -282,6 +282,10 @@ class LogConfig(Struct, frozen=True):
     format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
 
 
+RECORD = "ACSARD_RECORD"
+"""The environment variable by which the service's units say where it records."""
+
+
 class RecordConfig(Struct, frozen=True):
     directory: Annotated[
         str,

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding
 from acsard.doctor.running import Running
-from acsard.mcu.whose_silence import BUSY
+from acsard.mcu.whose_silence import BUSY, is_ours
 
 LOST = 0.02
 """Share of the lines; a sound link loses none."""
@@ -22,7 +22,7 @@ def link(running: Running) -> Iterator[Finding]:
     mend = check(running)
     if state.link != "up":
         mend = mend if state.link != "down" else "see the port above"
-        if config.mcu.simulated or state.reason.startswith("this computer"):
+        if config.mcu.simulated or is_ours(state.reason):
             mend = BUSY
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)

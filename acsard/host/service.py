@@ -44,6 +44,8 @@ AGAIN = ("tty", "usb-serial", "misc")
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
+    # First by itself, whatever becomes of it: the page's unit mounts the directory it is given.
+    Run(("systemctl", "start", UNIT), may_fail=True),
     Run(("systemctl", "enable", "--now", *ALL)),
 )
 GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))

@@ -82,7 +82,7 @@ class Search:
             self._speeds = sorted(self._seen)
             self._spare = max(1, int(STRAYS * sum(self._seen.values())))
             self._anchor = _anchor(self._speeds, self._seen, self._spare)
-        while True:
+        for _ in range(2 * TRIALS):  # never so often, unless a stranger has made it
             if self._fits:
                 self._fits = False
                 quantum = self._anchor / self._part
@@ -97,8 +97,9 @@ class Search:
                     self._fits = True
                     return False
             if self._tried >= TRIALS:
-                self._tried = 0
-                return False
+                break
+        self._tried = 0
+        return False
 
     def _all_on(self, quantum: float) -> bool:
         """All speeds but a few are multiples of it, roughly."""

@@ -14,6 +14,15 @@ SHARE = 0.5
 BUSY = "what else runs here? (`top`; as a service it goes first)"
 """The mend of a computer that is late."""
 
+HOST = "this computer did not run for"
+
+SIMULATOR = "the built-in simulator, a part of this program, is late"
+
+
+def is_ours(words: str) -> bool:
+    """These are `Lateness.words` of a silence that is of this computer."""
+    return HOST in words or SIMULATOR in words
+
 
 class Lateness:
     """Looks at the times of the steps."""
@@ -36,10 +45,7 @@ class Lateness:
     def words(self, link: LinkState) -> str:
         """How the link is, for people."""
         if link == "stale" and self.late_s:
-            return (
-                f"this computer did not run for {self.late_s:.2f} s, and heard nothing of the "
-                f"microcontroller: {BUSY}"
-            )
+            return f"{HOST} {self.late_s:.2f} s, and heard nothing of the microcontroller: {BUSY}"
         if link == "stale" and self._simulated:
-            return f"the built-in simulator, a part of this program, is late: {BUSY}"
+            return f"{SIMULATOR}: {BUSY}"
         return WORDS[link]

@@ -29,6 +29,7 @@ from acsard.record.layout import (
     Spread,
     Standing,
 )
+from acsard.record.plausible import implausible
 from acsard.record.steps import Said, Status, Step, Taken, checksum, micropose, status_of
 from acsard.values import (
     AcsardError,
@@ -168,6 +169,8 @@ def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
             spread = earlier.spread(_decoder_of_1.decode(data))
         else:
             spread = _spread(_decoder.decode(data))
+        if why := implausible(spread):
+            raise ValueError(why)
         return list(_steps(spread, reason))
     except (msgspec.DecodeError, ValueError, IndexError, StopIteration, RuntimeError) as error:
         raise BatchError(f"not a batch of steps: {error}") from None

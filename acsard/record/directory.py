@@ -13,14 +13,21 @@ import calendar
 import fcntl
 import math
 import os
+import stat
 import time
+from contextlib import suppress
 from pathlib import Path
 
-from acsard.config.settings import RecordConfig
+from acsard.config.settings import RECORD, RecordConfig
 from acsard.host.errors import RecordingError
 from acsard.record.file import MODE, About, Recording, Writing, rewrite
 
 DIRECTORY_MODE = 0o750
+
+OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
+"""Where the service records. Root alone gets to the directory around it, and the page, whose unit
+has it mounted read-only. No group would do: a dynamic one has no name, and later systemds (257)
+keep a state directory as nobody's on the disk."""
 
 KEPT = ".kept.mcap"
 WHOLE = ".mcap"
@@ -71,9 +78,11 @@ class Ring:
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self.file_bytes = self._bytes // FILES
+        self._open = os.environ.get(RECORD) == settings.directory
         if not self._directory.is_dir():
             self._directory.mkdir(parents=True)
             self._directory.chmod(DIRECTORY_MODE)  # whatever the umask takes away
+        # Nobody else may open this one: who can, can hold it.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -87,6 +96,16 @@ class Ring:
         except OSError:
             self.close()
             raise
+        if self._open:
+            self._let_in()
+
+    def _let_in(self) -> None:
+        """Also to what a version has left that recorded for itself alone."""
+        with suppress(OSError):  # somebody else's: to record comes first
+            for path in (self._directory, *listed(self._directory)):
+                mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
+                if stat.S_IMODE(path.stat().st_mode) != mode:
+                    path.chmod(mode)
 
     def close(self) -> None:
         """Give the directory back."""
@@ -97,7 +116,8 @@ class Ring:
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
-        writing = Writing(self._directory / f"{number:06}-{stamp}{PART}", about)
+        path = self._directory / f"{number:06}-{stamp}{PART}"
+        writing = Writing(path, about, OPEN_MODE if self._open else MODE)
         self._sync()
         return writing
 
@@ -123,17 +143,18 @@ class Ring:
         plain = [path for path in ended if not path.name.endswith(KEPT)]
         sizes = {path: path.stat().st_size for path in ended}
         oldest_s = wall_ns / 1e9 - self._days * S_PER_DAY
-        gone = [path for path in plain if _began_s(path) < oldest_s]
-        gone += kept[: max(0, len(kept) - KEPT_FILES)]
+        gone = {path for path in plain if _began_s(path) < oldest_s}
+        gone.update(kept[: max(0, len(kept) - KEPT_FILES)])
         room = self._bytes - self.file_bytes - sum(sizes[p] for p in ended if p not in gone)
         for path in plain + kept:
             if room >= 0:
                 break
             if path not in gone:
-                gone.append(path)
+                gone.add(path)
                 room += sizes[path]
-        for path in gone:
-            path.unlink(missing_ok=True)
+        for path in ended:
+            if path in gone:
+                path.unlink(missing_ok=True)
 
     def _sync(self) -> None:
         """The names are on the disk too."""

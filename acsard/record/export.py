@@ -160,7 +160,8 @@ def export(
         synced(stream)
 
     def messages(stream: BinaryIO) -> _Messages:
-        return _Messages(stream, course.robot, recording.about, recording.path.name)
+        with course.living():
+            return _Messages(stream, course.robot, recording.about, recording.path.name)
 
     with beside(new, force) as part:
         if kind == "rosbag2":

@@ -14,7 +14,7 @@ import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import zstandard
@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import IndexType, Writer
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from acsard.host.errors import RecordingError
 from acsard.record import earlier
@@ -58,6 +58,10 @@ DAMAGE = (
 """All that the library raises for bytes that are no MCAP."""
 
 
+Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+"""A time that calendars have."""
+
+
 class About(Struct, frozen=True):
     """Whose recording it is."""
 
@@ -65,22 +69,22 @@ class About(Struct, frozen=True):
     version: str
     """Of acsard."""
     python: str
-    mono_ns: int
-    wall_ns: int
+    mono_ns: Ns
+    wall_ns: Ns
     """Both clocks when it began."""
     config: str = ""
     """The `acsard.toml` in force, all keys in it."""
     format: str = FORMAT
-    started_ns: int = 0
+    started_ns: Ns = 0
     """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
 
 
 class Closing(Struct, frozen=True):
     """What a finished file says of itself at its end, so that a list need not read all of it."""
 
-    wall_ns: int
+    wall_ns: Ns
     """When it began."""
-    last_ns: int
+    last_ns: Ns
     """When its last message begins."""
     said: str
     """What happened, in a few words."""
@@ -89,11 +93,11 @@ class Closing(Struct, frozen=True):
 class Writing:
     """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
 
-    def __init__(self, path: Path, about: About) -> None:
-        self.path = path
+    def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
+        self.path, self._mode = path, mode
         self._about, self._last_ns = about, about.wall_ns
         self._news: list[Told] = []
-        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE), "wb")
+        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
         except OSError:
@@ -101,7 +105,7 @@ class Writing:
             raise
 
     def _open(self, about: About) -> None:
-        os.fchmod(self._file.fileno(), MODE)  # whatever the umask takes away
+        os.fchmod(self._file.fileno(), self._mode)  # whatever the umask takes away
         self._writer = Writer(
             self._file, CHUNK_BYTES, index_types=IndexType.ATTACHMENT | IndexType.METADATA
         )

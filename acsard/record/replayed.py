@@ -16,7 +16,7 @@ from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
 from acsard.record.replay import Difference, Replay, Seen, Tally, fastest
-from acsard.record.state import State, StateError, thaw
+from acsard.record.state import State, StateError, short, thaw
 from acsard.record.steps import MICRO, Step
 from acsard.robot import Robot
 from acsard.values import Outputs
@@ -32,6 +32,12 @@ EVERY = 1024
 
 def quietly(wall_ns: int) -> None:
     """Progress that nobody looks at."""
+
+
+LACKS = (
+    AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError, MemoryError
+)  # fmt: skip
+"""What a robot raises that has not the parts it ought to have."""
 
 
 class Lived(NamedTuple):
@@ -76,15 +82,13 @@ class Course:
         self.trouble = ""
         """Why it was not gone to the end of the file, "" when it was."""
         self._recording = recording
-        state = _state(recording)
-        if state is None:
-            self.robot = Robot(self.config)
-            self.last = b""
-        else:
-            self.robot, self.last = state
+        self._state, begins = _state(recording), Robot(self.config)
+        self.robot, self.last = self._state or (begins, b"")
+        if self._state is not None:
             # by newer code, its parts may have what it knows nothing of
-            adopt(self.robot, Robot(config_of(recording)), Robot(self.config))
-        self._state = state
+            begun = Robot(config_of(recording))
+            with self.living():
+                adopt(self.robot, begun, begins)
 
     @contextmanager
     def living(self) -> Iterator[None]:
@@ -111,8 +115,8 @@ class Course:
 def live(recording: Recording, other: Config | None = None, progress: Progress = quietly) -> Lived:
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
     course = Course(recording, other)
-    replay = Replay(course.config, course.robot, course.last)
     with course.living():
+        replay = Replay(course.config, course.robot, course.last)
         for number, step in enumerate(course.steps()):
             if number % EVERY == 0:
                 progress(step.inputs.now.wall_ns)
@@ -131,12 +135,19 @@ class Onlooker:
         self.config = config_of(recording)
         try:
             self._began = _state(recording)
-            if self._began is not None:
-                adopt(self._began.robot, Robot(self.config), Robot(self.config))
+            with self.living():
+                if self._began is not None:
+                    adopt(self._began.robot, Robot(self.config), Robot(self.config))
+                self.replay = Replay(self.config, *(self._began or ()))
         except RecordingError as error:
-            self._began = None
+            self._began, self.replay = None, Replay(self.config)
             self.notes.append(f"what is computed begins with a robot that knows nothing: {error}")
-        self.replay = Replay(self.config, *(self._began or ()))
+
+    @contextmanager
+    def living(self) -> Iterator[None]:
+        """Around what asks the robot; raises `RecordingError` where its state lacks the answer."""
+        with _known(self._recording, self._began):
+            yield
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Each step as it was recorded, what it decides now, and the robot after it.
@@ -148,7 +159,7 @@ class Onlooker:
             if number is None and self._began is None and step.number > 0 and not self.notes:
                 self.notes.append("its first steps are missing: the robot is begun without them")
             number = step.number
-            with _known(self._recording, self._began):
+            with self.living():
                 self.replay.step(step)
             if self.replay.outputs is not None:
                 yield step, self.replay.outputs, self.replay.robot
@@ -168,13 +179,16 @@ def _state(recording: Recording) -> State | None:
 
 @contextmanager
 def _known(recording: Recording, state: State | None) -> Iterator[None]:
-    """A robot of other code may lack, deep in it, what the code of today asks for."""
+    """A robot of other code, or that a stranger has made, may lack what is asked of it, or have
+    something else in its place, however deep in it."""
     try:
         yield
-    except AttributeError as error:
+    except RecordingError:
+        raise
+    except LACKS as error:
         if state is None:
             raise
-        lacks = f"this version cannot read the state at its start: {error}"
+        lacks = f"this version cannot read the state at its start: {short(error)}"
         raise _foreign(recording, lacks) from error
 
 

@@ -1,8 +1,8 @@
 """A robot between two steps -> bytes, and back: where a recording that begins later begins.
 
-Written by pickle, which copies a robot in a fraction of a millisecond. Read by one that makes
-nothing but values and the robot's own parts: what a stranger's file asks for beyond that is
-refused.
+Written by pickle, which copies a robot in a fraction of a millisecond. Read by `unpickling.py`,
+which makes nothing but values and the robot's own parts: what a stranger's file asks for beyond
+that is refused.
 """
 
 from __future__ import annotations
@@ -10,18 +10,28 @@ from __future__ import annotations
 import copyreg
 import io
 import pickle
-from typing import Any, NamedTuple
+import sys
+from collections import Counter, deque
+from typing import NamedTuple
 
 from acsard.drive.modes import Mode, Trigger
+from acsard.messages.text import printable
+from acsard.record.unpickling import unpickled
 from acsard.robot import Robot
 from acsard.values import AcsardError
 
 ROOMS = ("acsard.values", "acsard.robot", "acsard.config.settings", "acsard.drive.", "acsard.mcu.")
 """Whose classes a robot is made of; none of them does anything when it is made."""
 
-BESIDE = {("collections", "Counter"), ("collections", "deque")}
+BESIDE: dict[tuple[str, str], type] = {
+    ("collections", "Counter"): Counter,
+    ("collections", "deque"): deque,
+}
 
 PROTOCOL = 5
+
+MOST_TEXT = 200
+"""Characters of what is wrong with it."""
 
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
@@ -54,22 +64,31 @@ def freeze(robot: Robot, last: bytes) -> bytes:
 def thaw(data: bytes) -> State:
     """The robot as it was; raises `StateError` if that cannot be made here."""
     try:
-        robot, last = _Reader(io.BytesIO(data)).load()
-    except Exception as error:  # noqa: BLE001 - pickle raises whatever its bytes lead to
-        raise StateError(f"this version cannot read the state at its start: {error}") from None
-    if not isinstance(robot, Robot) or not isinstance(last, bytes):
-        raise StateError("the state at its start is not that of a robot")
-    return State(robot, last)
+        made = unpickled(data, part)
+    except ValueError as error:
+        text = f"this version cannot read the state at its start: {short(error)}"
+        raise StateError(text) from None
+    match made:
+        case (Robot() as robot, bytes() as last):
+            return State(robot, last)
+    raise StateError("the state at its start is not that of a robot")
 
 
-class _Reader(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        """A class of ours by its own name, no function, nothing found by way of another."""
-        ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)
-        if "." in name or not (ours or (module, name) in BESIDE):
-            raise pickle.UnpicklingError(f"{module}.{name} is no part of a robot")
-        found = super().find_class(module, name)
-        at_home = isinstance(found, type) and found.__module__ == module
-        if not at_home:
-            raise pickle.UnpicklingError(f"{module}.{name} is not a class of that module")
-        return found
+def short(error: Exception) -> str:
+    """Its words, which may be a stranger's."""
+    return printable(str(error))[:MOST_TEXT]
+
+
+def part(module: str, name: str) -> type:
+    """A class that a robot has parts of; raises `ValueError` for any other.
+
+    By its own name, and of a module that is there: nothing is imported, nothing is found by way of
+    another, and what only names or raises something is none.
+    """
+    if (module, name) in BESIDE:
+        return BESIDE[module, name]
+    ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)
+    found = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
+    if not isinstance(found, type) or found.__module__ != module or found.__name__ != name:
+        raise ValueError(f"{module:.50}.{name:.50} is no part of a robot")
+    return found

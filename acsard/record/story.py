@@ -9,19 +9,26 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
+from msgspec.structs import replace
 
+from acsard.mcu.whose_silence import is_ours
 from acsard.record.steps import MICRO, Step
 from acsard.values import Event
+
+FURTHEST_S = 2**63 / 1e9
+"""s from 1970, three hundred years: what is further is no time of a recording's."""
 
 
 class Told(Struct, frozen=True, omit_defaults=True):
     """A sentence; `seconds` are wall-clock time since 1970."""
 
-    seconds: float
+    seconds: Annotated[float, Meta(ge=-FURTHEST_S, le=FURTHEST_S)]
     name: str
-    """The event's, or `start`, `drive`, `gap` and `end`."""
+    """The event's, `link_late` of a `link_stale` that this computer was to blame for, `link_heard`
+    where more is told of a link that is gone already, or `start`, `drive`, `gap` and `end`."""
     text: str
     level: str = "info"
     by: str = ""
@@ -30,7 +37,27 @@ class Told(Struct, frozen=True, omit_defaults=True):
 
 def told(event: Event, wall_ns: int) -> Told:
     """The sentence of an event at that time."""
-    return Told(wall_ns / 1e9, event.name, event.text, event.level, event.by, event.count)
+    late = event.name == "link_stale" and is_ours(event.text)
+    name = "link_late" if late else event.name
+    return Told(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
+
+
+class Losses:
+    """Of what is told of the link: whether it went, or is gone already."""
+
+    def __init__(self) -> None:
+        self._told: set[str] = set()
+        """Since it was up."""
+
+    def again(self, name: str) -> bool:
+        """This has been told since the link was up."""
+        if name == "link_up":
+            self._told.clear()
+        if name not in ("link_down", "link_booting", "link_stale", "link_late"):
+            return False
+        before = name in self._told
+        self._told.add(name)
+        return before
 
 
 class Story:
@@ -44,6 +71,7 @@ class Story:
         self._way = 0.0
         self._source = ""
         self._leaving = False
+        self._losses = Losses()
 
     def step(self, step: Step) -> Iterator[Told]:
         """What there is to say of it."""
@@ -56,7 +84,8 @@ class Story:
         self._number = step.number
         yield from self._drive(step, wall_s)
         for event in step.said.events:
-            yield told(event, step.inputs.now.wall_ns)
+            one = told(event, step.inputs.now.wall_ns)
+            yield replace(one, name="link_heard") if self._losses.again(one.name) else one
         if step.inputs.leaving and not self._leaving:
             yield Told(wall_s, "end", "the daemon is told to end")
         self._leaving = step.inputs.leaving
@@ -81,23 +110,26 @@ class Story:
 NEWS = {
     "fault": "fault",
     "stop": "stop",
-    "link_down": "port lost",
-    "link_stale": "board silent",
-    "mcu_restarted": "board restarted",
+    "link_down": "lost port",
+    "link_stale": "board silence",
+    "link_late": "computer stall",
+    "mcu_restarted": "board restart",
     "commander": "takeover",
     "command_refused": "refused command",
     "wheels_doubted": "doubted wheel",
+    "link_up": "",
 }
-"""What a list says of a recording, and how."""
+"""What a list says of a recording, and how; nothing of what only ends something else."""
 
 
 def summary(events: Iterable[Told]) -> str:
     """What happened, in a few words: who stopped it, and how often the rest was."""
     counts: Counter[str] = Counter()
     stopped: list[str] = []
+    losses = Losses()
     for event in events:
         word = NEWS.get(event.name)
-        if word is None:
+        if losses.again(event.name) or not word:
             continue
         if event.name == "stop" and event.by and event.by not in stopped:
             stopped.append(event.by)

@@ -95,6 +95,8 @@ def summary(course: Course) -> str:
     faults = many(counts["fault"], "fault")
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
+    late = counts["link_late"]
+    link += f", {many(late, 'stall')} of the robot's computer" if late else ""
     return f"{way} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
 
 

@@ -24,7 +24,7 @@ from acsard.report.thinning import Place
 HEADINGS = 12
 """Arrows along a path."""
 
-NOTED = ("fault", "stop", "link_down", "link_stale")
+NOTED = ("fault", "stop", "link_down", "link_stale", "link_late")
 """Events that the path shows where they happened."""
 
 

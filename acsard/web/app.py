@@ -21,7 +21,7 @@ from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
-from acsard.web.limits import FULL, Seats, Tries
+from acsard.web.limits import Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports
 from acsard.web.requests import (
@@ -224,8 +224,10 @@ class Page:
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         who, peer = _who(request), request.remote or ""
-        if not self._seats.enter(peer, who.token):
-            return self.refused(Refusal("too_many", FULL))
+        if full := self._seats.enter(peer, who.token):
+            answer = self.refused(Refusal("too_many", full))
+            answer.force_close()  # who asks again and again keeps no connection either
+            return answer
         try:
             served = web.WebSocketResponse(
                 max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
@@ -255,7 +257,9 @@ class Page:
 
     async def _whoami(self, request: web.Request) -> web.StreamResponse:
         who = _who(request)
-        return web.json_response({"role": who.role, "name": who.name})
+        # A browser does not tell its page why a WebSocket was refused; this does.
+        full = self._seats.missing(request.remote or "", who.token)
+        return web.json_response({"role": who.role, "name": who.name, "full": full})
 
     async def _settings(self, request: web.Request) -> web.StreamResponse:
         return await self._programs.settings(_who(request))

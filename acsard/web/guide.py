@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.needs import NEEDS, SIMULATED
 from acsard.host import clock
 from acsard.host.exits import WORDS, Exit
 from acsard.host.threads import in_thread
@@ -32,8 +32,9 @@ LINE_BYTES = 65536
 LAST_BYTES = 4000
 """Of what it said to standard error."""
 
-RELAY_NS = NS_PER_S // 4
-"""So often it is told that the browser is heard."""
+RELAY_NS = NS_PER_S // 20
+"""So often at most it is told that the browser is heard: about twice as often as that says so
+(page/guide.js), so that none of its signs is lost on the way."""
 
 PATIENCE_S = 6.0
 """For its zeros and its end, once it was told to leave."""
@@ -51,6 +52,10 @@ class Choices(Struct, frozen=True):
 
     ways: dict[str, str]
     """Of calibrating, and what each needs."""
+    way: str
+    """The one to begin with; "" is the usual one."""
+    advice: str
+    """Why that one, and which others there are to choose from here."""
     ports: Sequence[Board]
     note: str
     """What this server cannot do, and what to type instead."""
@@ -74,10 +79,11 @@ class Guide:
         self._errand: _Errand | None = None
         self._task: asyncio.Task[None] | None = None
 
-    async def choices(self) -> Choices:
-        """What may be begun now."""
-        found = await in_thread(lambda: boards(self._configured), BOARDS_S)
-        return Choices(NEEDS, found, NO_DEVICE if len(found) == 1 else "")
+    async def choices(self, *, simulated: bool) -> Choices:
+        """What may be begun now, with a robot that is simulated or not."""
+        found = await self._boards()
+        way, advice = SIMULATED if simulated else ("", "")
+        return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
         """He is told who goes through what."""
@@ -159,7 +165,10 @@ class Guide:
     async def _ports(self, asked: Begin) -> list[str]:
         if asked.begin != "check":
             return []
-        return [one.port for one in (await self.choices()).ports]
+        return [one.port for one in await self._boards()]
+
+    async def _boards(self) -> list[Board]:
+        return await in_thread(lambda: boards(self._configured), BOARDS_S)
 
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():

@@ -13,13 +13,13 @@ MESSAGES_HZ, MESSAGES_AT_ONCE = 200.0, 400.0
 OVERRUNS = 600
 """So many messages too many end a connection."""
 
-CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN = 100, 20, 30
-"""WebSockets: in all, of one address, and with one token, from wherever."""
+CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
+"""WebSockets of who comes from elsewhere: in all, of one address, with one token from wherever,
+and with one token from one address. So a program that opens one after the other shuts out nobody
+who comes from its address with another token."""
 
-FULL = (
-    f"there is room for {CONNECTIONS} pages, {CONNECTIONS_OF_ONE} of one address, "
-    f"{CONNECTIONS_OF_TOKEN} with one token: close some"
-)
+CONNECTIONS_HERE = 20
+"""Of who is at the machine, and of nobody else: no stranger shuts out the robot's own browser."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
 """Keys of other robots that are followed: in all, and for one token. Those of the page's own robot
@@ -80,9 +80,13 @@ class Places:
         """By all."""
         return self._taken.total()
 
+    def room(self, address: str) -> bool:
+        """Is there a place?"""
+        return self._taken[address] < self._of_one and self.taken < self._most
+
     def enter(self, address: str) -> bool:
         """Take a place, if there is one."""
-        if self._taken[address] >= self._of_one or self.taken >= self._most:
+        if not self.room(address):
             return False
         self._taken[address] += 1
         return True
@@ -95,26 +99,53 @@ class Places:
 
 
 class Seats:
-    """Room for the pages that are open: of an address, and with a token where there is one."""
+    """Room for the pages that are open: at the machine (without a token), and from elsewhere."""
 
     def __init__(self) -> None:
-        self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
+        self._alike = Places(CONNECTIONS, CONNECTIONS_ALIKE)
         self._tokens = Places(CONNECTIONS, CONNECTIONS_OF_TOKEN)
+        self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
-    def enter(self, address: str, token: str) -> bool:
-        """Take a place, if there is one."""
-        if not self._addresses.enter(address):
-            return False
-        if token and not self._tokens.enter(token):
-            self._addresses.leave(address)
-            return False
-        return True
+    def missing(self, address: str, token: str) -> str:
+        """Why there is no room for one more, and what to do; "" where there is."""
+        for places, name, full in self._places(address, token):
+            if not places.room(name):
+                return full
+        return ""
+
+    def enter(self, address: str, token: str) -> str:
+        """Take a place; why there is none, or ""."""
+        if full := self.missing(address, token):
+            return full
+        for places, name, _ in self._places(address, token):
+            places.enter(name)
+        return ""
 
     def leave(self, address: str, token: str) -> None:
         """Give it back."""
-        self._addresses.leave(address)
-        if token:
-            self._tokens.leave(token)
+        for places, name, _ in self._places(address, token):
+            places.leave(name)
+
+    def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
+        """Which a page takes one of each, under which name, and what is said when they are full."""
+        if not token:
+            here = f"{CONNECTIONS_HERE} pages are open at the machine itself: close some"
+            return [(self._here, address, here)]
+        alike = (
+            f"with this token {CONNECTIONS_ALIKE} pages are open at {address} already: close some, "
+            "or be invited by a token of your own"
+        )
+        spread = f"with this token {CONNECTIONS_OF_TOKEN} pages are open already: close some"
+        full = (
+            f"there is room for {CONNECTIONS} pages, {CONNECTIONS_OF_ONE} of them from one "
+            "address: close some"
+        )
+        return [
+            (self._alike, f"{address} {token}", alike),
+            (self._tokens, token, spread),
+            (self._addresses, address, full),
+        ]
 
 
 class Shares:

@@ -151,6 +151,8 @@ _CHOICES: Described = {
             "description": "of calibrating, and what each needs",
             "additionalProperties": {"type": "string"},
         },
+        "way": {"type": "string", "description": "the one to begin with; none is the usual one"},
+        "advice": {"type": "string", "description": "why that one, where it is not the usual"},
         "ports": {
             "type": "array",
             "items": {
@@ -162,11 +164,13 @@ _CHOICES: Described = {
     },
 }
 
+_WHO = "Role and name, and `full`: why there is no room for one more WebSocket, or nothing."
+
 _OTHERS: Described = {
     "/api/whoami": {
         "get": {
             "summary": "who you are here",
-            "responses": {"200": _answer("Role and name.", {"type": "object"})},
+            "responses": {"200": _answer(_WHO, {"type": "object"})},
         }
     },
     "/api/settings": {

@@ -72,7 +72,8 @@ class Programs:
         if not who.may("maintainer"):
             self._counts.refuse("role")
             raise TroubleError(403, f"checks and calibrations are for maintainers, not {who.role}")
-        body = msgspec.json.encode(await guide.choices())
+        choices = await guide.choices(simulated=self._robots.about.simulated)
+        body = msgspec.json.encode(choices)
         return web.Response(body=body, content_type="application/json")
 
     async def value(self, who: Who, key: str) -> web.Response:

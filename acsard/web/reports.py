@@ -15,9 +15,11 @@ import asyncio
 import gzip
 import os
 import resource
+import signal
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -39,6 +41,9 @@ POLICY = (
 run, the report's own policy says by their hashes: both hold."""
 
 NICE = 19
+
+FIRST_TO_GO = b"1000"
+"""Of `oom_score_adj`: when memory runs out, ours or the computer's, it goes before the page."""
 
 DRAW_S = 600.0
 """A full file of the black box, an hour or four, takes minutes on a small computer."""
@@ -66,6 +71,10 @@ TOO_LONG = (
 )
 TOO_MUCH = (
     f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, by acsard log report"
+)
+KILLED = (
+    "it was ended from outside, for want of memory most likely: draw it on another machine, by "
+    "acsard log report"
 )
 TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, by acsard log report --from --to"
 
@@ -172,6 +181,8 @@ class Reports:
             if child.returncode is None:
                 child.kill()
                 await child.wait()
+        if code == -signal.SIGKILL:
+            raise _FailedError(KILLED)
         if code:
             raise _FailedError(_why(said) or f"the program that draws it ended with {code}")
         return body
@@ -192,6 +203,8 @@ def _why(said: str) -> str:
 def _hold_down(child: Process) -> None:
     """It takes what nobody else wants, and no more than so much of it."""
     try:
+        with suppress(OSError):
+            Path(f"/proc/{child.pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
         os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
         resource.prlimit(child.pid, resource.RLIMIT_DATA, (MEMORY, MEMORY))
     except ProcessLookupError:

@@ -31,6 +31,9 @@ BATCH = 200
 
 HOUR_S, MINUTE_S = 3600.0, 60.0
 
+PAGE_MB = 120.0
+"""The page's server, with a calibration that somebody goes through."""
+
 
 class Streamed:
     """A black box that writes as it goes: an hour does not fit into memory."""
@@ -120,3 +123,16 @@ def test_an_hour_needs_hardly_more_memory_than_a_minute(
         f"minute: {little.megabytes:.0f} MB)"
     )
     assert much.megabytes < little.megabytes + 2 * size + 50
+
+
+def test_a_report_of_an_hour_has_room_beside_the_page_in_its_service(
+    both: tuple[Path, Path], tmp_path: Path
+) -> None:
+    unit = (ROOT / "deploy/systemd/acsard-web.service").read_text()
+    room = int(unit.partition("MemoryMax=")[2].partition("M")[0])
+    little, much = (cost("log", "report", str(path), str(tmp_path / path.stem)) for path in both)
+    print(
+        f"\na report of an hour: {much.seconds:.0f} s ({much.processor:.0f} s of a processor), "
+        f"{much.megabytes:.0f} MB resident at most (a minute: {little.megabytes:.0f} MB)"
+    )
+    assert PAGE_MB + much.megabytes < room

@@ -99,6 +99,7 @@ def test_ten_minutes_through_every_fault_are_lived_again() -> None:
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(7200)
 def test_an_hour_through_every_fault_is_lived_again() -> None:
     lives_again(taped(PLAIN, 3600.0), PLAIN)
 

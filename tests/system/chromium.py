@@ -33,7 +33,17 @@ OPTIONS = (
     "--disable-dev-shm-usage", "--touch-events=enabled", "--remote-debugging-port=0",
 )  # fmt: skip
 
-PHONE, DESKTOP = (390, 844), (1280, 800)
+PHONE, SIDEWAYS, DESKTOP = (390, 844), (844, 390), (1280, 800)
+
+FINGER_PX = 44
+"""What is to be pressed is so wide and high at least."""
+
+_PRESSED = """[...document.querySelectorAll('button, a, input, select, #stick')]
+    .filter(one => one.checkVisibility())
+    .map(one => one.type === 'checkbox' ? one.closest('label') : one)
+    .map(one => [one.id || one.textContent, one.getBoundingClientRect()])
+    .filter(([, box]) => Math.min(box.width, box.height) < LEAST)
+    .map(([name, box]) => [name, box.width, box.height])"""
 
 
 class Browser:
@@ -181,6 +191,10 @@ class Browser:
         box = f"document.getElementById({name!r}).getBoundingClientRect()"
         found = self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         return found[0], found[1]
+
+    def too_small(self) -> list[Any]:
+        """What is shown, is to be pressed and is too small for a finger: name, width, height."""
+        return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """`kind` is Start, Move, End or Cancel; the fingers that are down then."""

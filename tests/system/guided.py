@@ -11,7 +11,7 @@ from typing import Any
 from tests.system.browser import Hands, Page, hands
 from tests.system.harness import Daemon, Tables, children, free_endpoint, until, write_config
 
-PING_S = 0.5
+PING_S = 0.1
 
 WHEELS = ("fr", "fl", "rl", "rr")
 
@@ -28,8 +28,13 @@ class NoDaemon(Daemon):
 class Guided:
     """What the child says, in order; pings go on as a browser's."""
 
-    def __init__(self, ours: Hands) -> None:
-        self.ours = ours
+    def __init__(self, ours: Hands, pinging: asyncio.Task[None] | None = None) -> None:
+        self.ours, self._pinging = ours, pinging
+
+    def falls_silent(self) -> None:
+        """No pings from now on; nothing closes."""
+        if self._pinging is not None:
+            self._pinging.cancel()
 
     async def begin(self, what: str, **more: object) -> None:
         await self.ours.say(begin=what, **more)
@@ -75,12 +80,11 @@ class Guided:
 async def guiding(page: Page, *, pings: bool = True, token: str = "") -> AsyncIterator[Guided]:
     """Connected, as a page that is looked at."""
     async with hands(page, token) as ours:
-        pinging = asyncio.create_task(_ping(ours)) if pings else None
+        guided = Guided(ours, asyncio.create_task(_ping(ours)) if pings else None)
         try:
-            yield Guided(ours)
+            yield guided
         finally:
-            if pinging is not None:
-                pinging.cancel()
+            guided.falls_silent()
 
 
 async def _ping(ours: Hands) -> None:

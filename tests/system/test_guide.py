@@ -15,10 +15,12 @@ import aiohttp
 import pytest
 
 from acsard.cli.json_lines import HEARD_S
+from acsard.lan.authority import Authority
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
 from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
-from tests.system.harness import Bus, Daemon, Program, acsard, until
+from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until, wheels
+from tests.system.hosts import Hosts, inside, on
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
 
@@ -166,6 +168,76 @@ def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> 
     run(story)
 
 
+def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
+    page: Page, standing: Bus
+) -> None:
+    async def story() -> None:
+        async with guiding(page) as guided:
+            await drives(guided, standing)
+            silent = time.monotonic()
+            guided.falls_silent()
+            await beside(standing.at_rest)
+            took = time.monotonic() - silent
+            # And the ramp: 0.3 m/s at 1 m/s2, and some of the way.
+            assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
+
+    run(story)
+    none_left(page)
+
+
+LINES = 10
+"""That have had one speed: it is steady."""
+
+
+@pytest.mark.network
+def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
+    hosts: Hosts, tmp_path: Path
+) -> None:
+    """Nothing closes, and nobody is told."""
+    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [hosts.address], 1)
+
+    def fast(since: float) -> float:
+        """The speed of a wheel in the last lines, which all have it; 0 when they have not."""
+        said = [one.line for one in peer.since(since) if one.line != b"-"][-LINES:]
+        speeds = [abs(wheels(line)[0]) for line in said]
+        steady = len(speeds) == LINES and len(set(speeds)) == 1
+        return speeds[0] if steady else 0.0
+
+    def slower(gone: float, than: float) -> float | None:
+        """When the first slower line came."""
+        for one in peer.since(gone):
+            if one.line != b"-" and abs(wheels(one.line)[0]) < than:
+                return one.at
+        return None
+
+    async def story() -> None:
+        async with guiding(served, token=token) as guided:
+            await guided.begin("calibrate", way="umbmark")
+            await guided.answer(await guided.asks("How wide"), 300)
+            begun = time.monotonic()
+            await guided.starts("1. Set the robot")
+            speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
+            hosts.cut()
+            gone = time.monotonic()
+            try:
+                at = await beside(lambda: until(lambda: slower(gone, speed), 5.0, "it slows down"))
+            finally:
+                hosts.heal()
+            print(f"slower after {at - gone:.2f} s")
+            # Its server, the command and the daemon, which a busy machine keeps waiting.
+            assert at - gone < 1.0 + 3 * lost(gone, at)
+
+    with (
+        FarPeer(tmp_path) as peer,
+        on(hosts.robot, Daemon(tmp_path, peer.path)) as daemon,
+        on(hosts.robot, Page(daemon, tmp_path, at=hosts.address)) as served,
+    ):
+        token = served.invite("maintainer", "phone")
+        with inside(hosts.stranger):
+            run(story)
+        none_left(served)
+
+
 def test_a_server_that_is_killed_at_a_question_takes_its_child_with_it(
     daemon: Daemon, tmp_path: Path
 ) -> None:
@@ -291,6 +363,9 @@ def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -
                 assert end["meaning"] == "port, bus address or robot id in use"
                 assert f"process {holder.pid}" in end["text"]
                 assert "systemctl stop acsard" in end["text"]
+            told = json.loads(await text(f"{served.here}/api/guide"))
+            # A pty is a port like any other: what is said of the simulator is not said of it.
+            assert (told["way"], told["advice"]) == ("", "")
 
         with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
             with Bus(holder.endpoint) as bus:
@@ -321,6 +396,8 @@ def test_what_may_be_begun_is_listed(page: Page) -> None:
     async def story() -> None:
         told = json.loads(await text(f"{page.here}/api/guide"))
         assert sorted(told["ways"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+        assert told["way"] == "positions"
+        assert "no floor to lay a tape on" in told["advice"]
         assert told["ports"][0]["port"] == "sim"  # the configured one
         if len(told["ports"]) == 1:
             assert "systemctl stop acsard" in told["note"]

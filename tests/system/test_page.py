@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import re
@@ -9,17 +10,20 @@ import signal
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import AsyncExitStack, suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import aiohttp
 import pytest
 
 from acsard.lan.authority import Authority
+from acsard.web.limits import CONNECTIONS_HERE
 from tests import pictures
 from tests.pictures import VIEWS
-from tests.system.browser import NAME, Page
-from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.browser import NAME, Hands, Page, hands, run
+from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import Bus, Daemon, Program, until
 
 pytestmark = [
@@ -193,30 +197,94 @@ def test_somebody_else_who_drives_is_named(page: Phone) -> None:
         page.browser.touch("End")
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP])
-def test_stick_and_stop_fit_on_the_screen_and_nothing_is_wider_than_it(
+SMALL, SMALL_SIDEWAYS = (375, 667), (667, 375)
+SCREENS = [PHONE, SMALL, SIDEWAYS, SMALL_SIDEWAYS, DESKTOP]
+
+BOXES = """['stick', 'stop', 'limit', 'hint', 'speed', 'mode', 'map'].map(name => {
+    const box = document.getElementById(name).getBoundingClientRect();
+    return [name, box.left, box.top, box.right, box.bottom];
+})"""
+
+PIECE_PX = 90
+"""Of the path, and of the stick."""
+
+
+@pytest.mark.parametrize("size", SCREENS)
+def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
     page: Phone, size: tuple[int, int]
 ) -> None:
-    page.browser.size(*size, touch=size == PHONE)
-    for name in ("stick", "stop", "limit", "mode", "map"):
-        box = page.browser.js(
-            f"(b => [b.left, b.top, b.right, b.bottom])"
-            f"(document.getElementById({name!r}).getBoundingClientRect())"
-        )
-        assert box[0] >= 0
-        assert box[1] >= 0
-        assert box[2] <= size[0]
-        assert box[3] <= size[1], name
+    page.browser.size(*size, touch=size != DESKTOP)
+    boxes = {name: tuple(box) for name, *box in page.browser.js(BOXES)}
+    for name, (left, top, right, bottom) in boxes.items():
+        assert left >= 0, name
+        assert top >= 0, name
+        assert right <= size[0], name
+        assert bottom <= size[1], name
+    for one, other in itertools.combinations(boxes, 2):
+        a, b = boxes[one], boxes[other]
+        apart = a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
+        assert apart, (one, a, other, b)
+    for name in ("map", "stick"):
+        left, top, right, bottom = boxes[name]
+        assert min(right - left, bottom - top) >= PIECE_PX, name
+    # Nothing is hidden behind an edge that would have to be scrolled.
+    more = "(one => one.scrollHeight - one.clientHeight)(document.querySelector('main'))"
+    assert page.browser.js(more) <= 0
     for view in VIEWS:
         page.browser.js(f"document.getElementById('tab-{view}').click()")
         assert page.browser.js("document.documentElement.scrollWidth") <= size[0], view
 
 
+def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
+    page.bus.get("srv/stop")
+    page.shows("mode", "STOPPED")  # with Clear
+    for size, view in itertools.product((PHONE, SIDEWAYS, SMALL_SIDEWAYS), VIEWS):
+        page.browser.size(*size)
+        pictures.show(page.browser, view)
+        assert page.browser.too_small() == [], (size, view)
+
+
+def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) -> None:
+    seen = "getComputedStyle(document.getElementById('hint')).visibility"
+    page.shows("hint", "Hold and push to drive; let go to stop.")
+    assert page.browser.js(seen) == "visible"
+    page.hold()
+    assert page.browser.js(seen) == "hidden"
+    page.browser.touch("End")
+    until(lambda: page.browser.js(seen) == "visible", 5.0, "the words again")
+
+
+def test_a_page_that_has_no_place_says_why(page: Phone) -> None:
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            left = CONNECTIONS_HERE
+            while left:  # the page that was open here goes when it is noticed
+                with suppress(aiohttp.WSServerHandshakeError):
+                    other = await stack.enter_async_context(hands(page.server))
+                    reading.append(asyncio.create_task(read(other)))
+                    left -= 1
+            await asyncio.to_thread(look)
+
+    reading: list[asyncio.Task[None]] = []
+
+    async def read(other: Hands) -> None:
+        """As one who is there, however long it takes."""
+        async for _ in other.socket:
+            pass
+
+    def look() -> None:
+        page.browser.open(page.server.here)
+        page.shows("reason", f"{CONNECTIONS_HERE} pages are open at the machine itself")
+
+    page.browser.open("about:blank")
+    run(story)
+
+
 def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:
     page.browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
-    looked = itertools.product((PHONE, DESKTOP), (False, True), (False, True), VIEWS)
+    looked = itertools.product((PHONE, SIDEWAYS, DESKTOP), (False, True), (False, True), VIEWS)
     for size, dark, stopped, view in looked:
-        page.browser.size(*size, touch=size == PHONE, dark=dark)
+        page.browser.size(*size, touch=size != DESKTOP, dark=dark)
         page.bus.get("srv/stop" if stopped else "srv/clear")
         page.shows("mode", "STOPPED" if stopped else "READY")
         page.browser.js(f"document.getElementById('tab-{view}').click()")
@@ -228,10 +296,10 @@ def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:
         assert worst == [], (size, dark, stopped, view)
 
 
-def test_every_view_is_drawn_on_a_phone_and_a_desktop(tmp_path: Path) -> None:
+def test_every_view_is_drawn_on_a_phone_upright_and_sideways_and_a_desktop(tmp_path: Path) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
-    assert sizes == [PHONE] * len(VIEWS) + [DESKTOP] * len(VIEWS)
+    assert sizes == [one for one in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]
     assert len({path.read_bytes() for path in written}) == len(written)
 
 
@@ -392,7 +460,7 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             assert len(told) >= 6
             assert {tuple(one) for one in told} == {(True, "for who is operator; you are viewer")}
             page.shows("barred", "for who is operator; you are viewer")
-            page.shows("told", "you may watch and stop")
+            page.shows("hint", "You may watch and stop, not drive")
             browser.tap("tab-events")
             page.shows("recordings", "download and report are for who is operator")
             assert (
@@ -432,6 +500,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
             page.shows("recordings", "being drawn")
             opened = "document.querySelector('#recordings a[target=_blank]')"
             until(lambda: browser.js(f"Boolean({opened})"), 60.0, "a report")
+            assert browser.too_small() == []
             # In the place of our page, since one page is what the test looks at.
             browser.open(browser.js(f"{opened}.href"))
             drawn = "document.querySelectorAll('.js-plotly-plot').length"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import time
 import tomllib
 from collections.abc import Iterator
@@ -14,7 +16,7 @@ import pytest
 from acsard.config.parsing import parse
 from tests.system.browser import Page
 from tests.system.bystander import lost
-from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, Browser, browsing
+from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.guided import NoDaemon, commands, none_left
 from tests.system.harness import Bus, Daemon, until
 from tests.system.test_calibrate import RIDES_S, SKIDDING
@@ -83,7 +85,8 @@ def browser() -> Iterator[Browser]:
 
 
 def sound(browser: Browser) -> None:
-    """Nothing is wider than the screen, nothing in the way of a screen reader, in any light."""
+    """Nothing is wider than the screen, too small for a finger or in the way of a screen reader, in
+    any light."""
     browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
     for size in (PHONE, DESKTOP):
         for dark in (False, True):
@@ -94,7 +97,10 @@ def sound(browser: Browser) -> None:
                 " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
             )
             assert [one for one in found if one[0] in ("serious", "critical")] == []
-    browser.size(*PHONE)
+    for size in (SIDEWAYS, PHONE):
+        browser.size(*size)
+        assert browser.js("document.documentElement.scrollWidth") <= size[0]
+        assert browser.too_small() == []
 
 
 def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
@@ -150,7 +156,7 @@ def drives(person: Person, bus: Bus) -> None:
 
     def moves() -> bool:
         if person.hidden("guide"):
-            person.begin("calibrate")
+            person.begin("calibrate", way="")
             person.asked("1. Set the robot", 30.0)
             person.shows("guide-where", "SIMULATED")
             person.press("start")
@@ -196,6 +202,50 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
     assert took < 0.3 + 0.5 + lost(begun, begun + took)
     person.ended("failure" if way in ("a key", "the button") else "stopped")
     none_left(server)
+    browser.open("about:blank")
+
+
+def test_a_browser_that_stands_still_while_it_drives_stops_it_within_a_second(
+    browser: Browser, skidding: tuple[Daemon, Bus, Page]
+) -> None:
+    """Its connection stays open: that it says nothing is all there is to hear."""
+    _, bus, server = skidding
+    person = Person(browser, server)
+    drives(person, bus)
+    assert browser.process is not None
+    begun = time.monotonic()
+    os.killpg(browser.process.pid, signal.SIGSTOP)
+    try:
+        until(lambda: not any(bus.state()["wheels"]), 10.0, "at rest")
+        took = time.monotonic() - begun
+        none_left(server)
+    finally:
+        os.killpg(browser.process.pid, signal.SIGCONT)
+    print(f"at rest after {took:.2f} s")
+    # And the ramp: 0.3 m/s at 1 m/s2, and some of the way.
+    assert took < 1.0 + 0.3 + 0.5 + lost(begun, begun + took)
+    browser.open("about:blank")
+
+
+def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
+    browser: Browser, skidding: tuple[Daemon, Bus, Page]
+) -> None:
+    _, _, server = skidding
+    person = Person(browser, server)
+    assert browser.js("document.getElementById('way').value") == "positions"
+    assert not person.hidden("positions-row")
+    person.shows("advice", "no floor to lay a tape on")
+    # As it stands it works; and another one that is chosen stays so.
+    person.click("calibrate")
+    person.asked("1. Set the robot", 30.0)
+    person.click("guide-leave")
+    person.ended("stopped")
+    person.click("guide-close")
+    browser.js("document.getElementById('way').value = 'tape'")
+    person.click("tab-drive")
+    person.click("tab-set")
+    browser.js("new Promise(done => setTimeout(done, 300))")
+    assert browser.js("document.getElementById('way').value") == "tape"
     browser.open("about:blank")
 
 

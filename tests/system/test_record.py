@@ -87,6 +87,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1200)
 def test_fifty_kills_cost_little_each(tmp_path: Path) -> None:
     for number in range(50):
         where = tmp_path / str(number)

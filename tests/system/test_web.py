@@ -230,10 +230,12 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_
         config = write_config(
             tmp_path / "a.toml", {"web": {"address": [f"http://127.0.0.1:{port}"]}}
         )
-        with Terminal(tmp_path, "--config", str(config)) as daemon:
+        with Terminal(tmp_path, "--config", str(config), "--record", "box") as daemon:
             daemon.shows(rf"page +http://127.0.0.1:{port}, for a browser")
             url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
             assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
+            what = "what the option has recorded is listed"
+            until(lambda: ".mcap" in asyncio.run(text(f"{url}api/recordings")), START_S, what)
             (first,) = daemon.page()
             with Bus(daemon.endpoint) as bus:
                 before = bus.get("info")

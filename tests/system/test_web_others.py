@@ -126,6 +126,7 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         stick = "document.getElementById('stick')"
         assert browser.js(f"{stick}.getAttribute('aria-disabled')") == "true"
         assert THEIRS in browser.js(f"{stick}.title")
+        shows("hint", f"To drive {THEIRS}, open its own page")
         before = two.theirs.count("commands"), two.ours.count("commands")
         browser.touch("Start", browser.middle("stick"))
         x, y = browser.middle("stick")
@@ -134,6 +135,13 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         browser.tap("stop")
         until(lambda: two.theirs.state()["mode"] == "stopped", 5.0, "it stops")
         shows("mode", "STOPPED")
+        # Here is no Clear to press, and nothing says there is.
+        shows("reason", f"Clear is on the own page of {THEIRS}")
+        assert browser.js("document.getElementById('clear').hidden") is True
+        browser.tap("tab-robots")
+        shows("cards", f"Clear is on the own page of {THEIRS}")
+        browser.tap("tab-drive")
+        assert "press Clear" not in browser.js("document.body.textContent")
         assert two.ours.state()["mode"] == "ready"
         assert before == (two.theirs.count("commands"), two.ours.count("commands"))
         two.theirs.ask("srv/clear")

@@ -13,7 +13,12 @@ from typing import Any
 import aiohttp
 import pytest
 
-from acsard.web.limits import CONNECTIONS_OF_TOKEN
+from acsard.web.limits import (
+    CONNECTIONS_ALIKE,
+    CONNECTIONS_HERE,
+    CONNECTIONS_OF_ONE,
+    CONNECTIONS_OF_TOKEN,
+)
 from tests.system.browser import Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, until
 
@@ -88,7 +93,7 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
             for word in ("__Host-acsard=", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
                 assert word in cookie
             async with session.get(f"{page.away}/api/whoami") as answer:
-                assert await answer.json() == {"role": "operator", "name": "lent"}
+                assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
             async with session.ws_connect(f"{page.away}/ws") as ours:
                 page.tokens("--revoke", "lent")
                 async with asyncio.timeout(PATIENCE_S):
@@ -123,13 +128,46 @@ def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(
     run(story)
 
 
+def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(page: Page, bus: Bus) -> None:
+    """All of them come from 127.0.0.1, the robot's own browser too."""
+    few = CONNECTIONS_OF_ONE // CONNECTIONS_ALIKE + 1
+    broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
+    counted = page.refused().get("too_many", 0)
+
+    async def taken(stack: AsyncExitStack, token: str) -> int:
+        """How many of too many this one gets."""
+        session = await stack.enter_async_context(page.client(token))
+        got = 0
+        for _ in range(CONNECTIONS_OF_ONE):
+            with suppress(aiohttp.WSServerHandshakeError):
+                await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
+                got += 1
+        async with session.get(f"{page.away}/api/whoami") as answer:
+            assert "close some" in (await answer.json())["full"]
+        return got
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            assert await taken(stack, broken) == CONNECTIONS_ALIKE
+            rest = [await taken(stack, one) for one in others]
+            assert rest[:-1] == [CONNECTIONS_ALIKE] * (few - 2)
+            assert sum(rest) == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
+            for _ in range(CONNECTIONS_HERE):
+                ours = await stack.enter_async_context(hands(page))
+            assert (await ours.call("stop"))["ok"]
+
+    run(story)
+    refused = few * CONNECTIONS_OF_ONE - CONNECTIONS_OF_ONE
+    assert page.refused()["too_many"] == counted + refused
+
+
 def test_one_who_follows_all_that_he_can_leaves_others_theirs(
     page: Page, bus: Bus, viewer: str, operator: str
 ) -> None:
     async def story() -> None:
         async with AsyncExitStack() as stack:
             refused = 0
-            for n in range(8):
+            for n in range(CONNECTIONS_ALIKE):
                 greedy = await stack.enter_async_context(hands(page, viewer))
                 for k in range(30):
                     await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
@@ -137,7 +175,7 @@ def test_one_who_follows_all_that_he_can_leaves_others_theirs(
                 await greedy.say(ping=n)
                 await greedy.find(lambda said: "pong" in said)
                 refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
-            assert refused == 7  # of 50 the second connection had the last 20
+            assert refused == CONNECTIONS_ALIKE - 1  # of 50 the second connection had the last 20
             ours = await stack.enter_async_context(hands(page, operator))
             await ours.say(subscribe="state", robot="r9")
             await ours.say(subscribe="state")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.system.harness import until
+from tests.system.harness import ROOT, until
 from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError
 
 pytestmark = pytest.mark.systemd
@@ -15,6 +18,7 @@ pytestmark = pytest.mark.systemd
 ACSARD = "/opt/acsard/venv/bin/acsard"
 PLACES = ("/etc", "/opt/acsard/bin")
 CONFIGURATION = "/etc/acsard/acsard.toml"
+RECORDINGS = ROOT / "tests" / "recordings"
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +96,14 @@ def asks(container: Container, path: str, *more: str) -> str:
 
 ASK = """\
 import sys
+from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-print(urlopen(Request(sys.argv[1], *(b"" for _ in sys.argv[2:]))).read().decode())
+try:
+    answer = urlopen(Request(sys.argv[1], *(b"" for _ in sys.argv[2:])))
+except HTTPError as refused:
+    answer = refused
+print(answer.read().decode())
 """
 
 
@@ -103,7 +112,7 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
     assert bare.run(ACSARD, "service", "install").code == 0
     until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
     assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
-    assert bare.show("MemoryMax", PAGE) == str(160 << 20)
+    assert bare.show("MemoryMax", PAGE) == str(420 << 20)
     daemon, first = bare.main_pid(), bare.main_pid(PAGE)
     bare.run("systemctl", "kill", "--signal=SIGKILL", PAGE)
     until(lambda: bare.show("NRestarts", PAGE) == "1", 10.0, "it is started again")
@@ -115,6 +124,111 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
     kept = bare.run("stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json").out.split()
     owner = bare.run("stat", "-L", "-c", "%u", "/var/lib/acsard-web").out.strip()
     assert kept == ["600", owner]
+
+
+STATE = "/var/lib/private/acsard"
+FORMER = "000001-20260101T000000Z.kept.mcap"
+
+
+def recorded_before(container: Container) -> bytes:
+    """A recording that an earlier version has left, which kept all for its own user of then."""
+    (recording, *_) = sorted(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_size)
+    container.run("sh", "-c", f"rm -rf {STATE} && install -d -m 700 {STATE.rpartition('/')[0]}")
+    place = container.path(f"{STATE}/record")
+    place.mkdir(parents=True)
+    (place / FORMER).write_bytes(recording.read_bytes())
+    for path, mode in ((place.parent, 0o750), (place, 0o750), (place / FORMER, 0o640)):
+        os.chown(path, 61999, 61999)
+        path.chmod(mode)
+    container.run("ln", "-sfn", "private/acsard", "/var/lib/acsard")
+    return recording.read_bytes()
+
+
+FETCHED = """\
+import hashlib, sys
+from urllib.request import urlopen
+
+print(hashlib.sha256(urlopen(sys.argv[1]).read()).hexdigest())
+"""
+
+PROBE = """\
+import errno, json, os, sys
+
+daemon, place, name = int(sys.argv[1]), *sys.argv[2:]
+one = f"{place}/{name}"
+
+
+def came_of(tried):
+    try:
+        tried()
+    except OSError as error:
+        return errno.errorcode[error.errno]
+    return "done"
+
+
+print(json.dumps({
+    "read": came_of(lambda: open(one, "rb").close()),
+    "make": came_of(lambda: open(f"{place}/new", "w").close()),
+    "append": came_of(lambda: open(one, "ab").close()),
+    "remove": came_of(lambda: os.unlink(one)),
+    "rename": came_of(lambda: os.rename(one, f"{place}/other")),
+    "chmod": came_of(lambda: os.chmod(one, 0o600)),
+    "hold": came_of(lambda: open(f"{place}/.lock", "rb").close()),
+    "signal": came_of(lambda: os.kill(daemon, 0)),
+    "environment": came_of(lambda: open(f"/proc/{daemon}/environ").close()),
+    "private": sorted(os.listdir("/var/lib/private")),
+}))
+"""
+"""Run where the page runs, in all its walls."""
+
+
+def drawn(container: Container) -> dict[str, object]:
+    """What becomes of a report of that recording."""
+
+    def ended() -> dict[str, object]:
+        told = json.loads(asks(container, f"/api/recordings/{FORMER}/report", "POST") or "{}")
+        return told if told.get("report") in ("ready", "failed") else {}
+
+    return until(ended, 60.0, "a report, or why there is none")
+
+
+def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare: Container) -> None:
+    recording = recorded_before(bare)
+    bare.write(CONFIGURATION, "")  # the simulator
+    done = bare.run(ACSARD, "service", "install")
+    assert done.code == 0, done.err + bare.messages()
+    until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "what was recorded before")
+    until(lambda: "being written" in asks(bare, "/api/recordings"), 20.0, "what is recorded now")
+    fetched = f"http://127.0.0.1:8080/api/recordings/{FORMER}"
+    given = bare.run("python3", "-c", FETCHED, fetched).out.strip()
+    assert given == hashlib.sha256(recording).hexdigest()
+    assert drawn(bare) == {"report": "ready", "href": f"report/{FORMER}"}
+    assert "Plotly" in asks(bare, f"/report/{FORMER}")
+
+    bare.write("/opt/acsard/probe.py", PROBE)
+    words = f"{bare.show('MainPID')} /var/lib/acsard/record {FORMER}"
+    walls = f"ExecStartPre=/usr/bin/python3 /opt/acsard/probe.py {words}"
+    bare.drop_in("probe.conf", f"[Service]\n{walls}\nMemoryMax={LITTLE}\n", PAGE)
+    bare.run("systemctl", "restart", PAGE)
+    told = [line for line in bare.messages(PAGE).splitlines() if line.startswith('{"read"')]
+    found = json.loads(told[-1])
+    assert found.pop("private") == ["acsard", "acsard-web"]
+    assert (found.pop("read"), found.pop("signal")) == ("done", "EPERM")
+    assert set(found.values()) <= {"EACCES", "EROFS", "ENOENT", "EPERM"}, found
+
+    until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "the page is there again")
+    if bare.show("MemoryCurrent", PAGE).isdecimal():
+        page = bare.main_pid(PAGE)
+        refused = drawn(bare)
+        assert (refused["report"], bare.main_pid(PAGE)) == ("failed", page)
+        assert "memory" in str(refused["text"])
+
+    assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
+    assert not bare.path(STATE).exists()
+
+
+LITTLE = 90 << 20
+"""Enough for the page, and for no report."""
 
 
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:

@@ -9,3 +9,11 @@ NEEDS: dict[str, str] = {
     "wall": "a straight wall and a tape measure",
     "umbmark": "a tape measure and marks",
 }
+
+SIMULATED = (
+    "positions",
+    "On the simulator there is no floor to lay a tape on: positions does there, with sim/pose, "
+    "where it truly is; and gyro where [odometry] gyro is on, with its distance left empty. tape, "
+    "wall and umbmark are for a real robot.",
+)
+"""The way to begin with on the simulator, and why."""

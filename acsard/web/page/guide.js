@@ -10,6 +10,7 @@ const LABELS = {
 };
 const NAMES = { check: "Check of the board", calibrate: "Calibration" };
 const LOOKS = { PASS: "", WARN: "warning", FAIL: "error", SKIPPED: "skipped" };
+const LIFE = 100; // ms between two signs of life while it goes on: 900 without one end what moves
 const MODIFIERS = ["Shift", "Control", "Alt", "AltGraph", "Meta", "Tab"];
 
 export class Guide {
@@ -40,12 +41,15 @@ export class Guide {
   }
 
   /** What may be begun, as `api/guide` says; or why nothing. */
-  choices({ ways, ports, note, error }) {
+  choices({ ways, way, advice, ports, note, error }) {
     text("guide-note", [error ?? note, this.#busy].filter(Boolean).join(" "));
     for (const id of ["check-card", "calibrate-card"]) $(id).hidden = Boolean(error);
     if (error) return;
     options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
+    const first = !$("way").options.length;
     options($("way"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(ways).map(([way, needs]) => [way, `${way}: ${needs}`])]);
+    if (first) $("way").value = way; // whoever has chosen keeps what he chose
+    text("advice", advice);
     this.#ways();
   }
 
@@ -85,6 +89,7 @@ export class Guide {
     text("guide-note", this.#busy);
     if (!running || !yours) return;
     this.#running = true;
+    this.#link.beat(LIFE);
     $("errands").hidden = true;
     $("guide").hidden = false;
     $("guide-leave").hidden = false;
@@ -205,6 +210,7 @@ export class Guide {
 
   #over(why, words = "", look = "warning") {
     this.#running = false;
+    this.#link.beat();
     this.#question = null;
     this.#ride(false);
     $("guide-question").hidden = $("guide-leave").hidden = true;

@@ -2,6 +2,7 @@
 // is shown.
 
 const AGAIN = [300, 600, 1200, 2500, 5000];
+const BEAT = 1000; // between two pings
 const SILENT = 3000; // without an answer for so long the way is cut, whatever the socket says
 
 export class Link extends EventTarget {
@@ -12,18 +13,26 @@ export class Link extends EventTarget {
   #number = 0;
   #heard = 0;
   #asked = null; // a ping that has no answer yet, since when
+  #timer = null;
   open = false;
   way = null; // there and back, ms
 
   start() {
     this.#connect();
-    setInterval(() => this.#ping(), 1000);
+    this.beat();
     document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
   }
 
   /** How far what is shown may lag behind, ms: the last way there and back, or what is waited for. */
   get lag() {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
+  }
+
+  /** Ping so often, ms: pings are the signs that somebody is here. */
+  beat(every = BEAT) {
+    clearInterval(this.#timer);
+    this.#timer = setInterval(() => this.#ping(), every);
+    this.#ping();
   }
 
   /** Follow a key at most `rate` times a second, also after a new connection; of another `robot`
@@ -92,8 +101,10 @@ export class Link extends EventTarget {
   #take(message) {
     this.#heard = performance.now();
     if ("pong" in message) {
-      this.way = performance.now() - message.pong;
-      if (message.pong === this.#asked) this.#asked = null;
+      // What is asked again before the answer has more than one.
+      if (message.pong !== this.#asked) return;
+      this.way = performance.now() - this.#asked;
+      this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
     else for (const kind of ["hello", "path", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);

@@ -7,15 +7,16 @@ import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Plot } from "./plot.js";
 import { Recordings } from "./recordings.js";
-import { barred, may, permit } from "./roles.js";
+import { barred, hint, may, permit } from "./roles.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { milliseconds, said as words, signed, yaw } from "./words.js";
+import { milliseconds, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 /** Another robot than the page's own: seen and stopped here; to drive or set it, it has its own page. */
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
+const words = (told) => clickable(told, OTHER);
 const LATCHED = ["stopped", "fault"];
 
 const link = new Link();
@@ -132,7 +133,7 @@ function stated({ detail }) {
   if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
-  views.banner(state, hello?.role === "viewer");
+  views.banner(state, hello?.role === "viewer", OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
@@ -161,7 +162,7 @@ function greeted({ detail }) {
   permit(hello.role, OTHER ? `only on the own page of ${OTHER}` : "");
   $("limit").max = String(hello.limits.linear);
   limited();
-  if (!drive.allowed && !OTHER) views.text("told", "you may watch and stop, not drive");
+  views.text("hint", hint(hello.role, OTHER));
   views.text("barred", barred(hello.role, "operator"));
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
   if (OTHER) elsewhere();
@@ -204,10 +205,10 @@ link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
 });
 link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.wheels.add(performance.now() - age, ...value.velocity));
 link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
-link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
+link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value, OTHER));
 link.addEventListener("path", ({ detail }) => OTHER || map.trail(detail.path));
 link.addEventListener("fleet", ({ detail }) => {
-  views.cards($("cards"), detail.fleet, hello?.robot);
+  views.cards($("cards"), detail.fleet, hello?.robot, OTHER ? "" : hello?.robot);
   views.text("fleet-note", detail.note);
 });
 link.addEventListener("refused", ({ detail }) => {
@@ -223,7 +224,8 @@ link.addEventListener("down", async ({ detail }) => {
   if (detail.reason || !detail.never) return;
   // A browser does not say why it was not let in; this does.
   const told = await got("api/whoami");
-  if (told.error && !link.open) views.lost(told.error);
+  const why = told.error || told.full;
+  if (why && !link.open) views.lost(why);
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));

@@ -12,6 +12,13 @@ export function barred(role, least) {
   return role ? `for who is ${least}; you are ${role}` : "no connection yet";
 }
 
+/** What stands at the stick while nobody holds it: how to drive, or why that is not for this one;
+ *  `other` is a robot that is seen by the page of another one. */
+export function hint(role, other) {
+  if (other) return `To drive ${other}, open its own page.`;
+  return may(role, "operator") ? "Hold and push to drive; let go to stop." : "You may watch and stop, not drive.";
+}
+
 /** Switch off what this role may not, and say why on it; or all of it, for another reason. `role` is
  *  "" while nobody knows. */
 export function permit(role, reason = "") {

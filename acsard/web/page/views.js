@@ -41,18 +41,18 @@ export function counters(list, state) {
   );
 }
 
-export function happened(list, told) {
+export function happened(list, told, elsewhere) {
   const rows = [...told.events].reverse().map((one) => {
     const by = one.by ? ` — ${one.by}` : "";
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${said(one.text)}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${said(one.text, elsewhere)}${by}`);
   });
   list.replaceChildren(...rows);
 }
 
 /** A card for each robot, which opens it; those that stay are not made anew, or nobody could press
- *  them. `own` is the id of the page's own. */
-export function cards(list, robots, own) {
+ *  them. `own` is the id of the page's own, `here` of the one that this page clears. */
+export function cards(list, robots, own, here) {
   const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
   const shown = robots.map((one) => {
     const bad = ["fault", "stopped"].includes(one.mode) ? "error" : one.mode === "driving" || one.mode === "ready" ? "" : "warning";
@@ -66,7 +66,7 @@ export function cards(list, robots, own) {
     const [, mode, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
-    why.textContent = said(one.reason ?? "");
+    why.textContent = said(one.reason ?? "", one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
@@ -83,10 +83,10 @@ function empty(robot, own) {
 }
 
 /** Mode and why, in words, and what doubts there are. */
-export function banner(state, viewer) {
+export function banner(state, viewer, elsewhere) {
   document.body.dataset.mode = state.mode;
   text("mode", state.mode.toUpperCase());
-  const why = reason(state);
+  const why = reason(state, elsewhere);
   text("reason", viewer ? why.replace("press Clear", "an operator clears it") : why);
   const doubt = document.getElementById("doubt");
   const warned = [state.doubt, state.recording, state.certificate.startsWith("valid") ? "" : state.certificate];

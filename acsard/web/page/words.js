@@ -41,12 +41,16 @@ export function yaw(q) {
 }
 
 /** A reason without the mode that stands above it already. */
-export function reason(state) {
+export function reason(state, elsewhere) {
   const before = `${state.mode}: `;
-  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason);
+  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason, elsewhere);
 }
 
-/** What a program is told to call is a button here. */
-export function said(text) {
-  return text.replace("call srv/clear", "press Clear").replace("srv/clear releases", "Clear releases").replace("call srv/activate", "Set has Switch on");
+/** What a program is told to call is a button: here, or on the own page of the robot `elsewhere`. */
+export function said(text, elsewhere = "") {
+  const there = `on the own page of ${elsewhere}`;
+  const buttons = elsewhere
+    ? { "call srv/clear": `Clear is ${there}`, "srv/clear": `Clear ${there}`, "call srv/activate": `Switch on is ${there}` }
+    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "call srv/activate": "Set has Switch on" };
+  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
 }

@@ -12,11 +12,13 @@ from acsard.cli.common import (
     PLACES,
     find,
     load,
+    recorded,
     require_asked,
     require_followed,
     robot_address,
     warn_of_unknown,
 )
+from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
@@ -235,3 +237,14 @@ def test_what_is_published_is_followed_and_asked_and_so_is_what_is_not_in_the_ta
         require_asked(key)
     require_followed("cmd/app")
     require_asked("config")
+
+
+def test_it_is_recorded_where_the_option_the_file_or_the_service_says_in_this_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = b'[record]\ndirectory = "/file"'
+    named, in_file = parse(said, {"record": {"directory": "/option"}}), parse(said)
+    assert recorded(Config()).record.directory == ""
+    monkeypatch.setenv("ACSARD_RECORD", "/service")
+    found = [recorded(one).record.directory for one in (named, in_file, Config())]
+    assert found == ["/option", "/file", "/service"]

@@ -7,11 +7,14 @@ import re
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.cli.log import SERVICE
 from acsard.config.settings import Config
 from acsard.record.file import Writing
+from acsard.record.steps import Taken
+from acsard.values import Event
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -87,6 +90,21 @@ def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
     hours, minutes, seconds = first.split(":")
     after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
     assert names("--from", after) == names("--from", "1.5")
+
+
+def test_what_a_stranger_recorded_moves_no_cursor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tape = Tape()
+    World(recorder=tape).run(0.3)
+    inputs, outputs, left = tape.taken[5]
+    event = Event("stop", "\x1b[2J\u202egone", by="\x1b]0;title\x07")
+    tape.taken[5] = Taken(inputs, replace(outputs, events=(event,)), left)
+    tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
+    for words in ((), ("show", "1"), ("show", "1", "--json")):
+        code, out, _ = log(capsys, tmp_path, *words)
+        assert (code, "stop" in out) == (0, True)
+        assert all(line.isprintable() for line in out.splitlines())
 
 
 @pytest.mark.parametrize("when", ["late", "12:3", "-1", "12:00:00:00"])

@@ -83,14 +83,3 @@ def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
     assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
     told = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
     assert f"acsard call stop{options} " in told
-
-
-def test_it_records_where_the_option_the_file_or_the_service_says_in_this_order(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    named = parse(b'[record]\ndirectory = "/file"', given_by("--record", "/option"))
-    in_file = parse(b'[record]\ndirectory = "/file"')
-    assert run.recorded(Config()).record.directory == ""
-    monkeypatch.setenv("ACSARD_RECORD", "/service")
-    found = [run.recorded(one).record.directory for one in (named, in_file, Config())]
-    assert found == ["/option", "/file", "/service"]

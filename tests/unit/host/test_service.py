@@ -56,6 +56,13 @@ def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> No
     assert installing(ALL, NOTHING, force=False) == [*map(Write, ALL), *INSTALLED]
 
 
+def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
+    steps = list(INSTALLED)
+    everything = Run(("systemctl", "enable", "--now", UNIT, DOOR, PAGE))
+    alone = Run(("systemctl", "start", UNIT), may_fail=True)
+    assert steps.index(alone) < steps.index(everything)
+
+
 def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
     assert installing(ALL, there(), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
 

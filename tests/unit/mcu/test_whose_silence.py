@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.mcu.link_state import WORDS
-from acsard.mcu.whose_silence import Lateness
+from acsard.mcu.whose_silence import Lateness, is_ours
 
 MS = 1_000_000
 QUIET_NS = 100 * MS
@@ -47,3 +47,9 @@ def test_a_link_that_is_up_or_closed_is_told_as_it_is() -> None:
     assert [late.words(state) for state in ("up", "booting", "down")] == [
         WORDS["up"], WORDS["booting"], WORDS["down"]
     ]  # fmt: skip
+
+
+def test_words_of_a_silence_say_whose_it_is() -> None:
+    ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
+    assert all(is_ours(lateness.words("stale")) for lateness in ours)
+    assert not any(is_ours(words) for words in (WORDS["stale"], "", after(800).words("down")))

@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from acsard.config.settings import RecordConfig
-from acsard.record.directory import DIRECTORY_MODE, KEPT, KEPT_FILES, PART, Ring, listed
+from acsard.record.directory import (
+    DIRECTORY_MODE,
+    KEPT,
+    KEPT_FILES,
+    OPEN_DIRECTORY_MODE,
+    PART,
+    Ring,
+    listed,
+)
 from acsard.record.file import About, Recording
 
 DAY_NS = 86_400_000_000_000
@@ -55,6 +63,57 @@ def test_the_directory_is_the_services_and_its_groups(tmp_path: Path, umask: int
         os.umask(before)
     assert (tmp_path / "b").stat().st_mode & 0o777 == DIRECTORY_MODE == 0o750
     assert path.stat().st_mode & 0o777 == 0o640
+
+
+def modes(where: Path) -> set[int]:
+    return {path.stat().st_mode & 0o777 for path in listed(where)}
+
+
+def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = tmp_path / "b"
+    one = ring(where)
+    record(one)  # as a version did that recorded for itself alone
+    cut = one.begin(about())
+    cut.add("steps", NOW_NS, b"whole")
+    cut.flush()
+    one.close()
+    assert modes(where) == {0o640}
+    monkeypatch.setenv("ACSARD_RECORD", str(tmp_path))
+    ring(where).close()
+    assert modes(where) == {0o640}, "it is another directory"
+    monkeypatch.setenv("ACSARD_RECORD", str(where))
+    before = os.umask(0o077)
+    try:
+        one = ring(where)
+        record(one)
+        one.begin(about())
+    finally:
+        os.umask(before)
+    assert where.stat().st_mode & 0o777 == OPEN_DIRECTORY_MODE == 0o755
+    assert (len(listed(where)), modes(where)) == (4, {0o644})
+    assert not (where / ".lock").stat().st_mode & 0o007
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives a directory away")
+def test_a_directory_that_is_somebody_else_s_is_recorded_to_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ACSARD_RECORD", ".")
+    monkeypatch.chdir(tmp_path)
+    tmp_path.chmod(0o777)
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setresuid(65534, 65534, 65534)
+            one = ring(Path())
+            record(one)
+            one.close()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert modes(tmp_path) == {0o644}
 
 
 def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path: Path) -> None:

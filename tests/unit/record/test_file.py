@@ -9,9 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from msgspec.structs import replace
 
+from acsard.config.parsing import effective
 from acsard.config.settings import Config
+from acsard.config.writing import document
 from acsard.host.errors import RecordingError
-from acsard.record.file import MODE, Closing, Recording, closing, rewrite
+from acsard.record.file import MODE, About, Closing, Recording, Writing, closing, rewrite
 from acsard.record.replayed import config_of, live, steps
 from acsard.record.steps import status_of
 from acsard.values import Instant
@@ -163,6 +165,27 @@ def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
         Recording(path)
     with pytest.raises(RecordingError, match="cannot read"):
         Recording(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["wall_ns", "mono_ns", "started_ns"])
+def test_a_time_that_no_calendar_has_is_refused(name: str, tmp_path: Path) -> None:
+    now = Config()
+    about = About(now.robot.id, "0.1.0", "3.11.0", 1, 2, "\n".join(document(effective(now))))
+    path = tmp_path / "far.mcap"
+    Writing(path, replace(about, **{name: 1 << 63})).finish()
+    with pytest.raises(RecordingError, match=name):
+        Recording(path)
+
+
+def test_an_event_of_no_time_is_none(tape: Tape, tmp_path: Path) -> None:
+    path = tmp_path / "far.mcap"
+    tape.write(path, Config())
+    recording, far = Recording(path), b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'
+    writing = Writing(tmp_path / "new.mcap", recording.about)
+    writing.add("events", 1, far)
+    writing.finish()
+    with pytest.raises(RecordingError, match="an event that is none"):
+        rewrite(Recording(tmp_path / "new.mcap"), tmp_path / "other.mcap")
 
 
 def test_what_was_cut_becomes_a_finished_file(whole: Path, tmp_path: Path) -> None:

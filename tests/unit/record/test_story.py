@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from acsard.config.settings import Config, McuConfig
 from acsard.record.batch import decode, encode
 from acsard.record.story import Story, Told, summary
+from acsard.record.story import told as once
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
+
+BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 
 
 def story(tape: Tape, without: range = range(0)) -> list[Told]:
@@ -36,6 +40,39 @@ def test_it_begins_and_ends_with_the_daemon_and_tells_each_drive() -> None:
     assert [one.seconds for one in told] == sorted(one.seconds for one in told)
 
 
+def test_a_silence_of_a_computer_that_did_not_run_is_not_told_as_the_boards() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.05)
+        world.stall(0.2)
+        world.run(0.02)
+    world.hold(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.2)
+    told = [one for one in story(tape) if one.name in ("link_stale", "link_late")]
+    late, stale = told
+    assert (late.name, stale.name) == ("link_late", "link_stale")
+    assert late.text.startswith("this computer did not run for 0.2")
+    assert summary(told) == "1 computer stall, 1 board silence"
+
+
+def test_what_is_heard_in_a_silence_is_no_other_silence() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.run(1.0)
+    with world.mcu.mute():
+        world.run(5.0)
+    world.run(1.0)
+    told = story(tape)
+    assert [one.name for one in told if one.name in ("link_stale", "link_heard")] == [
+        "link_stale", "link_heard"
+    ]  # fmt: skip
+    said = [one for _, outputs, _ in tape.taken for one in outputs.events]
+    assert summary([once(one, 1) for one in said]) == "1 board silence"
+
+
 def test_steps_that_are_missing_are_said() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
     assert gaps == ["60 steps are missing before this one"]
@@ -48,6 +85,12 @@ def test_a_list_says_who_stopped_it_and_how_often_what_happened() -> None:
         Told(2.5, "mode", "driving"),
         Told(3.0, "fault", "a wheel", "error"),
         Told(4.0, "command_refused", "old", count=7),
+        Told(5.0, "link_stale", "silent", "warning", count=2),
+        Told(6.0, "link_down", "gone", "warning", count=2),
+        Told(7.0, "mcu_restarted", "has started", "warning", count=2),
     ]
-    assert summary(events) == "2 stops, 1 fault, 7 refused commands (stopped by joe)"
+    assert summary(events) == (
+        "2 stops, 1 fault, 7 refused commands, 2 board silences, 2 lost ports, 2 board restarts "
+        "(stopped by joe)"
+    )
     assert summary([]) == ""

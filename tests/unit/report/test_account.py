@@ -39,6 +39,17 @@ def test_a_fault_is_told_with_its_time_and_its_words() -> None:
     assert table["Recorded by"] == "acsard 0.1.0, Python 3.11.0"
 
 
+def test_a_computer_that_did_not_run_is_no_loss_of_the_link() -> None:
+    def late(world: World) -> None:
+        world.drive(0.5, seconds=0.5)
+        with world.mcu.mute():
+            world.stall(0.2)
+            world.run(0.02)
+
+    course, _ = course_of(late)
+    assert summary(course).endswith("no stops, 1 stall of the robot's computer.")
+
+
 def test_only_what_is_not_the_default_is_told_of_a_configuration() -> None:
     config = Config()
     assert differences(config) == []

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.needs import NEEDS, SIMULATED
 from acsard.calibration.guided.ways import KINDS
 from acsard.cli import calibrate, mcu
 from acsard.web.errands import KEY, Reach, words
@@ -92,6 +92,12 @@ def test_no_text_becomes_an_option_of_its_own(
 
 def test_the_ways_are_those_there_are() -> None:
     assert {name: kind.needs for name, kind in KINDS.items()} == NEEDS
+
+
+def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
+    way, why = SIMULATED
+    assert way in NEEDS
+    assert [one for one in NEEDS if one not in why] == []
 
 
 @pytest.mark.parametrize("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])

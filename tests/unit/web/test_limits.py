@@ -5,6 +5,8 @@ from __future__ import annotations
 from acsard.values import NS_PER_S
 from acsard.web.limits import (
     CONNECTIONS,
+    CONNECTIONS_ALIKE,
+    CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
     CONNECTIONS_OF_TOKEN,
     TRIES,
@@ -57,24 +59,52 @@ def test_places_are_bounded_by_address_and_in_all() -> None:
 
 def test_a_token_has_a_share_of_the_pages_from_however_many_addresses_and_leaves_room() -> None:
     seats = Seats()
-    taken = [seats.enter(f"10.0.0.{n}", "wall") for n in range(CONNECTIONS)]
-    assert taken.count(True) == CONNECTIONS_OF_TOKEN < CONNECTIONS
-    assert seats.enter("10.0.1.1", "phone")
+    told = [seats.enter(f"10.0.0.{n}", "wall") for n in range(CONNECTIONS)]
+    assert told.count("") == CONNECTIONS_OF_TOKEN < CONNECTIONS
+    assert str(CONNECTIONS_OF_TOKEN) in told[-1]
+    assert not seats.enter("10.0.1.1", "phone")
     seats.leave("10.0.0.0", "wall")
-    assert seats.enter("10.0.2.1", "wall")
+    assert not seats.enter("10.0.2.1", "wall")
 
 
 def test_a_token_without_room_takes_no_place_of_its_address() -> None:
     seats = Seats()
     for n in range(CONNECTIONS_OF_TOKEN):
         seats.enter(f"10.0.0.{n}", "wall")
-    assert not any(seats.enter("10.0.1.1", "wall") for _ in range(2 * CONNECTIONS_OF_ONE))
-    assert seats.enter("10.0.1.1", "phone")
+    assert all(seats.enter("10.0.1.1", "wall") for _ in range(2 * CONNECTIONS_OF_ONE))
+    assert not seats.enter("10.0.1.1", "phone")
 
 
-def test_who_is_at_the_machine_has_no_token_to_share() -> None:
+def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
     seats = Seats()
-    assert [seats.enter("::1", "") for _ in range(CONNECTIONS_OF_ONE + 1)].count(False) == 1
+    told = [seats.enter("10.0.0.1", "broken") for _ in range(CONNECTIONS_OF_ONE)]
+    assert told.count("") == CONNECTIONS_ALIKE < CONNECTIONS_OF_ONE
+    assert f"{CONNECTIONS_ALIKE} pages are open at 10.0.0.1" in told[-1]
+    assert "broken" not in told[-1]
+    assert not seats.enter("10.0.0.1", "phone")
+    assert not seats.enter("10.0.0.2", "broken")
+    seats.leave("10.0.0.1", "broken")
+    assert seats.missing("10.0.0.1", "broken") == ""
+
+
+def test_an_address_has_a_share_of_the_pages_with_however_many_tokens() -> None:
+    seats = Seats()
+    told = [seats.enter("10.0.0.1", f"token{n}") for n in range(CONNECTIONS)]
+    assert told.count("") == CONNECTIONS_OF_ONE
+    assert f"{CONNECTIONS_OF_ONE} of them from one address" in told[-1]
+    assert not seats.enter("10.0.0.2", "token0")
+
+
+def test_who_is_at_the_machine_has_places_that_nobody_else_takes() -> None:
+    seats = Seats()
+    for n in range(2 * CONNECTIONS):
+        seats.enter(f"127.0.0.{n % 9}", f"token{n}")
+    assert seats.missing("127.0.0.1", "another")
+    told = [seats.enter("127.0.0.1", "") for _ in range(CONNECTIONS_HERE + 1)]
+    assert told[:-1] == [""] * CONNECTIONS_HERE
+    assert "at the machine itself" in told[-1]
+    seats.leave("127.0.0.1", "")
+    assert not seats.enter("::1", "")
 
 
 def test_one_holder_has_his_share_and_leaves_room_for_others() -> None:

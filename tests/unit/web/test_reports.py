@@ -91,7 +91,8 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
         ("import sys; sys.exit('acsard: needs the library plotly; run: pip')", "needs the library"),
         ("raise MemoryError", "memory: draw it on another machine"),
         ("{}['x']", "KeyError: 'x'"),
-        ("import os; os.kill(os.getpid(), 9)", "ended with -9"),
+        ("import os; os.kill(os.getpid(), 9)", "want of memory most likely"),
+        ("import os; os.kill(os.getpid(), 15)", "ended with -15"),
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
     ],
 )
@@ -132,16 +133,18 @@ TELLS = """import os, resource, sys, time
 limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
 while os.getpriority(os.PRIO_PROCESS, 0) == 0 or limit < 0:
     limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
-print(os.getpriority(os.PRIO_PROCESS, 0), limit, os.getpid(), flush=True)
+last = open("/proc/self/oom_score_adj").read().strip()
+print(os.getpriority(os.PRIO_PROCESS, 0), limit, last, flush=True)
 time.sleep(float(sys.argv[1].strip("/")))"""
 
 
-def test_it_has_the_lowest_priority_and_so_much_memory() -> None:
+def test_it_has_the_lowest_priority_and_so_much_memory_and_is_the_first_to_go() -> None:
     async def story() -> None:
         found = drawn_by(TELLS)
         await become(found, Path("/0"), "ready")
-        priority, memory, _ = gzip.decompress(found.drawn("0") or b"").split()
+        priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
         assert (int(priority), int(memory)) == (max(NICE, os.nice(0)), reports.MEMORY)
+        assert first == b"1000"
 
     run(story)
 

@@ -1,0 +1,311 @@
+"""What pickle wrote of a robot -> the same again, and nothing else, whoever wrote it.
+
+A recording comes from strangers too, and pickle's own reader does what its bytes say: it calls,
+imports, changes classes, nests without end. This one knows the few opcodes that a robot is written
+with. It calls nothing but what makes plain data, and each part is checked as it is made:
+
+    a number, text, bytes    a number has at most 128 bits
+    a list, a tuple ...      at most so deep, and so large with all that is in it as often as it is
+    a Struct                 each field is what the Struct says it is
+    another part             made without being run, then given attributes; none hides what its
+                             class has
+
+What has been referred to grows no more: so nothing has itself in it, and depth and size are exact.
+"""
+
+from __future__ import annotations
+
+import pickletools
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+MOST_BYTES = 1 << 20
+"""A robot takes some 20 000; with many senders of commands, a few times as much."""
+
+MOST_OPCODES = 1 << 17
+
+MOST_PARTS = 1 << 19
+"""All that is in it, what is there several times as often as that."""
+
+DEEPEST = 50
+"""Of parts within parts."""
+
+LONGEST = 128
+"""Bits of a number: sums over times in ns have more than 64."""
+
+MOST_IN_KEY = 4
+
+Find = Callable[[str, str], type]
+"""The class of this module and name; raises `ValueError` where there is none that may be read."""
+
+ARGUMENTS = {
+    "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE",
+    "SHORT_BINBYTES", "BINBYTES",
+}  # fmt: skip
+"""Opcodes that are followed by a value."""
+
+VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+
+CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
+
+TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+
+SIMPLE = (str, int, float, bool, bytes, type(None))
+
+
+def unpickled(data: bytes, find: Find) -> object:
+    """What these bytes say; raises `ValueError`, in words, for all that is no robot's."""
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"it has {len(data)} bytes, more than any robot")
+    machine = _Machine(find)
+    at = -1
+    try:
+        for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):
+            if count >= MOST_OPCODES:
+                raise ValueError("it has more parts than any robot")
+            machine.do(opcode.name, argument)
+            at = place or 0
+    except (LookupError, TypeError, ArithmeticError, msgspec.MsgspecError) as error:
+        raise ValueError(f"it is damaged: {error}") from None
+    if at + 1 != len(data):
+        raise ValueError("something follows its end")
+    return machine.result()
+
+
+class _Entry:
+    """A value on the stack, how deep and how large it is."""
+
+    __slots__ = ("closed", "depth", "size", "value")
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+        self.depth = 0
+        self.size = 1
+        self.closed = False
+        """It has been referred to, and grows no more."""
+
+    def holds(self, parts: Sequence[_Entry]) -> None:
+        """These are in it from now on."""
+        if self.closed:
+            raise ValueError("a part of it has itself in it, or grows when it is made")
+        for part in parts:
+            if isinstance(part.value, type):
+                raise ValueError("it has a class in place of a value")
+            self.depth = max(self.depth, 1 + part.depth)
+            self.size += part.size
+        if self.depth > DEEPEST:
+            raise ValueError(f"its parts are nested more than {DEEPEST} deep")
+        if self.size > MOST_PARTS:
+            raise ValueError("it has more parts than any robot")
+
+
+class _Machine:
+    """Pickle's stack, its marks, and what is referred to by number."""
+
+    def __init__(self, find: Find) -> None:
+        self._find = find
+        self._stack: list[_Entry] = []
+        self._marks: list[int] = []
+        self._memo: list[_Entry] = []
+
+    def result(self) -> object:
+        """What is left in the end."""
+        if len(self._stack) != 1 or self._marks:
+            raise ValueError("it is damaged: it ends in the middle")
+        return self._stack[0].value
+
+    def do(self, name: str, argument: Any) -> None:
+        """One opcode; raises `ValueError`, or what its values lead to."""
+        if name in ARGUMENTS:
+            if type(argument) is int and argument.bit_length() > LONGEST:
+                raise ValueError(f"it has a number of {argument.bit_length()} bits")
+            self._push(argument)
+        elif name in VALUES:
+            self._push(VALUES[name])
+        elif name in CONTAINERS:
+            self._push(CONTAINERS[name]())
+        elif name in TUPLES:
+            self._push_of(tuple, self._top(TUPLES[name]))
+        elif name in DOES:
+            DOES[name](self)
+        elif name in ("BINGET", "LONG_BINGET"):
+            entry = self._memo[argument]
+            entry.closed = True
+            self._stack.append(entry)
+        else:
+            raise ValueError(f"it has the opcode {name}, which no robot is written with")
+
+    def _push(self, value: object) -> _Entry:
+        entry = _Entry(value)
+        self._stack.append(entry)
+        return entry
+
+    def _push_of(self, kind: type, parts: list[_Entry]) -> None:
+        """A container that is made at once."""
+        entry = _Entry(None)
+        entry.holds(parts)
+        entry.value = kind([part.value for part in parts])
+        self._stack.append(entry)
+
+    def _top(self, count: int) -> list[_Entry]:
+        """The last ones, taken away."""
+        if len(self._stack) < count:
+            raise IndexError("its stack is empty")
+        taken = self._stack[-count:]
+        del self._stack[-count:]
+        return taken
+
+    def _marked(self) -> list[_Entry]:
+        """All behind the last mark, taken away."""
+        mark = self._marks.pop()
+        taken = self._stack[mark:]
+        del self._stack[mark:]
+        return taken
+
+    # what they do
+
+    def proceed(self) -> None:
+        """Says nothing about values."""
+
+    def mark(self) -> None:
+        self._marks.append(len(self._stack))
+
+    def memoize(self) -> None:
+        self._memo.append(self._stack[-1])
+
+    def many(self) -> None:
+        self._push_of(tuple, self._marked())
+
+    def frozen(self) -> None:
+        parts = self._marked()
+        _keys(parts)
+        self._push_of(frozenset, parts)
+
+    def append(self) -> None:
+        self._extend(self._top(1))
+
+    def appends(self) -> None:
+        self._extend(self._marked())
+
+    def _extend(self, parts: list[_Entry]) -> None:
+        whole = self._stack[-1]
+        if type(whole.value) not in (list, deque):
+            raise TypeError("what is no list is made longer")
+        whole.holds(parts)
+        whole.value.extend([part.value for part in parts])
+
+    def item(self) -> None:
+        self._update(self._top(2))
+
+    def items(self) -> None:
+        self._update(self._marked())
+
+    def _update(self, parts: list[_Entry]) -> None:
+        whole, keys, values = self._stack[-1], parts[::2], parts[1::2]
+        if type(whole.value) is not dict:
+            raise TypeError("what is no dict gets keys")
+        _keys(keys)
+        whole.holds(parts)
+        whole.value.update({key.value: one.value for key, one in zip(keys, values, strict=True)})
+
+    def added(self) -> None:
+        parts = self._marked()
+        whole = self._stack[-1]
+        if not isinstance(whole.value, set):
+            raise TypeError("what is no set gets elements")
+        _keys(parts)
+        whole.holds(parts)
+        whole.value.update([part.value for part in parts])
+
+    def found(self) -> None:
+        module, name = [entry.value for entry in self._top(2)]
+        if not isinstance(module, str) or not isinstance(name, str):
+            raise TypeError("a class whose name is no text")
+        self._push(self._find(module, name))
+
+    def reduced(self) -> None:
+        """A value of a class, of what it is given."""
+        kind, given = self._top(2)
+        if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
+            raise TypeError("what is no class is called")
+        entry = _Entry(None)
+        entry.holds([given])
+        entry.value = _made(kind.value, given.value)
+        self._stack.append(entry)
+
+    def bare(self) -> None:
+        """A part without its attributes."""
+        kind, given = self._top(2)
+        if not isinstance(kind.value, type) or given.value != ():
+            raise TypeError("what is no class, or needs values, is made of none")
+        if not _is_part(kind.value):
+            raise ValueError(f"{kind.value.__name__} is not made of nothing")
+        self._push(object.__new__(kind.value))
+
+    def built(self) -> None:
+        """Its attributes."""
+        (state,) = self._top(1)
+        whole, named = self._stack[-1], state.value
+        if not _is_part(type(whole.value)) or not isinstance(named, dict):
+            raise ValueError(f"a {type(whole.value).__name__} gets attributes")
+        for name in named:
+            if not isinstance(name, str) or hasattr(type(whole.value), name):
+                raise ValueError(f"the attribute {name!r:.50} of a {type(whole.value).__name__}")
+        whole.holds([state])
+        vars(whole.value).update(named)
+
+
+DOES: dict[str, Callable[[_Machine], None]] = {
+    "PROTO": _Machine.proceed,
+    "FRAME": _Machine.proceed,
+    "STOP": _Machine.proceed,
+    "MARK": _Machine.mark,
+    "MEMOIZE": _Machine.memoize,
+    "TUPLE": _Machine.many,
+    "FROZENSET": _Machine.frozen,
+    "APPEND": _Machine.append,
+    "APPENDS": _Machine.appends,
+    "SETITEM": _Machine.item,
+    "SETITEMS": _Machine.items,
+    "ADDITEMS": _Machine.added,
+    "STACK_GLOBAL": _Machine.found,
+    "REDUCE": _Machine.reduced,
+    "NEWOBJ": _Machine.bare,
+    "BUILD": _Machine.built,
+}
+
+
+def _keys(entries: Sequence[_Entry]) -> None:
+    """Raises `ValueError` for what takes long to look up, or cannot be."""
+    for entry in entries:
+        value = entry.value
+        parts = value if type(value) is tuple and len(value) <= MOST_IN_KEY else (value,)
+        if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
+            raise ValueError(f"a {type(value).__name__} is a key in it")
+
+
+def _is_part(kind: Any) -> bool:
+    """Its instances are their attributes, and nothing is run when they are made."""
+    plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
+    return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
+
+
+def _made(kind: type, given: tuple[Any, ...]) -> object:
+    """A value of this class; raises `ValueError` or `TypeError`."""
+    match given:
+        case (dict(),) if kind is Counter:
+            return Counter(*given)
+        case () | ((), None | int()) if kind is deque:
+            return deque(*given)
+        case (str() | int() as value,) if issubclass(kind, Enum):
+            return kind(value)
+        case _ if issubclass(kind, Struct):
+            made = kind(*given)
+            msgspec.convert({name: getattr(made, name) for name in kind.__struct_fields__}, kind)
+            return made
+    raise ValueError(f"{kind.__name__} is not made of that")
