@@ -168,7 +168,7 @@ _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'
 
 COMMANDS: dict[str, How] = {
     # README.md
-    "python3 -m venv .venv && .venv/bin/pip install '.[all]' && .venv/bin/acsard run": FIRST,
+    "python3 -m venv .venv && .venv/bin/pip install '.[web,top]' && .venv/bin/acsard run": FIRST,
     "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(
         "-e '.[test]'"
     ),
@@ -210,7 +210,8 @@ COMMANDS: dict[str, How] = {
     ),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
-        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_and_a_desktop"
+        "tests/system/test_page.py",
+        "test_every_view_is_drawn_on_a_phone_upright_and_sideways_and_a_desktop",
     ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
