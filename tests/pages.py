@@ -210,8 +210,7 @@ COMMANDS: dict[str, How] = {
     ),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
-        "tests/system/test_page.py",
-        "test_every_view_is_drawn_on_a_phone_upright_and_sideways_and_a_desktop",
+        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop"
     ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",

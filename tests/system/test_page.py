@@ -296,7 +296,7 @@ def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:
         assert worst == [], (size, dark, stopped, view)
 
 
-def test_every_view_is_drawn_on_a_phone_upright_and_sideways_and_a_desktop(tmp_path: Path) -> None:
+def test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop(tmp_path: Path) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
     assert sizes == [one for one in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]
