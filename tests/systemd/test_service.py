@@ -112,7 +112,7 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
     assert bare.run(ACSARD, "service", "install").code == 0
     until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
     assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
-    assert bare.show("MemoryMax", PAGE) == str(420 << 20)
+    assert bare.show("MemoryMax", PAGE) == str(256 << 20)
     daemon, first = bare.main_pid(), bare.main_pid(PAGE)
     bare.run("systemctl", "kill", "--signal=SIGKILL", PAGE)
     until(lambda: bare.show("NRestarts", PAGE) == "1", 10.0, "it is started again")
