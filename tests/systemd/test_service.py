@@ -112,7 +112,7 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
     assert bare.run(ACSARD, "service", "install").code == 0
     until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
     assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
-    assert bare.show("MemoryMax", PAGE) == str(420 << 20)
+    assert bare.show("MemoryMax", PAGE) == str(256 << 20)
     daemon, first = bare.main_pid(), bare.main_pid(PAGE)
     bare.run("systemctl", "kill", "--signal=SIGKILL", PAGE)
     until(lambda: bare.show("NRestarts", PAGE) == "1", 10.0, "it is started again")
@@ -208,7 +208,7 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
     bare.write("/opt/acsard/probe.py", PROBE)
     words = f"{bare.show('MainPID')} /var/lib/acsard/record {FORMER}"
     walls = f"ExecStartPre=/usr/bin/python3 /opt/acsard/probe.py {words}"
-    bare.drop_in("probe.conf", f"[Service]\n{walls}\nMemoryMax={LITTLE}\n", PAGE)
+    bare.drop_in("probe.conf", f"[Service]\n{walls}\n", PAGE)
     bare.run("systemctl", "restart", PAGE)
     told = [line for line in bare.messages(PAGE).splitlines() if line.startswith('{"read"')]
     found = json.loads(told[-1])
@@ -216,19 +216,8 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
     assert (found.pop("read"), found.pop("signal")) == ("done", "EPERM")
     assert set(found.values()) <= {"EACCES", "EROFS", "ENOENT", "EPERM"}, found
 
-    until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "the page is there again")
-    if bare.show("MemoryCurrent", PAGE).isdecimal():
-        page = bare.main_pid(PAGE)
-        refused = drawn(bare)
-        assert (refused["report"], bare.main_pid(PAGE)) == ("failed", page)
-        assert "memory" in str(refused["text"])
-
     assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
     assert not bare.path(STATE).exists()
-
-
-LITTLE = 90 << 20
-"""Enough for the page, and for no report."""
 
 
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:
