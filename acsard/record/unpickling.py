@@ -25,7 +25,7 @@ import msgspec
 from msgspec import Struct
 
 MOST_BYTES = 1 << 20
-"""A robot takes some 20 000; with many senders of commands, a few times as much."""
+"""A robot takes 12 000 to 40 000; with many senders of commands, a few times as much."""
 
 MOST_OPCODES = 1 << 17
 

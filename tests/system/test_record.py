@@ -67,7 +67,7 @@ def killed(where: Path, seconds: float) -> None:
     (path,) = [path for path in files(where) if path.name.endswith(".part")]
     late = bystander.lost(began, end)
     assert end_s - last_s(where, path) < LOST_S + late
-    assert replayed(where, path) > 50
+    assert replayed(where, path) > 0
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,24 @@ def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path:
     assert kept.exists()
     assert not first.exists()
     assert len(listed(tmp_path)) > 20
+
+
+def test_room_is_made_among_many_files_in_a_time_that_grows_as_they_do(tmp_path: Path) -> None:
+    first = record(ring(tmp_path / "first"))
+
+    def seconds(count: int) -> float:
+        where = tmp_path / str(count)
+        one = ring(where, 1e-3)
+        for number in range(count):
+            os.link(first, where / f"{number:06}-20270115T080000Z.mcap")
+        began = time.process_time()
+        one.trim(NOW_NS)
+        took = time.process_time() - began
+        assert listed(where) == []
+        return took
+
+    seconds(10)
+    assert seconds(4000) < 20 * seconds(500)
 
 
 def test_only_kept_files_are_bounded_in_bytes_too(tmp_path: Path) -> None:
