@@ -18,7 +18,7 @@ from xdist.scheduler import LoadGroupScheduling
 # No deadline: a slow machine must not fail a true sentence. The same examples every time: what a
 # change is judged by must not be luck. `explore` looks for new ones.
 settings.register_profile("default", deadline=None, max_examples=10, derandomize=True)
-settings.register_profile("thorough", deadline=None, max_examples=300, derandomize=True)
+settings.register_profile("thorough", deadline=None, max_examples=100, derandomize=True)
 """`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
 settings.register_profile("explore", deadline=None, max_examples=3000)
 """`pytest --hypothesis-profile explore tests/unit`: 8 minutes, other examples each time."""

@@ -93,7 +93,8 @@ def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
         lives_again(tape, FULL, first, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
 def test_ten_minutes_through_every_fault_are_lived_again() -> None:
     lives_again(taped(FULL, 600.0), FULL)
 
