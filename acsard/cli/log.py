@@ -175,7 +175,7 @@ def replay_one(args: argparse.Namespace) -> int:
     if tally.first is not None:
         rows = [*differs(tally.first, began_ns), *rows, *otherwise(tally)]
     for row in rows:
-        print(row)
+        print(printable(row))
     note = trouble or _state(recording).strip()
     if note:
         print(f"{recording.path}: {note}", file=sys.stderr)

@@ -118,14 +118,13 @@ def _drawn(
 
     about, looked = recording.about, Onlooker(recording)
     course = Course(looked.config, words.seconds(args.begin), words.seconds(args.end))
-    with looked.living():
-        for number, (step, outputs, robot) in enumerate(looked.steps()):
-            if number % EVERY == 0:
-                tell(step.inputs.now.wall_ns)
-            course.step(step, outputs, robot)
-            if course.over:
-                deque(recording.messages(), maxlen=0)  # only what is missing of it
-                break
+    for number, (step, outputs, robot) in enumerate(looked.steps()):
+        if number % EVERY == 0:
+            tell(step.inputs.now.wall_ns)
+        course.step(step, outputs, robot)
+        if course.over:
+            deque(recording.messages(), maxlen=0)  # only what is missing of it
+            break
     if course.began is None:
         message = f"{recording.path} has no step of that time to draw"
         raise ExitError(Exit.FAILURE, message)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import select
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -160,8 +161,10 @@ def ended_by_signals() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         for each in numbers:
             signal.signal(each, signal.SIG_IGN)
-        with suppress(OSError):  # who started it may be gone
-            print("\nstopping: zeros go out, then the port is closed", file=sys.stderr)
+        # Who started it may be gone, or read nothing: the zeros wait for nobody.
+        with suppress(OSError, ValueError):
+            if select.select([], [sys.stderr], [], 0.0)[1]:
+                print("\nstopping: zeros go out, then the port is closed", file=sys.stderr)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + number)

@@ -42,7 +42,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "https://0.0.0.0:8443 is for other machines",
     )
     parser.add_argument(
-        "--record", metavar="DIRECTORY", help="where the recordings are (else record.directory)"
+        "--record",
+        metavar="DIRECTORY",
+        help="where the recordings are until the robot says so (else record.directory)",
     )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from acsard.messages.schema import Events
+from acsard.messages.schema import Events, Happening
 from acsard.ros.shapes import Log, log
 
 
 class News:
-    """Knows how many there were, and when the last was."""
+    """Knows how many there were, when the last was, and the last ones."""
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
+        self._told: list[Happening] = []
 
     def of(self, events: Events) -> list[Log]:
         """Those that are new; of a daemon not heard before all that it still knows."""
-        known, stamp_ns = self._total, events.stamp.to_ns()
+        known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
                 return []  # what was asked for, overtaken by what came by itself
-            known = 0  # another daemon
-        self._total, self._stamp_ns = events.total, stamp_ns
+            known, told = 0, []  # another daemon
+        self._total, self._stamp_ns, self._told = events.total, stamp_ns, events.events
         new = min(events.total - known, len(events.events))
-        return [log(one, one.stamp) for one in events.events[len(events.events) - new :]]
+        last = events.events[len(events.events) - new :]
+        # One that goes on is several of the total, and one here.
+        return [log(one, one.stamp) for one in last if one not in told]

@@ -292,8 +292,8 @@ class Events(Message, frozen=True):
     stamp: Time
     """When the last of them was."""
     total: int
-    """How many there were since the start: who knows an earlier total knows which are new. One that
-    goes on counts each time, and is the last then."""
+    """How many there were since the start. One that goes on counts each time, and is the last then:
+    new are, of so many as the total has grown by, those that differ from what was known."""
     events: list[Happening]
 
 

@@ -29,6 +29,9 @@ OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 has it mounted read-only. No group would do: a dynamic one has no name, and later systemds (257)
 keep a state directory as nobody's on the disk."""
 
+PRIVATE = Path("/var/lib/private")
+"""Of services with a user of their own; only root gets in there."""
+
 KEPT = ".kept.mcap"
 WHOLE = ".mcap"
 PART = ".mcap.part"
@@ -78,7 +81,8 @@ class Ring:
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self.file_bytes = self._bytes // FILES
-        self._open = os.environ.get(RECORD) == settings.directory
+        here = self._directory.resolve()
+        self._open = os.environ.get(RECORD) == settings.directory and here.is_relative_to(PRIVATE)
         if not self._directory.is_dir():
             self._directory.mkdir(parents=True)
             self._directory.chmod(DIRECTORY_MODE)  # whatever the umask takes away
@@ -101,9 +105,9 @@ class Ring:
 
     def _let_in(self) -> None:
         """Also to what a version has left that recorded for itself alone."""
-        with suppress(OSError):  # somebody else's: to record comes first
-            for path in (self._directory, *listed(self._directory)):
-                mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
+        for path in (self._directory, *listed(self._directory)):
+            mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
+            with suppress(OSError):  # somebody else's: to record comes first
                 if stat.S_IMODE(path.stat().st_mode) != mode:
                     path.chmod(mode)
 

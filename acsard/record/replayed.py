@@ -35,7 +35,7 @@ def quietly(wall_ns: int) -> None:
 
 
 LACKS = (
-    AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError, MemoryError
+    AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
 """What a robot raises that has not the parts it ought to have."""
 

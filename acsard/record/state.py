@@ -40,6 +40,14 @@ TABLE = copyreg.dispatch_table | {
 """Python 3.11 before 3.11.4, Debian 12's own, writes members of an enum by `getattr`."""
 
 
+MOVED = {
+    "acsard.mcu.frames": "acsard.mcu.codec",
+    "acsard.mcu.link": "acsard.mcu.link_state",
+    "acsard.drive.lying_wheels.witness": "acsard.drive.lying_wheels.verdict",
+}
+"""Modules by the names that they had when older recordings were made."""
+
+
 class StateError(AcsardError):
     """These bytes hold no robot, or one of other parts."""
 
@@ -85,6 +93,7 @@ def part(module: str, name: str) -> type:
     By its own name, and of a module that is there: nothing is imported, nothing is found by way of
     another, and what only names or raises something is none.
     """
+    module = MOVED.get(module, module)
     if (module, name) in BESIDE:
         return BESIDE[module, name]
     ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)

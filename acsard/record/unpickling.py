@@ -32,6 +32,12 @@ MOST_OPCODES = 1 << 17
 MOST_PARTS = 1 << 19
 """All that is in it, what is there several times as often as that."""
 
+MOST_COPIED = 4 * MOST_PARTS
+"""All that is copied to make its parts: few bytes can ask for the same one again and again."""
+
+HASHED = 2**61 - 1
+"""Whole numbers below it have a hash each of their own, in Python."""
+
 DEEPEST = 50
 """Of parts within parts."""
 
@@ -112,6 +118,7 @@ class _Machine:
         self._stack: list[_Entry] = []
         self._marks: list[int] = []
         self._memo: list[_Entry] = []
+        self._copied = 0
 
     def result(self) -> object:
         """What is left in the end."""
@@ -166,6 +173,12 @@ class _Machine:
         taken = self._stack[mark:]
         del self._stack[mark:]
         return taken
+
+    def _copies(self, entry: _Entry) -> None:
+        """A part is made of it."""
+        self._copied += entry.size
+        if self._copied > MOST_COPIED:
+            raise ValueError("it has more parts than any robot")
 
     # what they do
 
@@ -235,6 +248,7 @@ class _Machine:
             raise TypeError("what is no class is called")
         entry = _Entry(None)
         entry.holds([given])
+        self._copies(given)
         entry.value = _made(kind.value, given.value)
         self._stack.append(entry)
 
@@ -257,6 +271,7 @@ class _Machine:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
                 raise ValueError(f"the attribute {name!r:.50} of a {type(whole.value).__name__}")
         whole.holds([state])
+        self._copies(state)
         vars(whole.value).update(named)
 
 
@@ -287,6 +302,8 @@ def _keys(entries: Sequence[_Entry]) -> None:
         parts = value if type(value) is tuple and len(value) <= MOST_IN_KEY else (value,)
         if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
             raise ValueError(f"a {type(value).__name__} is a key in it")
+        if any(type(part) is int and abs(part) >= HASHED for part in parts):
+            raise ValueError("a number of more than 60 bits is a key in it")
 
 
 def _is_part(kind: Any) -> bool:

@@ -4,8 +4,8 @@ nothing, and so many at most."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from acsard.bus import fleet
 from acsard.bus.access import MAY, SERVICE_ROLES
@@ -43,11 +43,24 @@ class RefusedError(AcsardError):
         """He may not; else there is none."""
 
 
+class Ending(NamedTuple):
+    """What became of what the page's server had begun beside the daemon."""
+
+    words: str = ""
+    """Empty where there was nothing."""
+    ended: bool = True
+    """Else it goes on for a while."""
+
+
+async def _nothing() -> Ending:
+    return Ending()
+
+
 class Calls:
     """What is under way, at most so much."""
 
-    def __init__(self, robots: Robots, ends: Callable[[], str] = str) -> None:
-        """`ends` ends what the page's server has begun beside the daemon, and says what it was."""
+    def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
+        """`ends` ends what the page's server has begun beside the daemon."""
         self._robots, self._ends = robots, ends
         self._running, self._stops, self._elsewhere = 0, Stops(), 0
 
@@ -60,11 +73,13 @@ class Calls:
         other = "" if robot == self._robots.id else robot
         if other:
             _require_stop(verb, other)
-        ended = self._ends() if verb == "stop" and not other else ""
-        reply = await self._called(who, verb, payload, other)
+        if verb != "stop" or other:
+            return await self._called(who, verb, payload, other)
         # A check has the port, and its wheels turn: the daemon, if there is one, cannot stop them.
-        # What is ended stands only when it has; what was confirmed is what the daemon says.
-        return ServiceReply(reply.success, f"{ended}; {reply.message}") if ended else reply
+        ending, reply = await asyncio.gather(self._ends(), self._called(who, verb, payload, other))
+        if not ending.words:
+            return reply
+        return ServiceReply(reply.success and ending.ended, f"{ending.words}; {reply.message}")
 
     async def _called(
         self, who: Who, verb: str, payload: Mapping[str, Any], other: str

@@ -23,8 +23,12 @@ from acsard.host.exits import WORDS, Exit
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S
 from acsard.web.boards import NO_DEVICE, Board, boards
+from acsard.web.calls import Ending
 from acsard.web.errands import Reach, words
 from acsard.web.frames import Begin, FrameError, Press, Reply
+
+ENDING_S = 1.0
+"""Whoever pressed STOP hears by then whether it has ended."""
 
 LINE_BYTES = 65536
 """Of what the child says at once."""
@@ -122,13 +126,15 @@ class Guide:
         else:
             errand.leave()
 
-    def stop(self) -> str:
-        """Somebody stops the robot: whoever began it, it is ended, and that is said; "" when
-        nothing goes on. The daemon does not hear of a check: it cannot have the port."""
-        if self._errand is None:
-            return ""
+    async def stop(self) -> Ending:
+        """Somebody stops the robot: whoever began what goes on, it is ended, and that is said. The
+        daemon does not hear of a check: it cannot have the port."""
+        if self._errand is None or self._task is None:
+            return Ending()
         self._errand.leave()
-        return f"the {self._errand.name} of {self._errand.by} is being ended"
+        what = f"the {self._errand.name} of {self._errand.by}"
+        done, _ = await asyncio.wait([self._task], timeout=ENDING_S)
+        return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
         """He says something: the child hears that he is there."""

@@ -254,7 +254,7 @@ def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) 
     until(lambda: page.browser.js(seen) == "visible", 5.0, "the words again")
 
 
-def test_a_page_that_has_no_place_says_why(page: Phone) -> None:
+def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     async def story() -> None:
         async with AsyncExitStack() as stack:
             left = CONNECTIONS_HERE
@@ -275,6 +275,8 @@ def test_a_page_that_has_no_place_says_why(page: Phone) -> None:
     def look() -> None:
         page.browser.open(page.server.here)
         page.shows("reason", f"{CONNECTIONS_HERE} pages are open at the machine itself")
+        page.browser.tap("stop")
+        until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
 
     page.browser.open("about:blank")
     run(story)

@@ -64,8 +64,19 @@ function followed(key, rate, wanted) {
 async function stop() {
   drive.release();
   guide.leave();
-  const told = await link.call("stop", undefined, OTHER);
+  const told = link.open || OTHER ? await link.call("stop", undefined, OTHER) : await posted();
   views.alarm(told.ok ? "" : `STOP: ${told.text}`);
+}
+
+/** STOP without the link: there may be no place for one more page. */
+async function posted() {
+  try {
+    const answer = await fetch("api/srv/stop", { method: "POST", signal: AbortSignal.timeout(3000) });
+    const told = await answer.json();
+    return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
+  } catch {
+    return { ok: false, text: "no connection to the robot" };
+  }
 }
 
 async function asked(verb) {

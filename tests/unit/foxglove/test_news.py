@@ -53,6 +53,14 @@ def test_an_answer_that_is_older_than_what_came_by_itself_tells_nothing() -> Non
     assert names(news, events(11)) == ["mode10"]
 
 
+def test_one_that_goes_on_brings_nothing_old_back() -> None:
+    news, fault = News(), events(1).events[0]
+    missed = Happening(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
+    news.of(Events(Time(5), 2, [fault, missed]))
+    later = replace(missed, stamp=Time(8), text="9 more periods")
+    assert names(news, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
+
+
 def test_another_daemon_begins_anew() -> None:
     news = News()
     news.of(events(10))

@@ -14,7 +14,7 @@ import struct
 import sys
 
 from acsard.record.state import PROTOCOL, StateError, thaw
-from acsard.record.unpickling import MOST_BYTES, MOST_OPCODES
+from acsard.record.unpickling import HASHED, MOST_BYTES, MOST_OPCODES
 from acsard.robot import Robot
 
 EXTENSION = 201
@@ -40,6 +40,20 @@ def doubled(times: int) -> bytes:
     """A tuple that has one twice, which has one twice ..."""
     levels = [pickle.BINGET + bytes([n]) + b"\x86\x94" for n in range(times)]
     return pickle.EMPTY_TUPLE + pickle.MEMOIZE + b"".join(levels)
+
+
+def counted_again(keys: int, times: int) -> bytes:
+    """A large dict, and so many counters that are made of it."""
+    pairs = b"".join(pickle.BININT + struct.pack("<i", key) + ONE for key in range(keys))
+    given = pickle.EMPTY_DICT + pickle.MARK + pairs + pickle.SETITEMS + pickle.TUPLE1
+    made = (pickle.BINGET + b"\x00" + pickle.BINGET + b"\x01" + pickle.REDUCE) * times
+    return pickle.MARK + COUNTER + pickle.MEMOIZE + given + pickle.MEMOIZE + made + pickle.TUPLE
+
+
+def of_one_hash(keys: int) -> bytes:
+    """A dict whose keys Python cannot tell apart but by comparing all of them."""
+    pairs = (pickle.LONG1 + b"\x0c" + (key * HASHED).to_bytes(12, "little") for key in range(keys))
+    return pickle.EMPTY_DICT + pickle.MARK + ONE.join(pairs) + ONE + pickle.SETITEMS
 
 
 def attributes(*pairs: tuple[bytes, bytes]) -> bytes:
@@ -155,6 +169,8 @@ BODIES: dict[str, bytes] = {
 }  # fmt: skip
 
 ATTACKS = {name: whole(body) for name, body in BODIES.items()} | {
+    "one dict copied again and again": whole(counted_again(18_000, 28_000)),
+    "keys of one hash": whole(of_one_hash(40_000)),
     "nothing": b"",
     "the first half": pickle.dumps(list(range(50)), PROTOCOL)[:60],
 }

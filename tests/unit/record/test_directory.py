@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from acsard.config.settings import RecordConfig
+from acsard.record import directory
 from acsard.record.directory import (
     DIRECTORY_MODE,
     KEPT,
@@ -85,6 +86,9 @@ def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
     ring(where).close()
     assert modes(where) == {0o640}, "it is another directory"
     monkeypatch.setenv("ACSARD_RECORD", str(where))
+    ring(where).close()
+    assert modes(where) == {0o640}, "everybody gets there, not only root"
+    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
     before = os.umask(0o077)
     try:
         one = ring(where)
@@ -102,6 +106,7 @@ def test_a_directory_that_is_somebody_else_s_is_recorded_to_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ACSARD_RECORD", ".")
+    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
     monkeypatch.chdir(tmp_path)
     tmp_path.chmod(0o777)
     child = os.fork()

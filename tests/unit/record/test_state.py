@@ -15,12 +15,13 @@ from acsard.mcu.lattice import Search
 from acsard.record.export import export
 from acsard.record.file import Recording
 from acsard.record.replayed import Onlooker, live
-from acsard.record.state import StateError, freeze, thaw
+from acsard.record.state import MOVED, StateError, freeze, thaw
 from acsard.report.course import Course
 from acsard.robot import Robot
 from acsard.values import Instant
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
+from tests.unit.record.attacks import text
 
 
 def test_it_comes_back_as_it_was() -> None:
@@ -31,6 +32,15 @@ def test_it_comes_back_as_it_was() -> None:
     assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
     again = freeze(state.robot, b"")
     assert freeze(thaw(again).robot, b"") == again
+
+
+def test_a_robot_of_parts_that_have_moved_since_comes_back_as_it_was() -> None:
+    data = freeze(Robot(Config()), b"line")
+    older = data
+    for before, now in MOVED.items():
+        assert text(now) in data
+        older = older.replace(text(now), text(before))
+    assert freeze(thaw(older).robot, b"line") == data
 
 
 @pytest.mark.parametrize("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])

@@ -13,7 +13,14 @@ from msgspec.structs import replace
 from acsard.client import Client
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import ServiceReply
-from acsard.web.calls import ELSEWHERE_AT_ONCE, STOPS_AT_ONCE, Calls, RefusedError, Stops
+from acsard.web.calls import (
+    ELSEWHERE_AT_ONCE,
+    STOPS_AT_ONCE,
+    Calls,
+    Ending,
+    RefusedError,
+    Stops,
+)
 from acsard.web.who import MAINTAINER
 from tests.unit.web.test_fleet import quiet, robots
 
@@ -89,16 +96,32 @@ def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_hav
     asyncio.run(story())
 
 
-def test_a_stop_ends_a_check_for_which_the_daemon_has_no_port() -> None:
-    async def story() -> None:
-        calls = Calls(robots(None), lambda: "the check of phone is being ended")
-        told = await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
-        # No daemon has confirmed anything.
-        assert not told.success
-        assert told.message.startswith("the check of phone is being ended; ")
-        assert not (await calls.call(MAINTAINER, "clear", {})).success
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_so(
+    ended: bool,
+) -> None:
+    async def ends() -> Ending:
+        return Ending("the check of phone has ended", ended)
 
-    asyncio.run(story())
+    def served(query: zenoh.Query) -> None:
+        with query:
+            answer = encode(ServiceReply(True, "stopped"), "msgpack")
+            kind = encoding_name("msgpack", "ServiceReply")
+            query.reply(query.key_expr, answer, encoding=kind)
+
+    async def story(client: Client | None) -> ServiceReply:
+        calls = Calls(robots(client), ends)
+        assert not (await Calls(robots(None), ends).call(MAINTAINER, "clear", {})).success
+        return await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
+
+    told = asyncio.run(story(None))
+    assert not told.success, "no daemon has confirmed anything"
+    assert told.message.startswith("the check of phone has ended; ")
+    with zenoh.open(quiet()) as session:
+        session.declare_queryable("acsard/acsar/srv/stop", served)
+        told = asyncio.run(story(Client(session, "acsar", "teleop")))
+    assert told.success == ended
+    assert told.message == "the check of phone has ended; stopped"
 
 
 def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:
