@@ -439,7 +439,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
         assert after["link"] == "up" or starved
         # To a link that was lost, even for a moment, there is no line to be made.
         kept = len(daemon.events("link_stale")) == lost_links
-        assert kept or lost(begun) > 0.02
+        assert kept or starved or lost(begun) > 0.01
         assert not kept or periods.superseded + periods.missed >= 35
         assert not kept or periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.
