@@ -116,10 +116,13 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
 
 
 def recorded(config: Config) -> Config:
-    """Where nothing else says where it is recorded, the environment does: the service's units."""
-    if config.record.directory or RECORD not in os.environ:
-        return config
-    return replace(config, record=replace(config.record, directory=os.environ[RECORD]))
+    """Where nothing else says where it is recorded, the environment does: the service's units.
+
+    The whole path: who reads it on the bus may stand elsewhere.
+    """
+    told = config.record.directory or os.environ.get(RECORD, "")
+    directory = os.path.abspath(told) if told else ""
+    return replace(config, record=replace(config.record, directory=directory))
 
 
 def robot_address(args: argparse.Namespace) -> Address:

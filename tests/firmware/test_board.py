@@ -71,7 +71,8 @@ def is_still(board: Board) -> Status:
 
     def look() -> Status | None:
         status = board.status()
-        still = all(abs(motor.speed) < 0.001 for motor in status.motors)
+        # What runs out yet is far less than a count, or one more may come after any answer.
+        still = all(abs(motor.speed) < 1e-6 for motor in status.motors)
         return status if still and is_off(status) else None
 
     return until(look, 10.0, "standstill")

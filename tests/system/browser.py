@@ -93,11 +93,17 @@ class _Here(aiohttp.abc.AbstractResolver):
         """Nothing is held."""
 
 
+async def answer(url: str) -> tuple[int, str]:
+    """Status and body."""
+    async with aiohttp.ClientSession() as session, session.get(url) as got:
+        return got.status, await got.text()
+
+
 async def text(url: str) -> str:
     """What is there."""
-    async with aiohttp.ClientSession() as session, session.get(url) as answer:
-        assert answer.status == 200
-        return await answer.text()
+    status, body = await answer(url)
+    assert status == 200, body
+    return body
 
 
 class Hands:

@@ -16,7 +16,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from tests.system.browser import Page, hands, run, text
+from tests.system.browser import Page, answer, hands, run, text
 from tests.system.harness import (
     PATIENCE_S,
     ROOT,
@@ -234,8 +234,13 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_
             daemon.shows(rf"page +http://127.0.0.1:{port}, for a browser")
             url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
             assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
-            what = "what the option has recorded is listed"
-            until(lambda: ".mcap" in asyncio.run(text(f"{url}api/recordings")), START_S, what)
+
+            def listed() -> bool:
+                """Not before the recorder has made its directory."""
+                status, told = asyncio.run(answer(f"{url}api/recordings"))
+                return status == 200 and ".mcap" in told
+
+            until(listed, START_S, "what the option has recorded is listed")
             (first,) = daemon.page()
             with Bus(daemon.endpoint) as bus:
                 before = bus.get("info")

@@ -248,3 +248,11 @@ def test_it_is_recorded_where_the_option_the_file_or_the_service_says_in_this_or
     monkeypatch.setenv("ACSARD_RECORD", "/service")
     found = [recorded(one).record.directory for one in (named, in_file, Config())]
     assert found == ["/option", "/file", "/service"]
+
+
+def test_where_it_is_recorded_is_told_whole_to_who_stands_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    named = recorded(parse(b"", {"record": {"directory": "box"}}))
+    assert named.record.directory == str(tmp_path / "box")
