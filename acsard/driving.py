@@ -36,7 +36,8 @@ SETTLED_S = 0.2
 """A state that is older than what we did last has come by then."""
 
 GRACE_S = 0.5
-"""A drive that does not count for so long is over: a held-up sender is heard again sooner."""
+"""A drive that does not count for so long, or for half of its time, is over: a held-up sender is
+heard again sooner."""
 
 ASK_S, DEAD_S = 0.3, 2.0
 """Without a state for so long it is asked for, since it may be published seldom; without an answer
@@ -84,11 +85,11 @@ def drive(
     try:
         # Each time: the robot may have been stopped and cleared, or started, since the last drive.
         yield from _opening(robot, watch)
-        end = time.monotonic() + seconds
+        end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - time.monotonic()) > 0:
             robot.send(linear, angular)
             yield min(SEND_PERIOD_S, left)
-            watch.require(GRACE_S)
+            watch.require(grace)
         yield from _stopping(robot, watch)
     finally:
         # Whatever interrupts the drive, the robot is told to stop.

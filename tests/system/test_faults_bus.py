@@ -51,6 +51,9 @@ SLACK_S = 0.1
 """What a noisy two-core machine may add to a bound before a test calls it broken. A backlog's ages
 run through all values from seconds down to zero: one that is obeyed too early cannot hide in it."""
 
+HANDS = 3
+"""Sender, way and daemon, through which a command goes: a busy machine keeps each waiting."""
+
 PROMPT: dict[str, object] = {
     "linear_acceleration": 100.0,
     "linear_deceleration": 100.0,
@@ -285,7 +288,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
                     held,
                     bus.count("command_stale") - refused,
                     len(ages),
-                    sum(age > bound + lost(h.at - age, h.at) for h, age in stale),
+                    sum(age > bound + HANDS * lost(h.at - age, h.at) for h, age in stale),
                     max(ages),
                     again.at - healed,
                 )

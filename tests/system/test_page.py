@@ -173,6 +173,29 @@ def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
     bus.at_rest()
 
 
+LOCKS = """
+(() => {
+  const ask = navigator.wakeLock.request.bind(navigator.wakeLock);
+  window.locks = [];
+  navigator.wakeLock.request = async (kind) => {
+    const lock = await ask(kind);
+    window.locks.push(lock);
+    return lock;
+  };
+})();1
+"""
+
+
+def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) -> None:
+    browser = page.browser
+    browser.js(LOCKS)
+    page.hold()
+    until(lambda: browser.js("locks.map(one => one.released)") == [False], 5.0, "it is kept on")
+    browser.touch("End")
+    until(lambda: browser.js("locks.map(one => one.released)") == [True], 5.0, "and no longer")
+    page.bus.at_rest()
+
+
 def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -> None:
     page.daemon.signal(signal.SIGSTOP)
     try:

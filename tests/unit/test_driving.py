@@ -219,6 +219,13 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert not world.subscribed
 
 
+def test_a_short_drive_that_hardly_counted_does_not_return_as_if_it_had(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(NotDrivenError, match="higher priority"):
+        World(after(0.45, HIGHER)).drive(monkeypatch, 0.8 * GRACE_S)
+
+
 def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
 

@@ -1,5 +1,6 @@
 // Stick, keys and gamepad -> one hand. Whatever takes the finger or the eye away lets go.
 
+import { awake } from "./awake.js";
 import { Hand, twist } from "./hand.js";
 
 export const SOURCE = "teleop";
@@ -57,6 +58,7 @@ export class Drive {
     this.#told("");
     this.#hand.press(performance.now());
     this.stick.classList.add("held");
+    awake("stick", true);
     this.#timer = setInterval(() => this.#look(), LOOK);
     this.#look();
   }
@@ -76,6 +78,7 @@ export class Drive {
     clearInterval(this.#timer);
     this.#timer = null;
     this.stick.classList.remove("held");
+    awake("stick", false);
     this.#told(why);
   }
 

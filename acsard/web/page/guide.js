@@ -1,6 +1,7 @@
 // A check of the board or a calibration: what the command tells and asks, and what the person beside
 // the robot answers. The command runs at the robot, and ends with this page's connection.
 
+import { awake } from "./awake.js";
 import { made, text } from "./views.js";
 
 const $ = (id) => document.getElementById(id);
@@ -90,6 +91,7 @@ export class Guide {
     if (!running || !yours) return;
     this.#running = true;
     this.#link.beat(LIFE);
+    awake("guide", true);
     $("errands").hidden = true;
     $("guide").hidden = false;
     $("guide-leave").hidden = false;
@@ -211,6 +213,7 @@ export class Guide {
   #over(why, words = "", look = "warning") {
     this.#running = false;
     this.#link.beat();
+    awake("guide", false);
     this.#question = null;
     this.#ride(false);
     $("guide-question").hidden = $("guide-leave").hidden = true;
