@@ -42,6 +42,11 @@ class Run(NamedTuple):
     def failed(self) -> list[str]:
         return re.findall(r"^(?:FAILED|ERROR) .*$", self.said, re.M)
 
+    @property
+    def again(self) -> list[str]:
+        """What failed while no core was free, and was judged again."""
+        return re.findall(r"^RERUN .*$", self.said, re.M)
+
 
 @contextmanager
 def loops(count: int) -> Iterator[None]:
@@ -117,7 +122,7 @@ def main() -> int:
         *_, last = one.said.strip().splitlines() or ["said nothing"]
         ended = "out of time" if one.code is None else f"exit {one.code}"
         print(f"run {number}: {one.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
-        for line in one.failed:
+        for line in one.again + one.failed:
             print(f"    {line}", flush=True)
         if one.code != 0:
             log = Path(tempfile.gettempdir(), f"acsard-loaded-{number}.log")
