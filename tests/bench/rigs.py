@@ -30,12 +30,13 @@ DRAINING = (*POLLED, "--drain")
 
 
 def trees() -> dict[str, Sequence[str]]:
-    """acsard, and beside it the acsard of another tree where $ACSARD_BESIDE names one."""
-    other = os.environ.get("ACSARD_BESIDE")
-    if other is None:
-        return {"acsard": ACSARD}
-    before = ("env", f"PYTHONPATH={other}", sys.executable, "-P", *ACSARD[1:])
-    return {"acsard": ACSARD, "another tree": before}
+    """acsard, and beside it those of the other trees that $ACSARD_BESIDE names, as PATH does."""
+    others = os.environ.get("ACSARD_BESIDE")
+    named = [Path(other) for other in others.split(os.pathsep)] if others else []
+    return {"acsard": ACSARD} | {
+        other.name: ("env", f"PYTHONPATH={other}", sys.executable, "-P", *ACSARD[1:])
+        for other in named
+    }
 
 
 def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:

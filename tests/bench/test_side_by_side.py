@@ -2,7 +2,7 @@
 
 pytest -s -m bench tests/bench/test_side_by_side.py
 
-With ACSARD_BESIDE=DIRECTORY the acsard of another checkout takes its turns as well.
+With ACSARD_BESIDE=DIRECTORY:DIRECTORY the acsard of other checkouts takes its turns as well.
 
 Asserted are ratios and counts; the figures themselves are printed. The polled program
 (`polled.py`) waits for its 100 Hz tick, half a period on average, and once a reply has been late it
