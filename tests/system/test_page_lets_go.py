@@ -116,7 +116,13 @@ class Field:
             self.browser.open("about:blank")
             self.browser.open(f"{self.server.away}/#token={self.token}")
         for name, words in (("mode", "READY"), ("age", "live")):
-            until(lambda n=name, w=words: w in self.browser.text(n), 30.0, f"{name}: {words}")  # type: ignore[misc]
+            try:
+                until(lambda n=name, w=words: w in self.browser.text(n), 30.0, f"{name}: {words}")  # type: ignore[misc]
+            except AssertionError as error:
+                says = [
+                    self.browser.text(one) for one in ("mode", "reason", "age", "told", "alarm")
+                ]
+                raise AssertionError(f"{error}; the page says {says}") from None
 
     def hold(self) -> None:
         """A finger drives until the speed is steady."""
