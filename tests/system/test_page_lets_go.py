@@ -63,7 +63,7 @@ class Round(NamedTuple):
     allowed_s: float
     """With what the machine itself lost meanwhile."""
     obeyed: int
-    """Lines that grew after that."""
+    """Lines that grew when that was over."""
 
 
 class Field:
@@ -162,11 +162,11 @@ class Field:
         return at - gone, allowed
 
     def obeyed(self, since: float) -> int:
-        """The lines that grew after the first slower one."""
+        """The lines that grew when the timeout of the last command was over. Before that it counts,
+        also after a moment in which a busy machine kept the answers from the daemon."""
         lines = [one.line for one in self.peer.since(since) if one.line != EMPTY]
         speeds = [abs(wheels(line)[0]) for line in lines]
-        braking = list(itertools.dropwhile(lambda speed: speed == speeds[0], speeds))
-        return sum(after > before for before, after in itertools.pairwise(braking))
+        return sum(after > before for before, after in itertools.pairwise(speeds))
 
     def lets_go(self, way: Way, number: int) -> Round:
         """Drive, let go, and look until nothing of it can come any more."""
@@ -175,7 +175,7 @@ class Field:
         with way(self, number) as gone:
             took, allowed = self.braking(gone)
         self.settle()
-        return Round(took, allowed, self.obeyed(gone))
+        return Round(took, allowed, self.obeyed(gone + allowed))
 
 
 Way = Callable[[Field, int], AbstractContextManager[float]]
