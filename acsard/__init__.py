@@ -37,8 +37,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     record/        S  the black box: steps <-> MCAP, a ring of files, replay (its core is pure)
     runtime/       S  the control loop and the daemon; figures of itself
     door/          S  `acsard door`: where TLS ends, a process of its own
-    client.py      S  drive and follow a robot from Python
-    driving.py     S  one drive of the client, and what `state` says becomes of it
+    client/        S  drive and follow a robot from Python: synchronous, asynchronous; driving is
+                      one drive, and what `state` says becomes of it
     report/        P  `acsard log report`: course (what a recording shows), thinning (a day in a
                       minute's room), account (words), figures, page
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look

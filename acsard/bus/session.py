@@ -82,6 +82,11 @@ def reachable(endpoint: str) -> str:
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
+def no_endpoint(text: str) -> UsageError:
+    """What to raise for it."""
+    return UsageError(f'{text} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
+
+
 PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
@@ -127,7 +132,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     certificates, and `UnreachableError` when nobody answers there.
     """
     if "/" not in endpoint:
-        raise UsageError(f'{endpoint} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
+        raise no_endpoint(endpoint)
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
         # What accepts and then says nothing is no daemon; a person waits for this.

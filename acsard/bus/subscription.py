@@ -76,7 +76,7 @@ class Subscription:
         """The next sample, or None when there is none now."""
         for _ in range(QUEUED):  # no flood holds the caller
             sample: zenoh.Sample | None = self._queue.try_recv()
-            if sample is None or self._key in ("", str(sample.key_expr)):
+            if sample is None or not self._key or on(self._key, sample):
                 return sample
         return None
 
@@ -134,6 +134,11 @@ class Subscription:
             self._queue.undeclare()
         except zenoh.ZError:
             pass  # with its session closed it is no more already
+
+
+def on(key: str, sample: zenoh.Sample) -> bool:
+    """It came on exactly this key: what a stranger put on a wildcard did not."""
+    return str(sample.key_expr) == key
 
 
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:

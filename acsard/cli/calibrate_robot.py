@@ -18,8 +18,8 @@ from acsard.calibration.guided.steps import GuideError, Leg
 from acsard.calibration.runs import Run
 from acsard.cli.attendant import Attendant
 from acsard.client import Client
+from acsard.client.driving import SEND_PERIOD_S
 from acsard.config.settings import Config
-from acsard.driving import SEND_PERIOD_S
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
 from acsard.messages.topics import by_key

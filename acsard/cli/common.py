@@ -98,12 +98,16 @@ def writable(path: str | None) -> Path:
     return Path(where)
 
 
+def by_environment() -> Overrides:
+    """What the environment says of it: where systemd puts the credentials of a service, say."""
+    return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
+
+
 def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
     """Where the configuration is and the configuration; raises `ExitError` with every problem."""
     where, text = find(path)
     given = dict(overrides or {})
-    if "ACSARD_TLS" in os.environ:  # where systemd puts the credentials of a service, say
-        given["bus"] = {"tls": os.environ["ACSARD_TLS"], **given.get("bus", {})}
+    given["bus"] = {**by_environment().get("bus", {}), **given.get("bus", {})}
     try:
         return where, configuration.parse(text, given)
     except ConfigError as error:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_config, find
+from acsard.cli.common import add_bus, by_environment, find, require_one
 from acsard.host.colours import coloured
 
 if TYPE_CHECKING:
@@ -19,10 +20,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "doctor",
         help="find out what is wrong on this machine",
         description="Look at the configuration, the serial port and who holds it, permissions, "
-        "clock, real-time limits, certificates, and the daemon if it runs. Each finding comes "
+        "clock, real-time limits, certificates, and the daemon if it runs: where the "
+        "configuration has it, or where the options say, as it was started. Each finding comes "
         "with its mend. Exit 0 when nothing fails, 1 when something does.",
     )
-    add_config(parser)
+    add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(main=main)
 
@@ -31,9 +33,12 @@ def main(args: argparse.Namespace) -> int:
     """Look and tell."""
     import msgspec
 
+    from acsard.bus.address import address_of
     from acsard.doctor.examination import examine
 
-    findings = list(examine(*find(args.config)))
+    require_one(args)
+    told = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
+    findings = list(examine(*find(args.config), by_environment(), told))
     if args.json:
         print(msgspec.json.encode(findings).decode())
     else:

@@ -251,7 +251,7 @@ class _Ride:
 
     def seen(self) -> Seen:
         """What there is to show."""
-        from acsard.driving import objection
+        from acsard.client.driving import objection
         from acsard.top.teleop import Teleop as Seen
 
         now, state, robot = time.monotonic(), self._state, self._robot

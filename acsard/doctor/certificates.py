@@ -1,4 +1,4 @@
-"""The files of bus.tls: are they there, private and in date?"""
+"""The files of bus.tls or --tls: are they there, private and in date?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
@@ -15,11 +14,11 @@ from acsard.host.extras import install
 from acsard.messages.expiry import expiry
 
 
-def certificates(config: Config) -> Iterator[Finding]:
-    """Are the files of bus.tls there, private and in date?"""
-    if not config.bus.tls:
+def certificates(tls: str) -> Iterator[Finding]:
+    """Are the files of this directory there, private and in date? Nothing of none, ""."""
+    if not tls:
         return
-    directory = Path(config.bus.tls)
+    directory = Path(tls)
     for name in (CA, CERTIFICATE, KEY):
         file = directory / name
         if not os.access(file, os.R_OK):
@@ -28,11 +27,11 @@ def certificates(config: Config) -> Iterator[Finding]:
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
-        require_usable(config.bus.tls)
+        require_usable(tls)
     except MendableError as error:
         yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
         return
-    ends = ends_ns(config.bus.tls)
+    ends = ends_ns(tls)
     level, words = expiry(ends, now().wall_ns)
     mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
     if ends is None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from acsard.bus.address import address_of
+from acsard.bus.address import Address
 from acsard.bus.session import reachable
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.link import check, link
 from acsard.doctor.running import Running, answers, asked
 from acsard.drive.gyro import WORDS
+from acsard.host.errors import NoAnswerError
 from acsard.messages.diagnostics import NO_ROUTER
 from acsard.messages.schema import DiagnosticStatus
 from acsard.values import NS_PER_S, AcsardError
@@ -26,6 +27,16 @@ GYRO_MENDS = {
     "not believed": "its z must point up, in rad/s; then `acsard calibrate` finds the track",
 }
 """By what `state` says of the gyro; nothing where all is well."""
+
+START = (
+    "systemctl status acsard; or start it: acsard run; one that was started with --listen is asked "
+    "by --connect and what that says"
+)
+
+ANOTHER = (
+    "one with another id is asked by --id (`acsard fleet` shows who is there); or is another "
+    "program on that port?"
+)
 
 ROUTER = "acsard: router"
 """The row of its diagnostics."""
@@ -53,18 +64,22 @@ def routers(config: Config) -> Iterator[Finding]:
         yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
 
 
-def found(config: Config) -> Running | Finding:
-    """The daemon that runs where this configuration has it; else what is wrong with that."""
-    endpoint = address_of(config).endpoint
+def found(config: Config, address: Address) -> Running | Finding:
+    """The daemon that runs there, asked; else what is wrong with that.
+
+    Raises `UsageError` for what is no endpoint.
+    """
+    endpoint = address.endpoint
     if not answers(endpoint):
-        if config.bus.mode == "client":
+        if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
             text = f"cannot be asked: the router at {endpoint}, by which it is reached, is missing"
             mend = "the router first; see `systemctl status acsard`"
             return Finding("daemon", "warning", text, mend)
-        mend = "systemctl status acsard; or start it: acsard run"
-        return Finding("daemon", "warning", f"nobody listens at {endpoint}", mend)
+        return Finding("daemon", "warning", f"nobody listens at {endpoint}", START)
     try:
-        return asked(config)
+        return asked(config, address)
+    except NoAnswerError as error:
+        return Finding("daemon", "failure", str(error), ANOTHER)
     except AcsardError as error:
         return Finding("daemon", "failure", str(error), "is another program on that port?")
 

@@ -21,7 +21,8 @@ def link(running: Running) -> Iterator[Finding]:
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
-        mend = mend if state.link != "down" else "see the port above"
+        if state.link == "down":
+            mend = "see the port above" if running.here else "`acsard doctor` there: its port"
         if config.mcu.simulated or is_ours(state.reason):
             mend = BUSY
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link

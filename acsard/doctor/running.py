@@ -8,15 +8,17 @@ from collections.abc import Iterator
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.bus.address import address_of
-from acsard.bus.session import reachable
+from acsard.bus.address import Address
+from acsard.bus.session import no_endpoint, reachable
 from acsard.client import Client, connect
 from acsard.config.live import flat, live
 from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import Config
+from acsard.config.settings import SIMULATOR, Config
 from acsard.doctor.finding import Finding
 from acsard.host import clock
+from acsard.host.processes import name_of
 from acsard.messages.schema import DiagnosticStatus, Info, RobotState
 from acsard.values import AcsardError
 
@@ -53,17 +55,21 @@ class Running(Struct, frozen=True):
     """When that was asked for, by this machine's wall clock."""
     rows: tuple[DiagnosticStatus, ...] = ()
     """Its diagnostics."""
+    here: bool = True
+    """On this machine, as far as its processes may be seen: a tunnel or a router may stand
+    between."""
 
 
-def asked(config: Config) -> Running:
-    """The daemon where this configuration has it; raises an `AcsardError`."""
-    endpoint, robot_id, tls = address_of(config)
+def asked(config: Config, address: Address) -> Running:
+    """The daemon that is there; raises an `AcsardError`. `config` is what the file says."""
+    endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(WATCHED_S)
         rows = tuple(robot.get("diagnostics").status)
         runs, state = _configuration(robot, info, config), robot.get("state")
-        return Running(info, runs, before, state, clock.now().wall_ns, rows)
+        here = name_of(info.pid) == "acsard"
+        return Running(info, runs, before, state, clock.now().wall_ns, rows, here)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -71,8 +77,9 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or another version's
-        mcu = msgspec.structs.replace(file.mcu, port="sim" if info.simulated else info.port)
-        return msgspec.structs.replace(file, mcu=mcu)
+        mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
+        bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
+        return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
 
 
 def differences(runs: Config, file: Config) -> dict[str, str]:
@@ -102,8 +109,10 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def answers(endpoint: str) -> bool:
-    """Somebody listens there."""
+    """Somebody listens there; raises `UsageError` for what is no endpoint."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise no_endpoint(endpoint)
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
     except OSError:

@@ -77,6 +77,14 @@ def master_of(path: str) -> Holder | None:
     return None
 
 
+def name_of(pid: int) -> str:
+    """The program that runs as this process; "" where none does, or may be seen."""
+    try:
+        return _name(PROC / str(pid))
+    except OSError:
+        return ""
+
+
 def running(name: str) -> bool:
     """A process of this name runs."""
     for process in _processes():

@@ -2,7 +2,7 @@
 
 A claim, not a proof: Zenoh does not tell which connection a query came by, nor whose certificate
 that shows. The name is the `sender` of the signature (`messages/signature.py`) on the call or put;
-`client.py` sets it. ROS has none: by rmw_zenoh it is the client's GID, and a bridge tells nothing.
+`client/` sets it. ROS has none: by rmw_zenoh it is the client's GID, and a bridge tells nothing.
 """
 
 from __future__ import annotations

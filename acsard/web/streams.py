@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import zenoh
 
-from acsard.bus.subscription import encoded
+from acsard.bus.subscription import encoded, on
 from acsard.client import Client
 from acsard.host import clock
 from acsard.host.errors import UsageError
@@ -21,6 +22,8 @@ from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, detect
 from acsard.messages.topics import PUBLISHED
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
+
+Take = Callable[[zenoh.Sample], None]
 
 KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
 """What may be followed."""
@@ -32,10 +35,9 @@ UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 
 
 class Stream:
-    """One key of one robot."""
+    """One key of one robot: nothing else may be handed to it."""
 
-    def __init__(self, key: str) -> None:
-        self._key = key
+    def __init__(self) -> None:
         self._taking = threading.Lock()
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
         self._text: tuple[int, bytes] = (0, b"null")
@@ -49,17 +51,15 @@ class Stream:
         return self._newest[0]
 
     def take(self, sample: zenoh.Sample) -> None:
-        """One has come; what a stranger put on a wildcard is none."""
-        if str(sample.key_expr) == self._key:
-            with self._taking:
-                self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
+        """One has come."""
+        with self._taking:
+            self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
         """What was asked for: only what was published since then is newer."""
-        if str(sample.key_expr) == self._key:
-            with self._taking:
-                if not self._newest[0]:
-                    self._newest = (1, sample, clock.mono_ns())
+        with self._taking:
+            if not self._newest[0]:
+                self._newest = (1, sample, clock.mono_ns())
 
     def value(self) -> tuple[int, bytes, float]:
         """Number, JSON and age in ms of the newest."""
@@ -87,7 +87,7 @@ class Streams:
         name = robot, key
         stream = self._streams.get(name)
         if stream is None:
-            stream = self._streams[name] = Stream(client.like(robot).key(key))
+            stream = self._streams[name] = Stream()
         stream.users += 1
         try:
             async with stream.lock:
@@ -117,10 +117,13 @@ class Streams:
         def late(subscriber: Any) -> None:
             subscriber.undeclare()
 
+        def own(take: Take) -> Take:
+            return lambda sample: take(sample) if on(client.key(key), sample) else None
+
         def declare() -> Any:
-            heard = client.listen(key, stream.take)
+            heard = client.listen(key, own(stream.take))
             try:
-                client.ask(key, stream.answered)  # what is published seldom is there at once
+                client.ask(key, own(stream.answered))  # what is published seldom is there at once
             except zenoh.ZError:
                 heard.undeclare()
                 raise

@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from acsard import client as client_module
 from acsard.bus.subscription import Subscription
-from acsard.client import AsyncClient, Client, connect, connect_async
+from acsard.client import AsyncClient, Client, connect, connect_async, synchronous
 from acsard.host.errors import (
     NoAnswerError,
     NotDrivenError,
@@ -272,7 +271,7 @@ def test_what_is_no_id_is_a_value_error(robot_id: str) -> None:
 def test_a_question_that_nobody_answers_in_time_is_a_timeout(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(client_module, "REPLY_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(synchronous, "REPLY_TIMEOUT_S", 0.3)
     endpoint = free_endpoint()
     unanswered: list[zenoh.Query] = []
     settings = zenoh.Config()

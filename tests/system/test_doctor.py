@@ -15,17 +15,30 @@ from typing import Any
 import pytest
 
 from acsard.lan.authority import Authority
-from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, free_endpoint, until
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    FarPeer,
+    Program,
+    acsard,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+)
 
 pytestmark = pytest.mark.network
 
 
-def examined(where: Path, text: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
+def examined(
+    where: Path, text: str, *options: str, **variables: str
+) -> tuple[int, dict[str, list[dict[str, str]]]]:
     """Exit code and findings by subject for a configuration."""
     file = where / "doctor.toml"
     file.write_text(text)
-    words = [sys.executable, "-m", "acsard", "doctor", "--json", "--config", str(file)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    words = [*acsard("doctor", "--json", "--config", str(file)), *options]
+    env = environment(**variables)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, env=env)
     assert done.stderr == ""
     found: dict[str, list[dict[str, str]]] = {}
     for finding in json.loads(done.stdout):
@@ -120,6 +133,54 @@ def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_told(tmp_p
         assert worst(found["link"])["level"] == "ok"
 
 
+def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path: Path) -> None:
+    where = free_endpoint()
+    with Daemon(tmp_path, words=("--listen", where, "--id", "other")) as daemon:
+        file = daemon.config.read_text()
+        _, blind = examined(tmp_path, file)
+        _, nameless = examined(tmp_path, file, "--connect", where)
+        _, found = examined(tmp_path, file, "--connect", where, "--id", "other")
+    assert blind["daemon"][-1]["text"] == f"nobody listens at {daemon.endpoint}"
+    assert "--connect" in blind["daemon"][-1]["mend"]
+    assert nameless["daemon"][-1]["level"] == "failure"
+    assert "--id" in nameless["daemon"][-1]["mend"]
+    told = worst(found["configuration"])["text"]
+    assert 'robot.id = "other", not "acsar"' in told
+    assert f"pid {daemon.pid}" in told
+    assert {"link", "daemon"} <= set(found)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="makes a process namespace")
+def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_told(tmp_path: Path) -> None:
+    apart = ("unshare", "--pid", "--fork", "--kill-child")
+    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path, before=apart) as daemon:
+        peer.awaits(b"ap00.00")
+        text = f'[mcu]\nport = "/dev/acsar_that_is_not"\n[bus]\nlisten = ["{daemon.endpoint}"]\n'
+        _, found = examined(tmp_path, text)
+    assert "runs on another machine" in found["daemon"][0]["text"]
+    assert "port" not in found
+    assert [one["level"] for one in found["configuration"]] == ["ok"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--connect", "robot"), "robot is not an endpoint"),
+        (("--connect", "tcp/127.0.0.1"), "tcp/127.0.0.1 is not an endpoint"),
+        (("--connect", "tcp/127.0.0.1:99999"), "tcp/127.0.0.1:99999 is not an endpoint"),
+        (("--id", "a/b"), "'a/b' is not a robot's id"),
+        (("--id", "*"), "names many robots"),
+    ],
+)
+def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
+    tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    done = finish(acsard("doctor", *options), tmp_path)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("acsard: ")
+    assert words in done.err
+
+
 @pytest.mark.parametrize(
     ("fault", "subject", "words"),
     [
@@ -181,6 +242,17 @@ def test_certificates_are_told_by_how_long_they_last(
     assert worst(found["certificates"])["level"] == level
     assert words in worst(found["certificates"])["text"]
     assert code == (1 if level == "failure" else 0)
+
+
+def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path: Path) -> None:
+    text = with_certificates(tmp_path, 400)
+    (tmp_path / "other").mkdir()
+    Authority.make(tmp_path / "other", "test", 10).issue(tmp_path / "other", "me", [], 10)
+    other = str(tmp_path / "other")
+    option = examined(tmp_path, text, "--connect", "tls/127.0.0.1:1", "--tls", other)[1]
+    assert sorted(one["level"] for one in option["certificates"]) == ["ok", "warning"]
+    variable = examined(tmp_path, text.partition("tls =")[0], ACSARD_TLS=other)[1]
+    assert [one["level"] for one in variable["certificates"]] == ["warning"]
 
 
 def test_a_key_that_others_may_read_is_a_failure(tmp_path: Path) -> None:

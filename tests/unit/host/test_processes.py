@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.host.processes import holder_of, holders, master_of, running
+from acsard.host.processes import holder_of, holders, master_of, name_of, running
 
 HOLD = """\
 import fcntl, os, sys
@@ -91,3 +91,10 @@ def test_a_program_is_found_by_its_name(device: str) -> None:
         (found,) = [one for one in holders(device) if one.pid == pid]
         assert running(found.name)
     assert not running("no such program")
+
+
+def test_a_process_that_is_not_there_has_no_name() -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert name_of(os.getpid()) != ""
+    assert name_of(ended.pid) == ""

@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 
 import pytest
 import zenoh
 
-from acsard.web.streams import Stream
+from acsard.client import Client
+from acsard.web.streams import Stream, Streams
 
 KEY = "acsard/acsar/events"
 
 
 @pytest.fixture(scope="module")
-def samples() -> Iterator[list[zenoh.Sample]]:
-    """Two of the key, in a session that reaches nobody."""
+def session() -> Iterator[zenoh.Session]:
+    """One that reaches nobody."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     with zenoh.open(config) as session:
-        heard = session.declare_subscriber(KEY)
-        for said in (b"1", b"2"):
-            session.put(KEY, said, encoding="application/json")
-        yield [heard.recv(), heard.recv()]
+        yield session
+
+
+@pytest.fixture(scope="module")
+def samples(session: zenoh.Session) -> list[zenoh.Sample]:
+    """Two of the key."""
+    heard = session.declare_subscriber(KEY)
+    for said in (b"1", b"2"):
+        session.put(KEY, said, encoding="application/json")
+    return [heard.recv(), heard.recv()]
 
 
 def test_an_answer_is_there_until_something_is_published(samples: list[zenoh.Sample]) -> None:
-    stream = Stream(KEY)
+    stream = Stream()
     stream.answered(samples[0])
     assert stream.value()[:2] == (1, b"1")
     stream.take(samples[1])
@@ -34,7 +42,19 @@ def test_an_answer_is_there_until_something_is_published(samples: list[zenoh.Sam
 
 
 def test_an_answer_that_was_overtaken_is_left_out(samples: list[zenoh.Sample]) -> None:
-    stream = Stream(KEY)
+    stream = Stream()
     stream.take(samples[1])
     stream.answered(samples[0])
     assert stream.value()[:2] == (1, b"2")
+
+
+def test_what_a_stranger_put_on_a_wildcard_is_not_of_the_key(session: zenoh.Session) -> None:
+    async def story() -> tuple[int, bytes]:
+        streams = Streams()
+        stream = await streams.follow(Client(session, "acsar", "app"), "acsar", "events")
+        for key, said in ((KEY, b"1"), ("acsard/**", b"666"), (KEY, b"2"), ("acsard/*/*", b"667")):
+            session.put(key, said, encoding="application/json")
+        await streams.leave("acsar", "events")
+        return stream.value()[:2]
+
+    assert asyncio.run(story()) == (2, b"2")

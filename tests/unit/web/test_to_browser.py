@@ -16,7 +16,7 @@ def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() 
     async def story() -> None:
         out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts())
         one = Following("acsar", "state", "acsar", 0.1)
-        one.stream = Stream("acsard/acsar/state")
+        one.stream = Stream()
         due = await out._send_due(one, 100.03)
         assert abs(due - 100.1) < 1e-6
         woken = [await out._send_due(one, now) for now in (100.04, 100.07, 100.099)]

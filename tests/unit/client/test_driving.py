@@ -12,8 +12,16 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard import driving
-from acsard.driving import DEAD_S, GRACE_S, OPENED_S, SETTLED_S, UnheardError, drive, objection
+from acsard.client import driving
+from acsard.client.driving import (
+    DEAD_S,
+    GRACE_S,
+    OPENED_S,
+    SETTLED_S,
+    UnheardError,
+    drive,
+    objection,
+)
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import RobotState, SourceState, Time

@@ -1,92 +1,35 @@
-"""Drive and follow a robot from Python.
-
-    from acsard.client import connect
-
-    with connect() as robot:
-        robot.drive(0.5, 0.0, seconds=2.0)
-        print(robot.pose())
-
-`connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
-messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive opens
-with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them. A
-drive that the robot does not follow is an error, and one that returns has come to a stand.
-
-Where you do not say which robot you mean, the file does that ACSARD_CONFIG names, as for the
-command line (`bus.listen`, `robot.id`, `bus.tls`); without that variable it is `acsar` on this
-machine. A file in the current directory is not looked for: a program means the same robot wherever
-it runs.
-
-Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
-
-    UnreachableError   ConnectionError  nobody listens at the endpoint
-    NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
-    ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
-                                        says so in its reply instead
-    NotDrivenError   RuntimeError     the robot does not follow your drive: stopped, in fault,
-                                        behind somebody else, not allowed; the text says which
-    NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
-    CertificateError   ValueError       certificates that are not there, or cannot be used
-    UsageError         ValueError       an endpoint, an id, a key or a number that cannot be, or the
-                                        file that ACSARD_CONFIG names
-    DecodeError                         what was sent is not one of our messages
-"""
+"""The client of scripts: each verb waits until it is done."""
 
 from __future__ import annotations
 
-import asyncio
 import os
 import platform
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import aclosing, asynccontextmanager, closing, contextmanager
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from typing import Any
 
 import msgspec
 import zenoh
 
-from acsard.bus.address import address_by_environment
 from acsard.bus.identity import Identity, identity
-from acsard.bus.session import client_session
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.driving import UnheardError, drive
+from acsard.client.driving import UnheardError, drive
 from acsard.host import clock
 from acsard.host.errors import (
-    CertificateError,
     MendableError,
     NoAnswerError,
     NotDrivenError,
     NotPermittedError,
     ReplyError,
-    UnreachableError,
     UsageError,
 )
 from acsard.host.own_name import own_name
-from acsard.host.threads import in_thread
 from acsard.messages import schema
-from acsard.messages.encodings import DecodeError, Decoder, encode, encoding_name
+from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
 from acsard.messages.topics import by_key, full_key, key_hint, service_key, unknown
-from acsard.values import AcsardError, Plain, Pose
-
-__all__ = (
-    "AcsardError",
-    "AsyncClient",
-    "CertificateError",
-    "Client",
-    "DecodeError",
-    "Identity",
-    "NoAnswerError",
-    "NotDrivenError",
-    "NotPermittedError",
-    "Pose",
-    "ReplyError",
-    "Subscription",
-    "UnreachableError",
-    "UsageError",
-    "connect",
-    "connect_async",
-)
+from acsard.values import Plain, Pose
 
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
@@ -142,7 +85,7 @@ class Client:
                 for pause in steps:
                     time.sleep(pause)
         except (UnheardError, NoAnswerError) as error:
-            raise self._unheard(error) from None
+            raise self.unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
@@ -159,7 +102,7 @@ class Client:
 
     def get(self, name: str) -> Any:
         """The last value of a published key as its typed message, or of `info`, `config`, …"""
-        return _decoder(name).decode(*self.reply(name))
+        return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
         """The same as it came: encoding and payload."""
@@ -179,9 +122,9 @@ class Client:
 
         Ends after `timeout` s of silence, and when the connection is closed.
         """
-        decoder = _decoder(name)
+        reader = decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
-            yield decoder.decode(*encoded(sample))
+            yield reader.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
         """The raw samples of any key below the robot's id, whatever key they were put on."""
@@ -275,7 +218,7 @@ class Client:
         if why := us.lacks(name.partition("?")[0]):
             raise NotPermittedError(why)
 
-    def _unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
+    def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """The same with what our certificate has to do with it."""
         if not self._tls:
             return error
@@ -289,110 +232,16 @@ class Client:
         return NotDrivenError(f"{error}; {us.words()}")
 
 
-class AsyncClient:
-    """The same verbs for asyncio programs; make it with `connect_async`."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    def send(self, linear: float, angular: float = 0.0) -> None:
-        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
-        self._client.send(linear, angular)
-
-    async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive`; cancelling sends a zero at once."""
-        try:
-            with closing(drive(self._client, linear, angular, seconds)) as steps:
-                for pause in steps:
-                    await asyncio.sleep(pause)
-        except (UnheardError, NoAnswerError) as error:
-            found = await in_thread(partial(self._client._unheard, error), 2 * REPLY_TIMEOUT_S)
-            raise found from None
-
-    async def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call a service, as `Client.call`."""
-        return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
-
-    async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings, as `Client.set`."""
-        return await in_thread(lambda: self._client.set(settings), 2 * REPLY_TIMEOUT_S)
-
-    async def get(self, name: str) -> Any:
-        """The last value of a key, as `Client.get`."""
-        return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
-
-    async def whoami(self) -> Identity:
-        """Who we are to the daemon, as `Client.whoami`."""
-        return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
-
-    async def pose(self) -> Pose:
-        """Where base_link is in odom now."""
-        return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
-
-    async def messages(self, name: str) -> AsyncIterator[Any]:
-        """The typed messages of a published key as they come, until the loop over them ends."""
-        decoder = _decoder(name)
-        async with aclosing(self._client.subscribe(name).arriving()) as samples:
-            async for sample in samples:
-                yield decoder.decode(*encoded(sample))
-
-
-@contextmanager
-def connect(
-    endpoint: str | None = None,
-    *,
-    robot_id: str | None = None,
-    source: str = "app",
-    tls: str | None = None,
-) -> Iterator[Client]:
-    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
-
-    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". What
-    is None is taken from the file that the environment variable ACSARD_CONFIG names, and without
-    one is "tcp/127.0.0.1:7448", "acsar" and no certificate.
-    """
-    where = address_by_environment(endpoint, robot_id, tls)
-    session = client_session(where.endpoint, where.tls)
-    try:
-        yield Client(session, where.robot_id, source, where.tls)
-    finally:
-        _close(session)
-
-
-@asynccontextmanager
-async def connect_async(
-    endpoint: str | None = None,
-    *,
-    robot_id: str | None = None,
-    source: str = "app",
-    tls: str | None = None,
-) -> AsyncIterator[AsyncClient]:
-    """`connect` for asyncio programs; opening and closing do not hold the event loop."""
-    where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
-    session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=_close)
-    try:
-        yield AsyncClient(Client(session, where.robot_id, source, where.tls))
-    finally:
-        await in_thread(lambda: _close(session), 5.0)
-
-
 def _name(session: zenoh.Session) -> str:
     """Ours alone, and for people to read: the machine, the process and the session."""
     return f"{platform.node()[:32]}/{os.getpid()}/{str(session.zid())[:8]}"
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()
-    except zenoh.ZError:
-        pass  # the other side is stuck; we are leaving anyway
 
 
 def _no_key(name: str) -> UsageError:
     return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
 
-def _decoder(name: str) -> Decoder[Any]:
+def decoder(name: str) -> Decoder[Any]:
     """The decoder of a key's type; plain dictionaries where it has none (config, schema/…)."""
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)

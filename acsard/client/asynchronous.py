@@ -1,0 +1,66 @@
+"""The client of asyncio programs: the same verbs, waiting on threads of their own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from contextlib import aclosing, closing
+from functools import partial
+from typing import Any
+
+from acsard.bus.identity import Identity
+from acsard.bus.subscription import encoded
+from acsard.client.driving import UnheardError, drive
+from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, decoder
+from acsard.host.errors import NoAnswerError
+from acsard.host.threads import in_thread
+from acsard.messages import schema
+from acsard.values import Plain, Pose
+
+
+class AsyncClient:
+    """The same verbs for asyncio programs; make it with `connect_async`."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
+        self._client.send(linear, angular)
+
+    async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
+        """Drive as `Client.drive`; cancelling sends a zero at once."""
+        try:
+            with closing(drive(self._client, linear, angular, seconds)) as steps:
+                for pause in steps:
+                    await asyncio.sleep(pause)
+        except (UnheardError, NoAnswerError) as error:
+            found = await in_thread(partial(self._client.unheard, error), 2 * REPLY_TIMEOUT_S)
+            raise found from None
+
+    async def call(self, service: str, **fields: float) -> schema.ServiceReply:
+        """Call a service, as `Client.call`."""
+        return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
+
+    async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
+        """Change settings, as `Client.set`."""
+        return await in_thread(lambda: self._client.set(settings), 2 * REPLY_TIMEOUT_S)
+
+    async def get(self, name: str) -> Any:
+        """The last value of a key, as `Client.get`."""
+        return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
+
+    async def whoami(self) -> Identity:
+        """Who we are to the daemon, as `Client.whoami`."""
+        return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
+
+    async def pose(self) -> Pose:
+        """Where base_link is in odom now."""
+        return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
+
+    async def messages(self, name: str) -> AsyncIterator[Any]:
+        """The typed messages of a published key as they come, until the loop over them ends."""
+        reader = decoder(name)
+        async with aclosing(self._client.subscribe(name).arriving()) as samples:
+            async for sample in samples:
+                yield reader.decode(*encoded(sample))

@@ -1,0 +1,67 @@
+"""What stands in the way of a connection, and under which names a program finds all of it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard import client
+
+NOBODY_LISTENS = "tls/127.0.0.1:1"
+
+
+@pytest.fixture
+def shared() -> Iterator[Path]:
+    """A directory that all may enter, also where `tmp_path` is in one that only root may."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+AS_NOBODY = """\
+import os, sys
+from acsard.client import connect
+if os.geteuid() == 0:
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+try:
+    with connect(sys.argv[1], tls=sys.argv[2]):
+        pass
+except PermissionError as error:
+    print(error)
+"""
+
+
+def test_certificates_that_one_may_not_read_are_a_permission_error(shared: Path) -> None:
+    for name in ("ca.pem", "certificate.pem", "key.pem"):
+        (shared / name).write_text("of somebody else")
+        (shared / name).chmod(0o600 if os.geteuid() == 0 else 0)
+    words = [sys.executable, "-c", AS_NOBODY, NOBODY_LISTENS, str(shared)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30.0, check=True)
+    assert str(shared / "ca.pem") in done.stdout
+
+
+def test_a_directory_without_certificates_is_said_and_not_taken_for_a_missing_daemon(
+    tmp_path: Path,
+) -> None:
+    with (
+        pytest.raises(client.CertificateError, match="acsard lan") as error,
+        client.connect(NOBODY_LISTENS, tls=str(tmp_path / "laptop-anna")),
+    ):
+        pass
+    assert isinstance(error.value, ValueError)
+
+
+def test_every_error_that_the_client_tells_of_can_be_had_from_it() -> None:
+    assert client.__doc__ is not None
+    told = {line.split()[0] for line in client.__doc__.splitlines() if line.startswith("    ")}
+    errors = {name for name in told if name.endswith("Error")}
+    assert errors == {n for n in client.__all__ if n.endswith("Error")} - {"AcsardError"}
+    assert all(issubclass(getattr(client, name), client.AcsardError) for name in errors)
