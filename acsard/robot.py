@@ -324,7 +324,7 @@ class Robot:
         self._limiter.use(self.config.limits)
         self._odometry.use(self.config.odometry)
         if self.config.commands != before.commands:
-            self._arbiter = Arbiter(self.config.commands)
+            self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
         return news or "nothing new: all of it is so already"
 

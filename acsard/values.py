@@ -116,7 +116,7 @@ class Command(Struct, frozen=True):
     sequence: int | None = None
     """Its number among those of its sender: none is missing unless it was sent and lost."""
     shared: bool = False
-    """Several programs may look like this sender: it came by a bridge."""
+    """Several programs may look like this sender: it came by a bridge, or has only its key."""
     ros: bool = False
     """It came from ROS, whose tools send no zero by themselves."""
     stamp_replaced: bool = False

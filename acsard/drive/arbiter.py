@@ -47,12 +47,18 @@ class _Source:
 
     def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
         self.name, self.priority = settings.name, settings.priority
+        self.first: State = "unheard" if neutral_first else "free"
+        self.senders: dict[str, Sender] = {}
+        self.use(settings, pause)
+
+    def use(self, settings: Source, pause: float) -> None:
+        """Go by this timeout and pause from now on, its senders too."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.neutral = Wait("neutral", settings.name, pause)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
-        self.first: State = "unheard" if neutral_first else "free"
-        self.senders: dict[str, Sender] = {}
+        for sender in self.senders.values():
+            sender.use(self.timeout_ns, self.pause_ns)
 
     def sender(self, name: str, now_ns: int) -> Sender | None:
         """The sender of this name, for whom one of less account makes room; None for no room."""
@@ -115,6 +121,14 @@ class Arbiter:
         self._holder: _Source | None = None
         self._since_ns = 0
         self._freshness = Freshness()
+
+    def use(self, commands: CommandsConfig) -> None:
+        """Go by these timeouts and this pause; who was heard and when, and his clock, stays known.
+
+        The sources are those that it was made with.
+        """
+        for settings in commands.sources:
+            self._sources[settings.name].use(settings, commands.pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands; each sender must be neutral once before it drives again.

@@ -39,7 +39,7 @@ class Sender:
     """One sender of a source: two programs, or two people, on one key are two."""
 
     def __init__(self, timeout_ns: int, pause_ns: int, state: State) -> None:
-        self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
+        self.use(timeout_ns, pause_ns)
         self.state = self._sure = state
         """Also by what does not count yet; and only by what does."""
         self.name = ""
@@ -63,6 +63,10 @@ class Sender:
         self._stamp_ns: int | None = None
         """When it says that it sent the last command that could be believed."""
         self._sequence: int | None = None
+
+    def use(self, timeout_ns: int, pause_ns: int) -> None:
+        """Go by these from now on."""
+        self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:
         """Its last command is no older than the timeout of its source."""

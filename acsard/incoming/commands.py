@@ -124,7 +124,7 @@ class Receiver:
             said.sender,
             cancelled,
             said.sequence,
-            shared=arrival.via == "bridge" and not said.signed,
+            shared=said.shared,
             ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
         )
@@ -195,26 +195,27 @@ class Voice(Struct, frozen=True):
     sender: str
     stamp_ns: int | None = None
     sequence: int | None = None
-    signed: bool = False
-    """By an attachment of its own."""
+    shared: bool = False
+    """Several programs may look like it."""
 
 
 def voice(arrival: Arrival) -> Voice:
     """By our attachment, else rmw's, else Zenoh's timestamp, else just the key.
 
-    A bridge says nothing of the ROS node behind it: all those of a source are one. Raises
-    `DecodeError`.
+    All that have nothing but a key are one, and so are all ROS nodes behind a bridge, which says
+    nothing of them. Raises `DecodeError`.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
-        return Voice(rmw.gid.hex(), rmw.stamp_ns, rmw.sequence, signed=True)
+        return Voice(rmw.gid.hex(), rmw.stamp_ns, rmw.sequence)
     told = signature.unpack(arrival.attachment)
     if told is not None:
         stamp_ns = arrival.stamp_ns if told.stamp is None else told.stamp
-        return Voice(told.sender, stamp_ns, told.sequence, signed=True)
+        return Voice(told.sender, stamp_ns, told.sequence)
     if arrival.sender:
-        return Voice(arrival.sender, arrival.stamp_ns)
-    return Voice(f"{arrival.via}/{arrival.key.partition('/')[2]}", arrival.stamp_ns)
+        return Voice(arrival.sender, arrival.stamp_ns, shared=arrival.via == "bridge")
+    key = arrival.key.partition("/")[2]
+    return Voice(f"{arrival.via}/{key}", arrival.stamp_ns, shared=True)
 
 
 def sender(arrival: Arrival) -> str:

@@ -112,7 +112,7 @@ def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
         "ready -> driving: commanded by app",
         "driving -> ready: waiting for a command: no source has sent one within its timeout",
     ]
-    assert [event.text for event in told(world, "commander")] == ["nobody -> app (native/app)"]
+    assert [event.text for event in told(world, "commander")] == ["nobody -> app (somebody)"]
 
 
 def test_a_higher_priority_is_another_commander_and_so_is_going_back(world: World) -> None:

@@ -14,6 +14,7 @@ from acsard.messages.cdr import Cdr
 from acsard.messages.schema import Odometry, ServiceReply
 from acsard.ros import parameters as rcl
 from acsard.values import NS_PER_S, Outputs, Plain
+from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 
 
@@ -164,6 +165,47 @@ def test_a_longer_timeout_holds_and_a_new_one_wants_neutral_first(world: World) 
     assert world.state.mode == "driving"
     world.run(0.3)
     assert world.state.mode == "ready"
+
+
+def test_who_is_in_the_midst_of_sending_is_not_forgotten_by_a_new_timeout(world: World) -> None:
+    stuck = Speaker(world, "plain")
+    stuck.open()
+    for verb in ("stop", "clear"):
+        stuck.hold(0.5, 1.0)
+        assert world.call(verb).success
+    stuck.hold(0.5, 0.5)
+    assert sets(world, commands__sources__app__timeout=0.5).success
+    since_ns = world.now_ns
+    Speaker(world, "plain").send(0.0)
+    stuck.hold(0.5, 1.0)
+    assert not moved(world, since_ns)
+    assert "neutral first" in world.state.reason
+
+
+def test_a_clock_that_is_known_stays_so_when_the_pause_is_another(world: World) -> None:
+    speaker = Speaker(world, "signed")
+    speaker.open()
+    world.run(1.5)
+    proved = world.state.counters["commands_first_contact"]
+    assert sets(world, commands__pause=2.0).success
+    speaker.hold(0.0, 0.1)
+    speaker.hold(0.4, 0.2)
+    assert world.state.mode == "driving"
+    assert world.state.counters["commands_first_contact"] == proved > 0
+    late = speaker.message(0.4)
+    world.run(0.4)
+    speaker.deliver(late)
+    world.run(0.1)
+    assert world.state.counters["command_stale"] == 1
+    # The pause is another for who was heard before, too.
+    for verb in ("stop", "clear"):
+        speaker.hold(0.4, 1.0)
+        assert world.call(verb).success
+    for pause, mode in ((1.5, "ready"), (2.5, "driving")):
+        speaker.hold(0.4, 1.0)
+        world.run(pause)
+        speaker.hold(0.4, 0.3)
+        assert world.state.mode == mode, world.state.reason
 
 
 def test_rates_and_covariances_hold_from_the_next_message_on(world: World) -> None:

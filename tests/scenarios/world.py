@@ -35,6 +35,9 @@ START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 LET_GO_NS = 4 * NS_PER_S // 10
 """A zero counts so long after a speed, for commanders of 5 Hz and more."""
 
+SIGNED = Signature("somebody").pack()
+"""Who sends what `World.send` does."""
+
 
 class VirtualPort:
     """A serial port to the fake MCU that can be unplugged, blocked, late and stingy."""
@@ -250,15 +253,23 @@ class World:
     def send(
         self, linear: float, angular: float = 0.0, source: str = "app", stamp_ns: int | None = None
     ) -> None:
-        """One Twist as JSON, as any client would put it."""
+        """One Twist as JSON, of one who says who he is: `speakers.py` has the others."""
         if linear or angular:
             self._moved_ns[source] = self.now_ns
         payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
-        self.put(f"cmd/{source}", payload, stamp_ns=stamp_ns)
+        self.put(f"cmd/{source}", payload, stamp_ns=stamp_ns, attachment=SIGNED)
 
-    def put(self, key: str, payload: bytes, put: bool = True, stamp_ns: int | None = None) -> None:
+    def put(
+        self,
+        key: str,
+        payload: bytes,
+        put: bool = True,
+        stamp_ns: int | None = None,
+        attachment: bytes = b"",
+    ) -> None:
+        peer = "peer" if stamp_ns else ""
         self.bus.arrivals.append(
-            Arrival(key, put, payload, "", self.now_ns, stamp_ns, "peer" if stamp_ns else "")
+            Arrival(key, put, payload, "", self.now_ns, stamp_ns, peer, attachment=attachment)
         )
         if self._listens or key == "stop":
             self._step()

@@ -718,6 +718,10 @@ class Bus:
 
         return until(look, within, "at rest")
 
+    @staticmethod
+    def _waits_for(state: Any, source: str) -> str:
+        return next((s["waits_for"] for s in state["sources"] if s["name"] == source), "")
+
     @contextmanager
     def commanding(
         self, linear: float, angular: float = 0.0, *, source: str = "app", neutral: bool = True
@@ -731,10 +735,17 @@ class Bus:
                 nonlocal said
                 # Whoever is stamped on the way, as by a router, shows its delays first; and what
                 # comes within a millisecond of another is left out.
-                if self.count("commands_first_contact") or time.monotonic() > said + 0.5:
+                state = self.state()
+                counters, waits = state["counters"], self._waits_for(state, source)
+                neutral = waits.startswith("neutral first")
+                if (
+                    neutral
+                    or counters.get("commands_first_contact")
+                    or time.monotonic() > said + 0.5
+                ):
                     self.put(commander.key, ZERO)
                     said = time.monotonic()
-                return self.count("commands") > before
+                return not neutral and counters.get("commands", 0) > before
 
             until(heard, 5.0, "the zero was heard")
         commander.thread.start()

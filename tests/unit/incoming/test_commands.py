@@ -84,7 +84,7 @@ def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_twist_is_a_command_of_the_source_in_its_key(form: Format) -> None:
     assert command(twist(), form) == Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/app", "native/app"
+        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/app", "native/app", shared=True
     )
 
 
@@ -95,7 +95,7 @@ def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
         "twist": twist(),
     }
     assert command(body, form) == Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app"
+        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app", shared=True
     )
 
 
@@ -322,7 +322,8 @@ def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -
     payload = native_twist(header)
     assert len(payload) == 52
     got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/app", "native/app")
+    plain = Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/app", "native/app", shared=True)
+    assert got == plain
 
 
 @pytest.mark.parametrize("header", ORDERS)
@@ -333,7 +334,7 @@ def test_a_native_stamped_twist_is_a_command_with_its_stamp(
     payload = native_stamped(header, frame)
     assert len(payload) == size
     got = RECEIVER.command(arrival(payload, stamp_ns=5))
-    assert got == Command("app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app")
+    assert (got.twist, got.stamp_ns, got.clock) == (Twist(0.5, 0.2), 3_000_000_004, HEADER_S)
 
 
 @pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
@@ -820,11 +821,14 @@ def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
         assert command(twist(), attachment=attachment).sender == "native/app"
 
 
-def test_by_a_bridge_many_may_look_like_one_unless_they_are_signed() -> None:
+def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
     assert RECEIVER.command(by_ros("bridge", twist())).shared
     assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
     assert not RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
-    assert not command(twist()).shared
+    assert command(twist()).shared
+    assert command(stamped(12)).shared
+    assert not command(twist(), sender="z2", stamp_ns=5).shared
+    assert not command(twist(), attachment=signed()).shared
 
 
 @pytest.mark.parametrize(
