@@ -24,7 +24,7 @@ RESTART_S = 1.0
 FEW_RESTARTS = 100
 """More blocks than that are rows in no order at all."""
 
-SLOWEST_S = 2.0
+SLOWEST_S = 0.7
 """Between two wheel samples: more is no log of a drive, or not in seconds."""
 
 LEAST_ROWS = 20

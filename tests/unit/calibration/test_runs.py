@@ -58,9 +58,10 @@ def test_rows_without_a_time_are_told() -> None:
     assert any("have no time" in n for n in of([*rows(0), ",1,1,1,", ",1,1,1,"])[2])
 
 
-def test_milliseconds_are_told_from_seconds() -> None:
+@pytest.mark.parametrize("rate", [20, 100, 500, 1000])
+def test_milliseconds_are_told_from_seconds(rate: int) -> None:
     with pytest.raises(LogError, match="t is in seconds"):
-        of(rows(0, step=10.0))
+        of(rows(0, step=1000.0 / rate))
 
 
 @pytest.mark.parametrize("per_second", [1e6, 1e9])
