@@ -25,10 +25,11 @@ MOST_STD = 1.0
 
 
 class Refusal(Struct, frozen=True):
-    """What `--json` prints when the log gives nothing: why."""
+    """What `--json` prints when the log gives nothing: why, and what was told of it until then."""
 
     log: str
     refused: str
+    notes: Sequence[str] = ()
 
 
 class Report(Struct, frozen=True):

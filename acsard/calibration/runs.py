@@ -24,7 +24,7 @@ RESTART_S = 1.0
 FEW_RESTARTS = 100
 """More blocks than that are rows in no order at all."""
 
-SLOWEST_S = 2.0
+SLOWEST_S = 0.7
 """Between two wheel samples: more is no log of a drive, or not in seconds."""
 
 LEAST_ROWS = 20
@@ -36,6 +36,10 @@ PAUSE_S = 60.0
 ENOUGH_S, REPEATED = 0.2, 4.0
 """Between wheel samples of different times, and samples to each of these: with more of both, times
 were rounded away."""
+
+ROLLING, AGAIN = 0.2, 0.5
+"""rad/s of both sides together at which no position stays the same, and the share of such rows with
+the one before in them that only a logger makes which fills in what has not come."""
 
 MOST_RUNS = 1000
 """In a log: more are no drives."""
@@ -213,6 +217,10 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
         if len(rows):
             notes.append(f"run {name} has {len(wheels[0])} rows of wheel speeds and is left out")
         return None
+    yaw, place = (
+        _new(yaw, wheels, f"run {name}: yaw", notes),
+        _new(place, wheels, f"run {name}: x y", notes),
+    )
     start = float(wheels[0][0])
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
     points = (x - x[:1]) + 1j * (y - y[:1])
@@ -220,6 +228,25 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
         name, start, wheels[0] - start, wheels[1], wheels[2], gyro[0] - start, gyro[1],
         yaw[0] - start, yaw[1], place[0] - start, points,
     )  # fmt: skip
+
+
+def _new(
+    stream: tuple[Floats, ...], wheels: tuple[Floats, ...], what: str, notes: list[str]
+) -> tuple[Floats, ...]:
+    """Without what a logger that fills every row says again between two samples."""
+    t, *values = stream
+    if len(t) < LEAST_ROWS:
+        return stream
+    again = np.concatenate([[False], np.all(np.diff(values) == 0.0, axis=0)])
+    rolls = np.interp(t, wheels[0], np.abs(wheels[1]) + np.abs(wheels[2])) > ROLLING
+    again &= rolls
+    if again.sum() <= AGAIN * rolls.sum():
+        return stream
+    notes.append(
+        f"{what} stay between samples: of {int(again.sum())} rows that say them again "
+        "while the wheels turn none is taken"
+    )
+    return tuple(column[~again] for column in stream)
 
 
 def _stream(

@@ -29,9 +29,10 @@ from acsard.calibration.multipliers import (
 from acsard.calibration.paths import Wheels, wheels
 from acsard.calibration.prepared import Prepared, prepared
 from acsard.calibration.runs import Log, Run
-from acsard.calibration.table import Floats
+from acsard.calibration.table import Floats, noted
 from acsard.calibration.tape import Follow, Tape, Way, scaled
 from acsard.config.settings import DriveConfig
+from acsard.values import AcsardError
 
 LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
 """Of blocks: with a sensor of heading, and without. Where positions are coarse, longer blocks tell
@@ -80,7 +81,16 @@ class Calibration(Struct, frozen=True):
 
 
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
-    """Of the robot that left this log; raises `LogError` or `RefusedError`."""
+    """Of the robot that left this log; raises `LogError` or `RefusedError`, with the log's notes
+    as theirs."""
+    try:
+        return _calibrated(log, drive, tape)
+    except AcsardError as error:
+        noted(error, log.notes)
+        raise
+
+
+def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
     base = Base(
         drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
         drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,

@@ -7,14 +7,18 @@ a few of them is refused, since what is left would not be what was recorded.
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.calibration.spikes import bounded
+from acsard.calibration.units import SI, factor, parted
 from acsard.config.nearest import nearest
 from acsard.values import AcsardError
 
@@ -26,16 +30,13 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
 COLUMNS = (*NUMBERS, "run")
 
-BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
-PLACE_BOUND = 1e9
-"""Greater ones are no measurement (rad/s, s, rad, m); degrees and ns must come through to be
-told."""
+MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-"))
 
-RATES = frozenset((*FOUR, *TWO, "yaw_rate"))
-SPIKE, FEW_SPIKES, SLOW = 10.0, 0.02, 0.02
-"""Times what all but this share of the rates over so many rad/s stay below: a misread number."""
+COMMENTS = ("#", "%")
+"""What a line above the numbers begins with that is none of the table."""
 
-MISSING = frozenset(("", "nan", "null", "none", "na", "n/a", "-"))
+BEHIND = re.compile(r"(?:^|\s)#")
+"""A comment behind a number; "1.#QNAN" has none."""
 
 FEW, SHARE = 3, 0.01
 """Rows that may be unreadable: as many as this, or this share of all."""
@@ -48,6 +49,12 @@ AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 class LogError(AcsardError):
     """The file cannot be used; the text says where, what was wrong and what to do."""
+
+
+def noted(error: Exception, notes: Iterable[str]) -> None:
+    """What was told of the log until then goes with a refusal: it may be why."""
+    for note in notes:
+        error.add_note(note)
 
 
 class Table(Struct, frozen=True):
@@ -65,13 +72,13 @@ def read(data: bytes) -> Table:
     """The table in a file; raises `LogError`."""
     lines = _text(data).splitlines()
     number, header, separator = _header(lines)
-    names = _columns(header, number)
+    names = _columns([name for name, _ in header], number)
     if separator != ",":
         lines = [line.replace(",", ".") for line in lines]
-    reader = _Reader(names, separator)
+    reader = _Reader(names, separator, [factor(name, unit) or 1.0 for name, unit in header])
     for at in range(number, len(lines)):
         reader.take(lines[at], at + 1)
-    return reader.table(_ignored(header, names))
+    return reader.table([*_ignored(header, names), *_unknown_units(header, names)])
 
 
 def _text(data: bytes) -> str:
@@ -83,40 +90,47 @@ def _text(data: bytes) -> str:
     return data.decode("utf-8-sig", errors="replace")
 
 
-def _header(lines: Sequence[str]) -> tuple[int, list[str], str]:
-    """How many lines it ends after, its cells, and what separates them.
+def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
+    """How many lines it ends after, its names with their units, and what separates them.
 
     numpy and others write it as a comment: then the last comment before the numbers is it.
     """
     comment = ""
     for at, line in enumerate(lines):
         text = line.strip()
-        if text.startswith("#"):
-            comment = text.strip("# \t")
-        elif text:
-            numeric = all(_is_number(cell) for cell in _split(text))
-            if numeric and "t" in (names := _names(comment)):
-                return at, names, _separator(comment)
-            if numeric:
-                raise LogError(
-                    f"line {at + 1} is numbers where the names of the columns should be: "
-                    f"write a first line like {EXAMPLE}"
-                )
-            return at + 1, _names(text), _separator(text)
+        if text.startswith(COMMENTS):
+            comment = text.strip("#% \t") or comment
+        elif text and not text.lower().startswith("sep="):  # a hint for a spreadsheet
+            separator = _separator(text)
+            cells = _cut(text, separator)
+            if not all(_is_number(cell) for cell in cells):
+                return at + 1, _names(text, separator), separator
+            separator = _separator(comment)
+            names = _names(comment, separator)
+            if 1 < len(names) == len(cells) or "t" in [name for name, _ in names]:
+                return at, names, separator
+            raise LogError(
+                f"line {at + 1} is numbers where the names of the columns should be: "
+                f"write a first line like {EXAMPLE}"
+            )
     raise LogError(f"it is empty: its first line names the columns, like {EXAMPLE}")
 
 
 def _separator(text: str) -> str:
-    return next((mark for mark in (",", ";", "\t") if mark in text), ",")
+    return max(",;\t", key=text.count)
 
 
-def _split(text: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in text.split(_separator(text))]
+def _cut(line: str, separator: str) -> list[str]:
+    """Into cells, of which some may be in quotes."""
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        return line.split(separator)
+    return [cell.strip() for cell in cells]
 
 
-def _names(text: str) -> list[str]:
-    """Lower case, without a unit in brackets behind."""
-    return [cell.partition("[")[0].partition("(")[0].strip().lower() for cell in _split(text)]
+def _names(text: str, separator: str) -> list[tuple[str, str]]:
+    return [parted(cell) for cell in _cut(text, separator)]
 
 
 def _is_number(cell: str) -> bool:
@@ -135,7 +149,7 @@ def _columns(header: list[str], number: int) -> list[str]:
         raise LogError(f"{where}: column {min(twice)} is there twice; leave one out")
     wheels = FOUR if set(FOUR) <= set(header) else TWO
     wanted = ["t", *wheels]
-    if len(header) == 1 and "t" in header[0].split():
+    if len(header) == 1 and "t" in header[0].split("_"):
         raise LogError(f"{where}: the names stand without commas between: write {EXAMPLE}")
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
@@ -163,34 +177,47 @@ def _near(names: Sequence[str], header: Sequence[str]) -> str:
     return f" (is {near[0]} it? rename it)" if near else ""
 
 
-def _ignored(header: list[str], names: list[str]) -> list[str]:
-    left = [f'"{cell[:40]}"' for cell, name in zip(header, names, strict=True) if cell and not name]
+def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
+    left = [
+        f'"{cell[:40]}"' for (cell, _), name in zip(header, names, strict=True) if cell and not name
+    ]
     if not left:
         return []
     return [f"columns not used: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}"]
 
 
+def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
+    return [
+        f"column {name} says ({unit[:20]}), which is no unit known here: it was taken for "
+        f"{SI.get(name, 'rad/s')}"
+        for (_, unit), name in zip(header, names, strict=True)
+        if name and name != "run" and factor(name, unit) is None
+    ]
+
+
 class _Reader:
     """Takes line by line; a million must be quick."""
 
-    def __init__(self, names: list[str], separator: str) -> None:
-        self._names, self._separator = names, separator
+    def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
+        self._names, self._separator, self._factors = names, separator, factors
         self._run = names.index("run") if "run" in names else -1
         # What is neither a number of ours nor the run is not looked at.
         self._picks = [i for i, name in enumerate(names) if name and name != "run"]
+        self._last = max(*self._picks, self._run)
         self._values = array("d")  # a list of lists takes ten times the memory
         self._runs: list[int] = []
         self._known: dict[str, int] = {}
         self._bad, self._first = 0, ""
 
     def take(self, line: str, number: int) -> None:
-        if "#" in line:
-            line = line.partition("#")[0]
         if not line or line.isspace():
             return
-        cells = line.split(self._separator)
+        special = "#" in line or '"' in line
+        cells = self._cells(line) if special else line.split(self._separator)
         short = len(self._names) - len(cells)
         if short > 0:
+            if not cells:
+                return
             cells += [""] * short
         elif short < 0 and any(cell.strip() for cell in cells[short:]):
             self._refuse(f"line {number} has {len(cells)} cells, the header {len(self._names)}")
@@ -202,22 +229,48 @@ class _Reader:
             if not row:
                 return
         self._values.extend(row)
-        name = cells[self._run].strip().strip('"') if self._run >= 0 else ""
+        name = cells[self._run].strip() if self._run >= 0 else ""
         self._runs.append(self._known.setdefault(name, len(self._known)))
+
+    def _cells(self, line: str) -> list[str]:
+        """Of a line with quotes or a comment; none of one that is a comment.
+
+        The name of a run, and texts that are not looked at, may have any "#".
+        """
+        cells = _cut(line, self._separator)
+        if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):
+            return []
+        for i, cell in enumerate(cells):
+            if i == self._run or (i < self._last and i not in self._picks):
+                continue
+            if cell.lower() not in MISSING and (comment := BEHIND.search(cell)):
+                return [*cells[:i], cell[: comment.start()]]
+        return cells
+
+    def _begins_with_its_run(self, cells: list[str]) -> bool:
+        return (
+            self._run == 0
+            and len(cells) > self._last
+            and all(_is_number(cells[i]) for i in self._picks)
+        )
 
     def _slowly(self, cells: list[str], number: int) -> list[float]:
         row = []
         for i in self._picks:
-            cell = cells[i].strip().strip('"')
+            cell = cells[i].strip()
             if cell.lower() in MISSING:
                 row.append(math.nan)
                 continue
             try:
                 row.append(float(cell))
             except ValueError:
+                if parted(cell)[0] == self._names[i]:
+                    return []  # the header once more: logs were put one behind the other
                 shown = cell if len(cell) <= 30 else cell[:27] + "..."
                 shown = "".join(c if c.isprintable() else "?" for c in shown)
-                self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is no number')
+                date = self._names[i] == "t" and ":" in cell
+                why = "a date, and t is in s" if date else "no number"
+                self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is {why}')
                 return []
         return row
 
@@ -238,33 +291,12 @@ class _Reader:
         if self._bad:
             notes = [*notes, f"{_rows(self._bad)} left out: {self._first}"]
         values = np.frombuffer(self._values).reshape(rows, len(self._picks))
-        columns = {self._names[i]: values[:, at].copy() for at, i in enumerate(self._picks)}
+        columns = {
+            self._names[i]: values[:, at] * self._factors[i] for at, i in enumerate(self._picks)
+        }
         runs = np.array(self._runs, dtype=np.int64)
-        return Table(columns, runs, tuple(self._known), (*notes, *_bounded(columns)))
-
-
-def _bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Make what cannot be a measurement missing, in place; what was."""
-    for name, values in columns.items():
-        with np.errstate(invalid="ignore"):
-            wild = np.abs(values) > min(BOUNDS.get(name, PLACE_BOUND), _spike(name, values))
-        if wild.any():
-            example = float(values[wild][0])
-            values[wild] = math.nan
-            yield f"{_cells(int(wild.sum()))} of {name} left out as impossible, like {example:g}"
-
-
-def _spike(name: str, values: Floats) -> float:
-    """What no rate is that all others are far below; rad/s."""
-    sizes = np.abs(values[np.isfinite(values) & (np.abs(values) > SLOW)])
-    if name not in RATES or len(sizes) < 1 / FEW_SPIKES:
-        return math.inf
-    return SPIKE * float(np.quantile(sizes, 1 - FEW_SPIKES))
+        return Table(columns, runs, tuple(self._known), (*notes, *bounded(columns)))
 
 
 def _rows(count: int) -> str:
     return f"{count} row{'s' if count > 1 else ''}"
-
-
-def _cells(count: int) -> str:
-    return f"{count} cell{'s' if count > 1 else ''}"

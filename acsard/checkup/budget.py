@@ -87,6 +87,10 @@ class Budget(Struct, frozen=True):
     at_rest: tuple[float, float]
     """m/s and rad/s: what the quantum of two decimals leaves of each report's twist."""
     shares: tuple[Share, ...]
+    multiplier: float = 1.0
+    """Configured: effective track over wheel separation."""
+    learned: float | None = None
+    """The same as the gyro implies it, on the way; shown and never used. None is not known."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Of what is told so, the largest of the place, else of the heading."""
@@ -146,6 +150,8 @@ def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: floa
         lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
         counts, heard.gyro, still=True,
         at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=tuple(shares),
+        multiplier=(configured := kinematics.multipliers[2]),
+        learned=None if heard.learned is None else heard.learned * configured,
     )  # fmt: skip
 
 

@@ -71,6 +71,9 @@ def _lines(budget: Budget) -> Iterator[str]:
         yield from _wrapped(_driven(budget))
         yield ""
         yield from _table(budget)
+    if budget.learned is not None:
+        yield ""
+        yield from _wrapped(_track(budget.learned, budget.multiplier))
     yield ""
     sentence = advice(budget)
     yield from _wrapped(f"{sentence[0].upper()}{sentence[1:]}.")
@@ -97,6 +100,14 @@ def _table(budget: Budget) -> Iterator[str]:
     millimetres, degrees = budget.total()
     figures = f"{_number(millimetres, 0):>12}{_number(degrees, 2):>12}"
     yield f"{'all':<14}{figures}   the root of their squares"
+
+
+def _track(learned: float, configured: float) -> str:
+    return (
+        f"By the gyro drive.wheel_separation_multiplier would be {learned:.3f}; configured is "
+        f"{configured:.3f}. That is only shown, and nothing uses it: where both differ on the "
+        "ground that matters, `acsard calibrate` measures it, with its standard deviation."
+    )
 
 
 def _standing(budget: Budget) -> str:

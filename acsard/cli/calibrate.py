@@ -104,9 +104,11 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
         else:
             found, config = guided(_no_log(args), mine, where, lines)
     except (LogError, RefusedError, GuideError) as error:
+        notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
-            print(msgspec.json.encode(Refusal(source, str(error))).decode(), flush=True)
-        raise ExitError(Exit.FAILURE, f"{source}: {error}") from None
+            print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
+        behind = "".join(f"\nnote: {note}" for note in notes)
+        raise ExitError(Exit.FAILURE, f"{source}: {error}{behind}") from None
     if args.write:
         change(Path(where), keys(found))
     told = report(source, found, config.drive, where if args.write else "")
@@ -143,7 +145,7 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
 def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
-    from acsard.calibration.table import AS_CSV, LogError, read
+    from acsard.calibration.table import AS_CSV, LogError, noted, read
     from acsard.record.file import MAGIC
 
     if log.is_dir():
@@ -158,7 +160,13 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
         ) from None
     if data.startswith(MAGIC):
         data = _measured(log)
-    return calibrate(runs(read(data)), drive, tape)
+    table = read(data)
+    try:
+        driven = runs(table)
+    except LogError as error:
+        noted(error, table.notes)
+        raise
+    return calibrate(driven, drive, tape)
 
 
 def _measured(log: Path) -> bytes:

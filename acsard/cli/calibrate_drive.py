@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from acsard.client import Client
     from acsard.config.settings import Config
 
-DRIVE_OPTIONS = ("way", "positions", "positions_at", "yes", "json_lines")
+DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
+
+IMU = "imu"
+"""The gyro's key where none is given."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +50,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="where that key is, when the daemon does not have it: a router, say",
     )
     parser.add_argument(
-        "--imu", metavar="KEY", default="imu", help="the gyro's key (imu): as listed, or a full key"
+        "--imu",
+        metavar="KEY",
+        help="with the gyro on this key (imu without it): as listed, or a full key",
     )
     parser.add_argument(
         "--yes",
@@ -85,7 +90,7 @@ def guided(
         attendant = stack.enter_context(_attendant(args, lines))
         robot = Robot(client, config, attendant)
         if name == "gyro":
-            robot.gyro(args.imu)
+            robot.gyro(args.imu or IMU)
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
@@ -103,6 +108,9 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         raise UsageError(
             "odom is what the wheels say already: positions have to come from elsewhere"
         )
+    if args.imu and (args.positions or args.way not in (None, "gyro")):
+        other = "--positions" if args.positions else f"--way {args.way}"
+        raise UsageError(f"--imu is for --way gyro, not for {other}; leave one out")
     if args.positions_at and not args.positions:
         raise UsageError("--positions-at says where --positions KEY is; give that as well")
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
@@ -149,12 +157,13 @@ def differing(config: Config, mine: Config, where: str) -> str:
 def _way(args: argparse.Namespace, config: Config) -> str:
     if args.positions:
         return "positions"
-    if args.way == "gyro" and args.imu == "imu" and not config.odometry.gyro:
+    gyro = args.way == "gyro" or args.imu
+    if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
             "this robot's daemon hears no gyro: set odometry.gyro = true and restart it, or give "
             "--way tape, wall or umbmark"
         )
-    way: str = args.way or ("gyro" if config.odometry.gyro else "tape")
+    way: str = args.way or ("gyro" if gyro or config.odometry.gyro else "tape")
     return way
 
 

@@ -58,9 +58,10 @@ def test_rows_without_a_time_are_told() -> None:
     assert any("have no time" in n for n in of([*rows(0), ",1,1,1,", ",1,1,1,"])[2])
 
 
-def test_milliseconds_are_told_from_seconds() -> None:
+@pytest.mark.parametrize("rate", [20, 100, 500, 1000])
+def test_milliseconds_are_told_from_seconds(rate: int) -> None:
     with pytest.raises(LogError, match="t is in seconds"):
-        of(rows(0, step=10.0))
+        of(rows(0, step=1000.0 / rate))
 
 
 @pytest.mark.parametrize("per_second", [1e6, 1e9])
@@ -148,3 +149,15 @@ def test_four_wheels_are_the_means_of_two_sides() -> None:
     run = runs(read(text.encode())).runs[0]
     assert (run.left[0], run.right[0]) == (2.0, 5.0)
     assert run.place[2] == 2 - 2j
+
+
+def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() -> None:
+    """At 5 Hz among rows at 100 Hz, every cell filled."""
+    rows = [f"{i / 100},{4 * (i >= 300)},{4 * (i >= 300)},{max(0, i // 20 - 15) * 0.04:.3f},0"
+            for i in range(1000)]  # fmt: skip
+    log = runs(read(("t,left,right,x,y\n" + "\n".join(rows)).encode()))
+    run = log.runs[0]
+    moving = run.place_t >= 3.3
+    assert np.diff(run.place_t[moving]) == pytest.approx(0.2)
+    assert (run.place_t < 3.0).sum() == 300, "who stands is where he was"
+    assert any("x y stay between samples" in note for note in log.notes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -33,6 +35,47 @@ def test_a_header_may_be_the_last_comment_before_the_numbers() -> None:
 def test_other_separators_are_known_by_the_header(text: str) -> None:
     assert read(text.encode()).columns["t"][0] == 1.5
     assert read(text.encode("utf-16")).columns["t"][0] == 1.5
+
+
+@pytest.mark.parametrize("place", ["first", "last"])
+@pytest.mark.parametrize("name", ["#1", "lap #2", "cw # slow", '"a, b"'])
+def test_a_run_may_have_any_sign_in_its_name(name: str, place: str) -> None:
+    header, row = b"t,left,right,yaw_rate", "{},2,3,4"
+    cells = [f"{name},{row}" if place == "first" else f"{row},{name}"] * 3
+    names = b"run," + header if place == "first" else header + b",run"
+    text = "\n".join(one.format(t) for t, one in enumerate(cells))
+    table = read(names + b"\n" + text.encode())
+    assert table.names == (name.strip('"'),)
+    assert table.columns["t"].tolist() == [0.0, 1.0, 2.0]
+    assert not table.notes
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1,2,3,4 # slipped, perhaps, or not",
+        "1,2,3,4,# slipped, perhaps",
+        "# 1,2,3,5\n1,2,3,4",
+        "1,2,3,4\n#9,2,3,4",
+    ],
+)
+def test_a_comment_is_behind_the_numbers_or_a_line_of_its_own(row: str) -> None:
+    table = read(HEADER + row.encode())
+    assert table.columns["yaw_rate"].tolist() == [4.0]
+    assert not table.notes
+
+
+def test_a_text_that_is_not_looked_at_may_have_a_number_sign() -> None:
+    table = read(b"t,note,left,right,yaw_rate\n1,try #3,2,3,4\n")
+    assert table.columns["yaw_rate"].tolist() == [4.0]
+
+
+def test_a_number_that_a_sign_spoils_is_none() -> None:
+    """As C on Windows writes NaN; the half before it is no speed."""
+    table = read(HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,3,4\n")
+    assert table.columns["t"].tolist() == [1.0, 3.0]
+    assert np.isnan(table.columns["left"][1])
+    assert "no number" in table.notes[0]
 
 
 def test_runs_are_told_apart_by_any_name() -> None:
@@ -83,18 +126,79 @@ def test_what_is_no_measurement_counts_as_missing_and_is_told() -> None:
     assert len(table.notes) == 2
 
 
-def test_a_spike_counts_as_missing_and_a_fast_drive_does_not() -> None:
-    lines = [f"{i},{i % 10},{i % 10},0.1" for i in range(200)]
-    lines[70] = "70,900,5,-40"
-    table = read(HEADER + "\n".join(lines).encode())
-    assert np.flatnonzero(np.isnan(table.columns["left"])).tolist() == [70]
-    assert np.flatnonzero(np.isnan(table.columns["yaw_rate"])).tolist() == [70]
-    assert not np.isnan(table.columns["right"]).any()
-    assert len(table.notes) == 2
-
-
 def test_columns_that_are_not_used_are_told() -> None:
     assert read(b"t,left,right,yaw_rate,volts\n1,2,3,4,5\n").notes == ('columns not used: "volts"',)
+
+
+# as others write them
+
+ROWS = [(i / 100, i % 7 + 0.25, i % 5 + 0.5, 0.125) for i in range(40)]
+NAMES = ["t", "left", "right", "yaw_rate"]
+
+
+def written(separator: str = ",", point: str = ".", end: str = "\n", more: str = "") -> str:
+    rows = (separator.join(f"{v:.3f}".replace(".", point) for v in row) + more for row in ROWS)
+    return end.join([separator.join(NAMES) + more, *rows]) + end
+
+
+FOREIGN: dict[str, bytes] = {
+    "a byte order mark": b"\xef\xbb\xbf" + written().encode(),
+    "UTF-16": written("\t").encode("utf-16"),
+    "lines of Windows": written(end="\r\n").encode(),
+    "lines of old Macs": written(end="\r").encode(),
+    "semicolons and decimal commas": written(";", ",").encode(),
+    "semicolons and a hint for a spreadsheet": ("sep=;\n" + written(";", ",")).encode(),
+    "a comma in a unit": written(";").replace("rate", "rate (rad/s, up)").encode(),
+    "tabs": written("\t").encode(),
+    "trailing commas": written(more=",").encode(),
+    "commas enough for a whole sheet": written(more=",,,,,").encode(),
+    "empty lines": written(end="\n\n").encode(),
+    "capitals and spaces": written().replace("yaw_rate", "Yaw Rate").replace("t,", "T,").encode(),
+    "names in quotes": written().replace("t,left", '"t","left"').encode(),
+    "all in quotes": "\n".join(
+        ",".join(f'"{cell}"' for cell in line.split(",")) for line in written().splitlines()
+    ).encode(),
+    "a comment of MATLAB's": ("% " + written()).encode(),
+    "one log behind another": (written() + written()).encode(),
+    "other units": "\n".join(
+        ["t [ms],left [rpm],right (deg/s),yaw_rate (°/s)"]
+        + [
+            f"{1000 * t:.6f},{a * 60 / math.tau:.9f},{math.degrees(b):.9f},{math.degrees(w):.9f}"
+            for t, a, b, w in ROWS
+        ]
+    ).encode(),
+}
+
+
+@pytest.mark.parametrize("how", FOREIGN)
+def test_what_others_write_is_the_same_table(how: str) -> None:
+    table = read(FOREIGN[how])
+    found = np.column_stack([table.columns[name] for name in NAMES])
+    assert found[:40] == pytest.approx(np.array(ROWS))
+    assert not [note for note in table.notes if "not used" not in note]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (written(point=",").encode(), "write numbers with a point"),
+        (written(";").replace(".", "'").encode(), "write numbers with a point"),
+        (written().replace("0.", "12:00:00.").encode(), "a date, and t is in s"),
+        (written(" ").encode(), "without commas"),
+        (written().replace("yaw_rate", "gyro_z").encode(), "it must name yaw_rate"),
+        (written().replace("t,l", "time_ms,l").encode(), "is time_ms it? rename it t, in s"),
+        (b"%time,field.left,field.right\n1,2,3\n", "is time it? rename it t"),
+    ],
+)
+def test_what_cannot_be_read_is_told_with_what_to_do(data: bytes, words: str) -> None:
+    with pytest.raises(LogError, match=r".") as refused:
+        read(data)
+    assert words in str(refused.value)
+
+
+def test_a_unit_that_is_not_known_is_told() -> None:
+    notes = read(HEADER.replace(b"left", b"left (m/s)") + b"1,2,3,4\n").notes
+    assert "column left says (m/s)" in notes[0]
 
 
 @given(st.binary(max_size=300), st.integers(0, 100))

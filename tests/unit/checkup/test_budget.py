@@ -104,6 +104,14 @@ def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
     assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
+def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
+    config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
+    found = budget(Heard(driven().lines, [], learned=1.1), config)
+    assert found.multiplier == 1.5
+    assert found.learned == pytest.approx(1.65)
+    assert budget(Heard(driven().lines, []), config).learned is None
+
+
 def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
     found = budget(Heard(lines, [], gyro=True), CONFIG)

@@ -78,6 +78,13 @@ def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() ->
     assert next(row for row in rows if row.startswith("gaps")).split()[1:3] == ["-", "-"]
 
 
+@pytest.mark.parametrize("still", [False, True])
+def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: bool) -> None:
+    told = " ".join(text(of(KNOWN, learned=1.7, multiplier=1.5, still=still)).split())
+    assert "wheel_separation_multiplier would be 1.700; configured is 1.500" in told
+    assert "would be" not in text(of(KNOWN, still=still))
+
+
 def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
     told = text(of(("parameters", 7.2, "settings"), still=True))
     assert "stands still" in told

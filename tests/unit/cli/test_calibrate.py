@@ -93,6 +93,16 @@ def test_a_refusal_ends_with_failure_and_an_object(
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
+def test_a_refusal_has_what_was_told_of_the_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [f"{i / 100},1,1,0.1" for i in range(500)]
+    rows[100] = "1,1,1,900"
+    with pytest.raises(ExitError, match="\\nnote: 1 cell of yaw_rate left out"):
+        called(tmp_path, "t,left,right,yaw_rate\n" + "\n".join(rows), "--json")
+    assert "1 cell of yaw_rate" in json.loads(capsys.readouterr().out)["notes"][0]
+
+
 def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     calibrate.add(parser.add_subparsers())
@@ -152,6 +162,9 @@ def driving(*words: str) -> int:
         (["--positions", "odom"], "what the wheels say"),
         (["--positions", "acsard/acsar/odom"], "what the wheels say"),
         (["--log", "drive.csv", "--way", "tape"], "--way is for a guided drive"),
+        (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
+        (["--way", "tape", "--imu", "imu"], "--imu is for --way gyro, not for --way tape"),
+        (["--positions", "sim/pose", "--imu", "x/imu"], "not for --positions"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
         (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
         (["--yes", "--json-lines"], "--json-lines a program"),

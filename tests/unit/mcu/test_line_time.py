@@ -54,11 +54,16 @@ def test_stalls_of_the_host_cost_nothing(
         seconds,
         seeds,
     )
-    assert np.all(found[FOUND] <= 1.1 * found[FLOOR] + SLACK)
+    assert np.all(found[FOUND] <= 1.1 * found[FLOOR] + slack(seeds))
 
 
 SLACK = np.array([0.02, 0.05])
-"""m and deg: what a drive that happens to end where it should leaves of the ratio."""
+"""m and deg: what one drive that happens to end where it should leaves of the ratio."""
+
+
+def slack(seeds: int) -> np.ndarray:
+    """The mean of twenty drives has none: their floor is 0.05 to 0.13 m and 0.065 deg."""
+    return SLACK if seeds == 1 else 0.0 * SLACK
 
 
 @EFFORT
@@ -69,13 +74,15 @@ def test_an_adapter_that_holds_lines_back_costs_nothing(
     case = Case("ftdi", prompted, stall=0.15)
     name = f"FTDI 16 ms, 12 stalls a minute, {link(prompted)}"
     found = errors(name, "1.05 x floor", case, seconds, seeds)
-    assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + SLACK)
+    assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + slack(seeds))
 
 
 @EFFORT
-def test_a_fifth_of_the_lines_lost_costs_little(seconds: float, seeds: int) -> None:
-    case = Case(lost=0.2, stall=0.15, stall_every=60.0)
-    found = errors("20 % lost, a stall a minute", "0.45 m", case, seconds, seeds)
+@pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
+def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, seeds: int) -> None:
+    case = Case(prompted=prompted, lost=0.2, stall=0.15, stall_every=60.0)
+    name = f"20 % lost, a stall a minute, {link(prompted)}"
+    found = errors(name, "0.45 m", case, seconds, seeds)
     assert found[FOUND, 0] <= 0.45
 
 
