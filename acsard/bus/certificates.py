@@ -5,6 +5,7 @@ Reading how long takes the library of the extra `lan`.
 
 from __future__ import annotations
 
+import ipaddress
 import ssl
 from contextlib import suppress
 from pathlib import Path
@@ -59,7 +60,15 @@ def common_name(directory: str) -> str:
 def names_in(directory: str) -> list[str]:
     """The host names and addresses that the certificate in `directory` is for."""
     alternative: Any = _shown(directory).get("subjectAltName", ())
-    return [str(name) for _, name in alternative]
+    return [_plain(str(name)) for _, name in alternative]
+
+
+def _plain(name: str) -> str:
+    """An IPv6 address as everybody writes it; the standard library has all its zeros."""
+    try:
+        return str(ipaddress.ip_address(name))
+    except ValueError:
+        return name
 
 
 def _shown(directory: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from acsard.values import ROLES
 
 if TYPE_CHECKING:
     from acsard.config.settings import Config
-    from acsard.web.server import Listen
+    from acsard.web.listen import Listen
 
 MOST_DAYS = 3650
 
@@ -115,7 +115,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
 
 
 def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
-    from acsard.web.server import listens
+    from acsard.web.listen import listens
 
     return tuple(listens(text) for text in args.address or config.web.address)
 
@@ -124,11 +124,12 @@ def _invite(args: argparse.Namespace, config: Config) -> int:
     """A new token, shown once."""
     import segno
 
-    from acsard.web.server import invitations
+    from acsard.web.listen import invitations, require_certificate
     from acsard.web.tokens import Vault, place
 
-    tls = args.tls or config.bus.tls
-    urls = invitations(_listen(args, config), tls)
+    tls, listen = args.tls or config.bus.tls, _listen(args, config)
+    require_certificate(listen, tls)
+    urls = invitations(listen, tls)
     if not urls:
         raise UsageError(
             "nobody could come with it: web.address has no https://; add "

@@ -30,6 +30,7 @@ from acsard.web.requests import (
     body_of,
     keep_little,
     own_address,
+    peer_of,
     problem,
     secured,
     sent,
@@ -148,15 +149,15 @@ class Page:
             strange = foreign(asked)
             if strange is not None:
                 return self.refused(strange)
-        if request.path in OPEN or request.path.startswith("/page/"):
-            request[WHO] = MAINTAINER if spot == "here" else None
-        else:
-            shown = token_shown(request)
-            who = MAINTAINER if spot == "here" else await self._known(asked.peer, shown)
-            if isinstance(who, Refusal):
-                return self.refused(who)
-            request[WHO] = who
         try:
+            if request.path in OPEN or request.path.startswith("/page/"):
+                request[WHO] = MAINTAINER if spot == "here" else None
+            else:
+                shown = token_shown(request)
+                who = MAINTAINER if spot == "here" else await self._known(asked.peer, shown)
+                if isinstance(who, Refusal):
+                    return self.refused(who)
+                request[WHO] = who
             return await handler(request)
         except TimeoutError:
             return problem(503, "the disk does not answer")
@@ -169,14 +170,11 @@ class Page:
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     async def _known(self, peer: str, shown: str) -> Who | Refusal:
-        """Whose token this is."""
+        """Whose token this is; raises `TimeoutError` for one that cannot be looked up."""
         now_ns = clock.mono_ns()
         if not shown:
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
-        try:
-            who = await in_thread(lambda: self._vault.who(shown), READ_S)
-        except TimeoutError:
-            who = None  # whom we cannot look up we do not let in
+        who = await in_thread(lambda: self._vault.who(shown), READ_S)
         if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
             return who
         if self._tries.spent(peer, now_ns):
@@ -194,7 +192,7 @@ class Page:
         text = await token_posted(request)
         if not request.secure:
             return self.refused(Refusal("plain", "here you need no token"))
-        who = await self._known(request.remote or "", text)
+        who = await self._known(peer_of(request), text)
         if isinstance(who, Refusal):
             return self.refused(who)
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
@@ -223,7 +221,7 @@ class Page:
         return sent(request, file)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
-        who, peer = _who(request), request.remote or ""
+        who, peer = _who(request), peer_of(request)
         if full := self._seats.enter(peer, who.token):
             answer = self.refused(Refusal("too_many", full))
             answer.force_close()  # who asks again and again keeps no connection either
@@ -258,7 +256,7 @@ class Page:
     async def _whoami(self, request: web.Request) -> web.StreamResponse:
         who = _who(request)
         # A browser does not tell its page why a WebSocket was refused; this does.
-        full = self._seats.missing(request.remote or "", who.token)
+        full = self._seats.missing(peer_of(request), who.token)
         return web.json_response({"role": who.role, "name": who.name, "full": full})
 
     async def _settings(self, request: web.Request) -> web.StreamResponse:

@@ -1,7 +1,7 @@
 """The page's interface for programs, described as OpenAPI 3.1; pure.
 
-From the table of topics and the schemas that `schema/<Type>` answers with: a key or a field that
-is new there is new here.
+From the table of topics, the schemas that `schema/<Type>` answers with, and the frames of the
+WebSocket: a key or a field that is new there is new here.
 """
 
 from __future__ import annotations
@@ -9,9 +9,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import msgspec
+
 from acsard.bus.access import SERVICE_ROLES, least_role
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import SERVICES, TOPICS, Topic, service_key
+from acsard.web.frames import KINDS
 
 Described = dict[str, Any]
 
@@ -20,6 +23,9 @@ PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
 
 NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
 """Rows that have no value to be asked for here."""
+
+TO_ROBOT = "ToRobot"
+"""Any message that the WebSocket takes."""
 
 PAYLOADS = {"set": "Settings", "set_pose": "SetPose"}
 
@@ -44,15 +50,46 @@ def document(version: str) -> Described:
             "title": "acsard",
             "version": version,
             "description": "The robot's page, for programs. At the machine nothing is asked for; "
-            "from elsewhere a token, as `Authorization: Bearer ...`. GET /ws is a WebSocket.",
+            "from elsewhere a token, as `Authorization: Bearer ...`.",
         },
         "paths": paths,
         "components": {
-            "schemas": dict(SCHEMAS),
+            "schemas": _keys() | _frames(),
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
         "security": [{}, {"token": []}],
     }
+
+
+def _keys() -> Described:
+    """The types of the keys, each with its parts beside it as `Type.Part`: a schema with parts of
+    its own within is beyond most readers of such documents."""
+    found: Described = {}
+    for name, schema in SCHEMAS.items():
+        whole = _flat(schema, f"{name}.")
+        parts = whole.pop("$defs")
+        found[name] = {key: value for key, value in whole.items() if key[0] != "$"}
+        found |= {f"{name}.{part}": value for part, value in parts.items()}
+    return found
+
+
+def _flat(node: Any, before: str) -> Any:
+    """The same, its references to parts led to those beside it."""
+    if isinstance(node, list):
+        return [_flat(one, before) for one in node]
+    if not isinstance(node, dict):
+        return node
+    if isinstance(ref := node.get("$ref"), str):
+        return {"$ref": ref.replace("#/$defs/", f"#/components/schemas/{before}")}
+    return {key: _flat(value, before) for key, value in node.items()}
+
+
+def _frames() -> Described:
+    """The messages of `/ws` to the robot, by their names."""
+    refs, parts = msgspec.json.schema_components(
+        KINDS.values(), ref_template="#/components/schemas/{name}"
+    )
+    return {**parts, TO_ROBOT: {"title": TO_ROBOT, "oneOf": list(refs)}}
 
 
 def _ref(name: str) -> Described:
@@ -166,7 +203,47 @@ _CHOICES: Described = {
 
 _WHO = "Role and name, and `full`: why there is no room for one more WebSocket, or nothing."
 
+_TOKEN: Described = {
+    "type": "object",
+    "required": ["token"],
+    "properties": {"token": {"type": "string"}},
+}
+
 _OTHERS: Described = {
+    "/ws": {
+        "get": {
+            "summary": "a WebSocket, JSON as text both ways: follows, drives, stops",
+            "description": f"Each message to the robot is a `{TO_ROBOT}`; what comes from it is on "
+            "the page deploy/web.",
+            "x-messages": {"$ref": f"#/components/schemas/{TO_ROBOT}"},
+            "responses": {"101": {"description": "It is open."}, "default": _TROUBLE},
+        }
+    },
+    "/token": {
+        "post": {
+            "summary": "a token becomes the cookie of a browser, which no script reads; by HTTPS",
+            "security": [{}],
+            "requestBody": {
+                "required": True,
+                "content": {
+                    "application/json": {"schema": _TOKEN},
+                    "application/x-www-form-urlencoded": {"schema": _TOKEN},
+                },
+            },
+            "responses": {
+                "303": {
+                    "description": "It counts; the page is there.",
+                    "headers": {
+                        "Set-Cookie": {"schema": {"type": "string"}},
+                        "Location": {"schema": {"type": "string"}},
+                    },
+                },
+                "401": _TROUBLE,
+                "429": _TROUBLE,
+                "default": _TROUBLE,
+            },
+        }
+    },
     "/api/whoami": {
         "get": {
             "summary": "who you are here",

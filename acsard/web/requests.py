@@ -11,7 +11,7 @@ import msgspec
 from aiohttp import web
 
 from acsard.web.files import File
-from acsard.web.who import Asked
+from acsard.web.who import Asked, unmapped
 
 COOKIE = "__Host-acsard"
 """By its name browsers take it only with Secure, of this host, for all paths."""
@@ -45,13 +45,18 @@ def asked_of(request: web.Request) -> Asked:
     """What is known of it before anything in it is believed."""
     hosts = request.headers.getall("Host", [])
     return Asked(
-        request.remote or "",
+        peer_of(request),
         request.secure,
         hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
         request.headers.get("Origin"),
         request.headers.get("Sec-Fetch-Site"),
         any(name.lower().startswith(PROXIES) for name in request.headers),
     )
+
+
+def peer_of(request: web.Request) -> str:
+    """The address it comes from."""
+    return unmapped(request.remote or "")
 
 
 def problem(status: int, text: str) -> web.Response:
@@ -62,7 +67,7 @@ def problem(status: int, text: str) -> web.Response:
 def own_address(request: web.Request) -> str:
     """The address of ours that the client has reached: no name that somebody points here."""
     at = None if request.transport is None else request.transport.get_extra_info("sockname")
-    return str(at[0]).lower() if at else ""
+    return unmapped(str(at[0]).lower()) if at else ""
 
 
 def token_shown(request: web.Request) -> str:

@@ -17,12 +17,10 @@ from aiohttp import web
 from msgspec import Struct
 
 from acsard.bus.address import Address
-from acsard.bus.certificates import CERTIFICATE, KEY, names_in, require_usable
+from acsard.bus.certificates import CERTIFICATE, KEY, names_in
 from acsard.bus.session import client_session
 from acsard.client import Client
 from acsard.config.settings import Config
-from acsard.host.addresses import own_addresses
-from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.logs import Log
 from acsard.host.parent import end_with_parent
 from acsard.web.app import Page
@@ -34,13 +32,11 @@ from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
+from acsard.web.listen import Listen, bound, own_name, require_certificate
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
 from acsard.web.unreadable import Reader
 from acsard.web.who import is_loopback
-
-TRIES = 20
-"""Ports after a taken one that are tried."""
 
 BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0
 
@@ -57,30 +53,6 @@ LEAVE_S = 0.3
 
 SWITCH_INTERVAL_S = 0.0005
 """How long one thread may keep the interpreter from another: a command or a stop waits for it."""
-
-
-class Listen(Struct, frozen=True):
-    """Where to listen, and how."""
-
-    secure: bool
-    """HTTPS."""
-    host: str
-    port: int
-
-    @property
-    def everywhere(self) -> bool:
-        """At all addresses of this machine."""
-        return self.host in ("0.0.0.0", "::")
-
-    @property
-    def url(self) -> str:
-        """What to open in a browser; where it is everywhere by the name of this machine."""
-        return self.url_at(own_name() if self.everywhere else self.host)
-
-    def url_at(self, host: str) -> str:
-        """The same by another name."""
-        host = f"[{host}]" if ":" in host else host
-        return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
 
 
 class Wanted(Struct, frozen=True):
@@ -100,47 +72,6 @@ class Wanted(Struct, frozen=True):
     held: bool = False
     """End with standard input."""
     page: Path = PAGE
-
-
-def own_name() -> str:
-    """What others find this machine by, by mDNS."""
-    return f"{socket.gethostname().partition('.')[0].lower()}.local"
-
-
-def listens(text: str) -> Listen:
-    """An address like http://127.0.0.1:8080; raises `UsageError`.
-
-    Without TLS nobody but this machine is listened to.
-    """
-    scheme, _, place = text.removesuffix("/").partition("://")
-    host, _, port = place.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    number = int(port) if port.isascii() and port.isdecimal() else 0
-    if scheme not in ("http", "https") or not host or not 0 < number < 65536:
-        raise UsageError(
-            f"{text} is no address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
-        )
-    if scheme == "http" and not (host == "localhost" or is_loopback(host)):
-        raise UsageError(f"{text}: beyond this machine only https, with the robot's certificate")
-    return Listen(scheme == "https", host, number)
-
-
-def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """The addresses to write on an invitation, the likeliest first; none without HTTPS.
-
-    An IP address before a name: not every phone asks by mDNS.
-    """
-    found: list[str] = []
-    for one in listen:
-        if not one.secure:
-            continue
-        hosts = [one.host]
-        if one.everywhere:
-            certified = set(names_in(tls)) if tls else set()
-            own = [at for at in own_addresses() if at in certified and ":" not in at]
-            hosts = [*own, own_name()]
-        found += [one.url_at(host) for host in hosts]
-    return found
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: Log) -> None:
@@ -168,11 +99,11 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
         stack.push_async_callback(guide.close)
-        places = [_bound(one, wanted.next_port) for one in wanted.listen]
-        for one, bound in places:
+        places = bound(wanted.listen, wanted.next_port)
+        for one, opened in places:
             server = await asyncio.get_running_loop().create_server(
                 gate.guarded(lambda: Reader(counts, runner.server)),
-                sock=bound,
+                sock=opened,
                 ssl=secure if one.secure else None,
                 ssl_handshake_timeout=HANDSHAKE_S if one.secure else None,
                 backlog=128,
@@ -274,36 +205,11 @@ def _about(wanted: Wanted) -> About:
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
     """What to show from elsewhere, and the names there; raises a `MendableError`."""
-    away = [one for one in wanted.listen if one.secure]
-    if not away:
+    if not any(one.secure for one in wanted.listen):
         return None, frozenset()
-    if not wanted.tls:
-        raise CertificateError(
-            f"{away[0].url} takes a certificate: `acsard lan init` makes one; then set bus.tls, or "
-            "--tls DIRECTORY"
-        )
-    require_usable(wanted.tls)
+    require_certificate(wanted.listen, wanted.tls)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.load_cert_chain(f"{wanted.tls}/{CERTIFICATE}", f"{wanted.tls}/{KEY}", password="")
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(wanted.tls))}
     return context, frozenset(one for one in names if one != "localhost" and not is_loopback(one))
-
-
-def _bound(one: Listen, next_port: bool) -> tuple[Listen, socket.socket]:
-    """A socket there, or at one of the next ports; raises `InUseError`."""
-    ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
-    trouble: OSError | None = None
-    for port in ports:
-        try:
-            found = socket.getaddrinfo(one.host, port, type=socket.SOCK_STREAM)[0]
-            bound = socket.create_server(found[4][:2], family=found[0], backlog=128)
-        except OSError as error:
-            trouble = error
-            continue
-        bound.setblocking(False)
-        return Listen(one.secure, one.host, port), bound
-    raise InUseError(
-        f"cannot listen at {one.url}: {trouble}; stop what has it, or choose another "
-        "by --address (web.address)"
-    ) from None

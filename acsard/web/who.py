@@ -108,6 +108,11 @@ def host_name(host: str) -> str:
     return host.partition(":")[0].lower()
 
 
+def unmapped(address: str) -> str:
+    """An IPv4 address as such, also of one who came by it to a socket for both."""
+    return address.removeprefix("::ffff:") if "." in address else address
+
+
 def is_loopback(text: str) -> bool:
     """An address of this machine for itself; no name is."""
     try:

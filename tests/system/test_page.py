@@ -136,6 +136,70 @@ def test_keys_drive_while_they_are_held(page: Phone) -> None:
     bus.at_rest()
 
 
+def pressed(browser: Browser, code: str, number: int) -> None:
+    """A key with what it does to what has the focus."""
+    for kind in ("rawKeyDown", "keyUp"):
+        browser.ask(
+            "Input.dispatchKeyEvent", type=kind, code=code, key=code, windowsVirtualKeyCode=number
+        )
+
+
+LIMIT = "document.getElementById('limit').value"
+
+
+def test_keys_drive_after_the_slider_was_set_and_leave_it_where_it_is(page: Phone) -> None:
+    browser, bus = page.browser, page.bus
+    before = browser.js(LIMIT)
+    x, y = browser.middle("limit")
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    until(lambda: browser.js(LIMIT) != before, 5.0, "it is set")
+    chosen = browser.js(LIMIT)
+    try:
+        browser.ask(
+            "Input.dispatchKeyEvent", type="rawKeyDown", code="ArrowUp", key="ArrowUp",
+            windowsVirtualKeyCode=38,
+        )  # fmt: skip
+        until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    finally:
+        browser.key("Up", "ArrowUp", "ArrowUp")
+    bus.at_rest()
+    assert browser.js(LIMIT) == chosen
+
+
+def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(page: Phone) -> None:
+    browser, bus = page.browser, page.bus
+    for _ in range(40):
+        if browser.js("document.activeElement.id") == "limit":
+            break
+        pressed(browser, "Tab", 9)
+    before, commands = float(browser.js(LIMIT)), bus.count("commands")
+    pressed(browser, "ArrowUp", 38)
+    pressed(browser, "ArrowUp", 38)
+    assert float(browser.js(LIMIT)) == pytest.approx(before + 0.1)
+    assert bus.count("commands") == commands
+    browser.key("Down", "KeyW", "w")
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    browser.key("Up", "KeyW", "w")
+    bus.at_rest()
+
+
+@pytest.mark.parametrize("where", ["map", "limit", "tab-drive"])
+def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
+    page.hold()
+    page.browser.tap(where)
+    page.shows("told", "one finger drives")
+    page.bus.at_rest()
+
+
+def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
+    """A phone freezes what it has put away; it hides it before, so here is the event alone."""
+    page.hold()
+    page.browser.js("document.dispatchEvent(new Event('freeze'))")
+    page.bus.at_rest()
+    assert page.browser.js("document.getElementById('stick').matches('.held')") is False
+
+
 PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
     mapping: 'standard',
     buttons: Array.from({length: 16}, (_, n) => ({pressed: n === 5 && HELD}))}]"""
@@ -171,6 +235,25 @@ def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
     until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
     browser.js(pad.replace("HELD", "false") + ";1")
     bus.at_rest()
+
+
+def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
+    browser, bus = page.browser, page.bus
+    browser.js(PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true") + ";1")
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    # What it said last stays held, as with a battery that is empty.
+    browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
+    page.shows("told", "the gamepad is gone")
+    bus.at_rest()
+
+
+def test_a_gamepad_that_the_browser_does_not_know_drives_nothing_and_says_so(page: Phone) -> None:
+    pad = PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true").replace("standard", "")
+    commands = page.bus.count("commands")
+    page.browser.js(pad + ";1")
+    page.shows("told", "this gamepad does not drive")
+    assert page.bus.count("commands") == commands
+    assert page.browser.js("document.getElementById('stick').matches('.held')") is False
 
 
 LOCKS = """
@@ -457,6 +540,32 @@ def test_a_hand_that_is_not_followed_lets_go_and_says_why(
     assert told[-1][0] == 0
     assert why in json.dumps(told[-1][1])
     assert all(one[1] is None for one in told[:-1])
+
+
+READ = """import('/page/settings.js').then(({read}) => [
+    read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2), read('info', 'debug'),
+    read('1,2.5, 3', [0, 0, 0]), read('1,,x', [0, 0, 0])])"""
+
+
+def test_what_is_typed_is_a_number_with_a_comma_too_but_between_several(page: Phone) -> None:
+    told = page.browser.js(READ)
+    assert told == [0.5, -1.5, "fast", "", "info", [1, 2.5, 3], [1, "", "x"]]
+
+
+def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
+    """Space is STOP, in a field too."""
+    browser = page.browser
+    browser.tap("tab-set")
+    fields = "[...document.querySelectorAll('#settings input')]"
+    lists = f"{fields}.filter(one => one.value.includes(',')).map(one => one.value)"
+    until(lambda: len(browser.js(lists)) >= 2, 10.0, "the lists")
+    assert not any(" " in one for one in browser.js(lists))
+    labels = f"{fields}.filter(one => one.value.includes(',')).map(one => one.labels[0].innerText)"
+    assert all("no space, which is STOP" in one for one in browser.js(labels))
+    browser.js(f"{fields}.find(one => one.value.includes(',')).focus()")
+    browser.key("Down", "Space", " ")
+    browser.key("Up", "Space", " ")
+    until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops from there too")
 
 
 def test_what_strangers_write_is_text(page: Phone) -> None:

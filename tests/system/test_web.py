@@ -104,8 +104,19 @@ def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> N
                 assert (answer.status, (await answer.json())["success"]) == (409, False)
             async with session.get("/api") as answer:
                 assert (await answer.json())["openapi"] == "3.1.0"
-                for name in ("Content-Security-Policy", "X-Content-Type-Options"):
-                    assert answer.headers[name]
+
+    run(story)
+
+
+def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            for place in ("/", "/page/main.js", "/api/state", "/nothing"):
+                async with session.get(place) as answer:
+                    policy = answer.headers["Content-Security-Policy"].split("; ")
+                    assert {"default-src 'self'", "frame-ancestors 'none'"} <= set(policy)
+                    assert answer.headers["X-Frame-Options"] == "DENY"
+                    assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
     run(story)
 

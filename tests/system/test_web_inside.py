@@ -29,11 +29,15 @@ from acsard.web.guide import Guide
 from acsard.web.limits import OVERRUNS
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
+from acsard.web.to_browser import UNREAD_BYTES
 from acsard.web.tokens import Vault
 from tests.system.browser import Hands, run
-from tests.system.harness import PATIENCE_S, Daemon
+from tests.system.harness import PATIENCE_S, Daemon, seconds
 
 pytestmark = pytest.mark.network
+
+MISSED = 50
+"""Messages at 50 a second that one does not read."""
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
 
@@ -99,6 +103,43 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
             wire.abort()
 
     run(story)
+
+
+def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_between(
+    inside: Inside, tmp_path: Path
+) -> None:
+    def left_out() -> int:
+        return inside.counts.all().get("frames_left_out", 0)
+
+    async def story(daemon: Daemon) -> None:
+        with client_session(daemon.endpoint, "") as session:
+            inside.robots.client = Client(session, "acsar", "teleop")
+            async with inside.hands() as ours:
+                await ours.say(subscribe="odom", rate=50)
+                await ours.find(lambda said: "key" in said)
+                assert left_out() == 0
+                wire = cast(Any, ours.socket)._response.connection.transport
+                wire.pause_reading()
+                (viewer,) = inside.page._viewers
+                while viewer._out._unread() <= UNREAD_BYTES:  # more than the kernels hold
+                    viewer._out.say("x" * 4096)
+                    await asyncio.sleep(0)
+                await eventually(lambda: left_out() >= MISSED)
+                wire.resume_reading()
+                stamps = [0.0]
+
+                def leaps(said: Any) -> bool:
+                    """Over most of what it did not read."""
+                    if "key" not in said:
+                        return False
+                    stamps.append(seconds(said["value"]["header"]["stamp"]))
+                    return 0 < stamps[-2] < stamps[-1] - 0.5 * MISSED / 50
+
+                news = await ours.find(leaps)
+                assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest
+
+    with Daemon(tmp_path) as daemon:
+        run(lambda: story(daemon))
 
 
 def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(inside: Inside) -> None:

@@ -19,10 +19,16 @@ from acsard.web.limits import (
     CONNECTIONS_OF_ONE,
     CONNECTIONS_OF_TOKEN,
 )
+from acsard.web.server import TIDY_S
+from acsard.web.tokens import Vault
 from tests.system.browser import Page, hands, run
+from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Bus, until
 
 pytestmark = pytest.mark.network
+
+PASSES_S = 0.5
+"""For reading the tokens, and for the way of a few bytes."""
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +111,35 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
     run(story)
     assert "lent" not in page.tokens("--tokens")
     assert token not in page.stdout + page.stderr
+
+
+def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_stops(
+    page: Page, bus: Bus
+) -> None:
+    token = page.invite("operator", "trusted")
+
+    async def story() -> None:
+        async with hands(page, token) as ours:
+            await ours.say(subscribe="state", rate=10)
+            await ours.until_driving(0.3)
+            holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+            Vault(page.state / "acsard-web").revoke("trusted")
+            begun = time.monotonic()
+            async with asyncio.timeout(PATIENCE_S):
+                while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                    pass
+            ended = time.monotonic()
+            assert (message.type, message.extra) == (
+                aiohttp.WSMsgType.CLOSE,
+                "your token has ended",
+            )
+            # It is looked up that often, by a process that may wait for a core as this one does.
+            assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
+            bus.at_rest()
+            with suppress(ConnectionError):
+                await holding
+
+    run(story)
 
 
 def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.lan.authority import Authority
 from tests.system.harness import ROOT, until
 from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError
 
@@ -119,12 +120,17 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
     until(lambda: "maintainer" in asks(bare, "/api/whoami"), 20.0, "it answers again")
     assert bare.main_pid(PAGE) != first
     assert bare.main_pid() == daemon
-    told = bare.run(ACSARD, "web", "--invite", "viewer", "--address", "https://0.0.0.0:8443")
+    Authority.make(bare.path(TLS), "test", 1).issue(bare.path(TLS), "robot", ["127.0.0.1"], 1)
+    away = ("--address", "https://0.0.0.0:8443", "--tls", TLS)
+    told = bare.run(ACSARD, "web", "--invite", "viewer", *away)
     assert told.code == 0, told.err
     kept = bare.run("stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json").out.split()
     owner = bare.run("stat", "-L", "-c", "%u", "/var/lib/acsard-web").out.strip()
     assert kept == ["600", owner]
 
+
+TLS = "/root/tls"
+"""A robot's certificate, for who comes from elsewhere."""
 
 STATE = "/var/lib/private/acsard"
 FORMER = "000001-20260101T000000Z.kept.mcap"

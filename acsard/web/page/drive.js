@@ -10,6 +10,8 @@ const KEYS = {
   ArrowLeft: [-1, 0], KeyA: [-1, 0], ArrowRight: [1, 0], KeyD: [1, 0],
 };
 const SHOULDERS = [4, 5, 6, 7];
+const STRANGE =
+  "this gamepad does not drive: the browser does not know which of its axes is which. Try its switch (X, XInput) or another browser";
 
 export class Drive {
   #hand = new Hand();
@@ -21,6 +23,7 @@ export class Drive {
   #pressed = new Set();
   #pointer = null;
   #padHeld = false;
+  #padStrange = false; // and that was said
   state = null;
   heard = -Infinity; // when that was true, by performance.now()
   sender = "";
@@ -99,6 +102,7 @@ export class Drive {
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"])
       stick.addEventListener(name, (event) => event.pointerId === this.#pointer && this.release());
     stick.addEventListener("contextmenu", (event) => event.preventDefault());
+    addEventListener("pointerdown", (event) => this.#second(event), true);
     addEventListener("keydown", (event) => this.#key(event, true));
     addEventListener("keyup", (event) => this.#key(event, false));
     addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
@@ -108,6 +112,11 @@ export class Drive {
     document.addEventListener("visibilitychange", () => document.hidden && this.release("let go: the page was hidden"));
     addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("let go: the gamepad is gone"));
     setInterval(() => this.#pad(), 50);
+  }
+
+  /** A finger beside the one that drives, wherever: a hand that does two things lets go. */
+  #second(event) {
+    if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("let go: one finger drives");
   }
 
   #down(event) {
@@ -145,7 +154,11 @@ export class Drive {
 
   #pad() {
     // Of others nobody knows which axis is which: a trigger at rest may read as full lock.
-    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected && one.mapping === "standard");
+    const pads = [...(navigator.getGamepads?.() ?? [])].filter((one) => one?.connected);
+    const pad = pads.find((one) => one.mapping === "standard");
+    const strange = !pad && pads.length > 0;
+    if (strange && !this.#padStrange && this.allowed) this.#told(STRANGE);
+    this.#padStrange = strange && this.allowed;
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
     if (held && this.#by === "pad") this.#show(farther(pad.axes[0], pad.axes[2]), -farther(pad.axes[1], 0));
     if (held && !this.#padHeld && !this.#by && document.hasFocus()) {
@@ -157,9 +170,11 @@ export class Drive {
   }
 }
 
-/** Keys mean something else to what has the focus, or with others. */
+/** Keys mean something else to what has the focus, or with others; to a slider the arrows alone. */
 function busy(event) {
-  return event.ctrlKey || event.altKey || event.metaKey || event.target.matches?.("input, select, textarea");
+  if (event.ctrlKey || event.altKey || event.metaKey) return true;
+  const slider = event.target.matches?.("input[type=range]") && event.code?.startsWith("Key");
+  return !slider && event.target.matches?.("input, select, textarea");
 }
 
 /** The axis that is pushed farther; nothing within the play of a spring. */

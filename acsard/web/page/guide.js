@@ -3,6 +3,7 @@
 
 import { awake } from "./awake.js";
 import { made, text } from "./views.js";
+import { number } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const LABELS = {
@@ -243,9 +244,9 @@ export function worded(words) {
 /** The number that was typed; null where nothing was and something is usual; what it cannot be goes as
  *  it is, and is refused. */
 export function typed(words, usual) {
-  const plain = words.trim().replace("−", "-").replace(",", ".");
-  if (plain === "") return usual === undefined ? "" : null;
-  return Number.isNaN(Number(plain)) ? words.slice(0, 80) : Number(plain);
+  if (words.trim() === "") return usual === undefined ? "" : null;
+  const value = number(words);
+  return Number.isNaN(value) ? words.slice(0, 80) : value;
 }
 
 function options(select, rows) {

@@ -14,8 +14,16 @@ export class Link extends EventTarget {
   #heard = 0;
   #asked = null; // a ping that has no answer yet, since when
   #timer = null;
+  #refused;
+  #shut = false; // for good
   open = false;
   way = null; // there and back, ms
+
+  /** `refused()` is asked when the robot takes no connection: true ends the asking. */
+  constructor(refused) {
+    super();
+    this.#refused = refused;
+  }
 
   start() {
     this.#connect();
@@ -72,7 +80,7 @@ export class Link extends EventTarget {
   }
 
   #connect() {
-    if (this.#socket && this.#socket.readyState <= 1) return;
+    if (this.#shut || (this.#socket && this.#socket.readyState <= 1)) return;
     const socket = new WebSocket(new URL("ws", location.href.replace(/^http/, "ws").replace(/#.*/, "")));
     this.#socket = socket;
     const given = setTimeout(() => socket.readyState === WebSocket.CONNECTING && socket.close(), SILENT);
@@ -87,12 +95,13 @@ export class Link extends EventTarget {
       this.#ping();
     };
     socket.onmessage = (event) => this.#take(JSON.parse(event.data));
-    socket.onclose = (event) => {
+    socket.onclose = async (event) => {
       if (this.#socket !== socket) return;
       const was = this.open;
       this.open = false;
       this.way = null;
-      this.#tell("down", { reason: event.reason, never: !was });
+      this.#tell("down", { reason: event.reason });
+      if (!was) this.#shut = await this.#refused();
       if (document.hidden) return; // again when somebody looks
       setTimeout(() => this.#connect(), AGAIN[Math.min(this.#tries++, AGAIN.length - 1)]);
     };

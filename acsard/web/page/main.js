@@ -1,5 +1,6 @@
 // The page: one link, one hand, and the views.
 
+import { invited, refusal } from "./door.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
@@ -19,7 +20,7 @@ const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(
 const words = (told) => clickable(told, OTHER);
 const LATCHED = ["stopped", "fault"];
 
-const link = new Link();
+const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
 const guide = new Guide(link);
@@ -37,6 +38,7 @@ let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
 let hello = null;
 let wished = null;
+let uninvited = ""; // why the invitation did not let us in
 let period = 0; // s from one state of another robot's to the next
 
 function open(name) {
@@ -175,6 +177,8 @@ function greeted({ detail }) {
   limited();
   views.text("hint", hint(hello.role, OTHER));
   views.text("barred", barred(hello.role, "operator"));
+  if (uninvited) views.text("told", uninvited); // let in all the same, by an earlier one
+  uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
   if (OTHER) elsewhere();
 }
@@ -188,15 +192,13 @@ function elsewhere() {
   $("other").hidden = false;
 }
 
-/** Who comes by an invitation has its token behind the #: it becomes a cookie, and is wiped. */
-async function invited() {
-  const token = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!token) return;
-  history.replaceState(null, "", location.pathname);
-  const body = JSON.stringify({ token });
-  const headers = { "Content-Type": "application/json" };
-  const answer = await fetch("token", { method: "POST", headers, body, signal: AbortSignal.timeout(5000) }).catch(() => null);
-  if (!answer?.ok && !answer?.redirected) views.text("reason", "this invitation is not valid: ask for a new one (acsard web --invite)");
+/** The robot takes no connection: say why. True where asking again changes nothing. */
+async function refused() {
+  const { why, shut } = await refusal();
+  if (link.open) return false;
+  if (why) views.lost(shut && uninvited ? uninvited : why);
+  $("again").hidden = !shut;
+  return shut;
 }
 
 link.addEventListener("hello", greeted);
@@ -228,15 +230,10 @@ link.addEventListener("refused", ({ detail }) => {
   views.text("told", why || detail.reason);
 });
 link.addEventListener("gone", ({ detail }) => OTHER || views.text("reason", detail.gone));
-link.addEventListener("down", async ({ detail }) => {
+link.addEventListener("down", ({ detail }) => {
   drive.release("let go: the connection is gone");
   heard = -Infinity;
   views.lost(detail.reason);
-  if (detail.reason || !detail.never) return;
-  // A browser does not say why it was not let in; this does.
-  const told = await got("api/whoami");
-  const why = told.error || told.full;
-  if (why && !link.open) views.lost(why);
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));
@@ -263,6 +260,10 @@ $("farther").addEventListener("click", () => map.zoom(1 / 1.4));
 $("recentre").addEventListener("click", () => map.recentre());
 $("erase").addEventListener("click", () => map.erase());
 $("limit").addEventListener("input", limited);
+// A finger or mouse that has set it leaves the arrows to the stick; who came here by Tab has them.
+for (const name of ["pointerup", "click", "change"])
+  $("limit").addEventListener(name, ({ target }) => target.matches(":focus-visible") || target.blur());
+$("again").addEventListener("click", () => location.reload());
 
 permit("");
 limited();
@@ -274,5 +275,7 @@ for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["w
 setInterval(looked, 100);
 // A recording grows, and a new one begins, while they are looked at.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
-await invited();
+// A link that is opened where this page is already changes no more than what is behind the #.
+addEventListener("hashchange", () => location.reload());
+uninvited = await invited(views.lost);
 link.start();

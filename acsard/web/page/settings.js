@@ -1,6 +1,7 @@
 // What may be set while the robot runs: a row for each, its range beside it.
 
 import { made } from "./views.js";
+import { number } from "./words.js";
 
 export class Settings {
   #form;
@@ -21,15 +22,16 @@ export class Settings {
 
   #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
+    const list = Array.isArray(row.value) ? "; commas between them and no space, which is STOP" : "";
     // A narrow screen breaks a name where its words end.
     const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
-    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}`));
+    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}${list}`));
     label.htmlFor = id;
     const field = made(row.choices ? "select" : "input", "");
     for (const one of row.choices ?? []) field.append(new Option(one, one));
     field.id = id;
     if (!row.choices) field.inputMode = typeof row.value === "number" ? "decimal" : "text";
-    field.value = Array.isArray(row.value) ? row.value.join(", ") : row.value;
+    field.value = Array.isArray(row.value) ? row.value.join(",") : row.value;
     const set = made("button", "", "Set");
     set.setAttribute("aria-label", `Set ${row.key}`);
     const send = () => this.#call({ settings: { [row.key]: read(field.value, row.value) } });
@@ -41,11 +43,11 @@ export class Settings {
 
 /** What was typed, of the kind that stands there now; what it cannot be goes as it is, and is refused. */
 export function read(typed, before) {
-  if (Array.isArray(before)) return typed.split(",").map((one) => number(one));
-  return typeof before === "number" ? number(typed) : typed;
+  if (Array.isArray(before)) return typed.split(",").map(one);
+  return typeof before === "number" ? one(typed) : typed;
 }
 
-function number(typed) {
-  const value = Number(typed.trim().replace("−", "-"));
-  return typed.trim() === "" || Number.isNaN(value) ? typed : value;
+function one(typed) {
+  const value = number(typed);
+  return Number.isNaN(value) ? typed : value;
 }

@@ -5,6 +5,12 @@ export function signed(value, decimals) {
   return Number(text) === 0 ? (0).toFixed(decimals) : text.replace("-", "−");
 }
 
+/** A number as people type it, "−1,5" too; NaN for none. */
+export function number(typed) {
+  const plain = typed.trim().replace("−", "-").replace(",", ".");
+  return plain === "" ? NaN : Number(plain);
+}
+
 /** A stamp {sec, nanosec} as the clock on the wall. */
 export function clock(stamp) {
   return new Date(stamp.sec * 1000 + stamp.nanosec / 1e6).toLocaleTimeString();

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
+from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.messages.schema import Figure, RobotState, Spread, Time
 from acsard.web.metrics import text
-
-LINE = re.compile(r"([a-z_]+)\{(.*)\} (\S+)\Z")
-LABEL = re.compile(r'([a-z_]+)="((?:[^"\\\n]|\\["\\n])*)"(?:,|\Z)')
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
@@ -20,26 +17,16 @@ STATE = RobotState(
 
 
 def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    """Samples by name and labels; fails for what is not the format."""
+    """Samples by name and labels, as Prometheus' own client reads them; each has a type, and no two
+    are the same."""
     found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
-    kinds: dict[str, str] = {}
-    for line in told.removesuffix("\n").split("\n"):
-        if line.startswith("# TYPE "):
-            _, _, name, kind = line.split(" ")
-            assert name not in kinds
-            assert kind in ("gauge", "counter")
-            kinds[name] = kind
-            continue
-        if line.startswith("# HELP "):
-            continue
-        match = LINE.match(line)
-        assert match, line
-        assert match[1] in kinds, line
-        assert (kinds[match[1]] == "counter") == match[1].endswith("_total")
-        labels = frozenset(LABEL.findall(match[2]))
-        assert LABEL.sub("", match[2]) == "", line
-        assert (match[1], labels) not in found
-        found[match[1], labels] = float(match[3])
+    for family in text_string_to_metric_families(told):
+        assert family.type in ("gauge", "counter"), family
+        for one in family.samples:
+            assert (family.type == "counter") == one.name.endswith("_total")
+            key = one.name, frozenset(one.labels.items())
+            assert key not in found
+            found[key] = float(one.value)
     return found
 
 
@@ -66,4 +53,5 @@ def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
 
 def test_words_of_a_stranger_stay_within_their_label() -> None:
     got = parsed(text("acsar", None, False, 0, {'a"b\\c\nd': 1}, {}))
-    assert len([name for name, _ in got if name == "acsard_page_total"]) == 1
+    whats = [dict(labels)["what"] for name, labels in got if name == "acsard_page_total"]
+    assert whats == ['a"b\\c\nd']

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Hashable
+from pathlib import Path
 from typing import Any
 
+import pytest
 from jsonschema import Draft202012Validator
+from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from acsard.messages.topics import SERVICES, TOPICS
-from acsard.web.openapi import PLAIN, asked, document
+from acsard.web.frames import KINDS, FrameError, decode
+from acsard.web.openapi import PLAIN, TO_ROBOT, asked, document
 
 WHOLE = document("1.2.3")
 
 
 def references(node: Any) -> list[str]:
-    """Those outside the schemas, which are documents of their own."""
+    """All there are."""
     if isinstance(node, dict):
         own = [node["$ref"]] if "$ref" in node else []
         return own + [one for value in node.values() for one in references(value)]
@@ -32,17 +39,48 @@ def test_every_key_to_ask_for_and_every_service_is_described() -> None:
 
 
 def test_every_reference_leads_to_a_schema() -> None:
-    told = references(WHOLE["paths"])
-    assert len(told) > 10
+    told = references(WHOLE)
+    assert len(told) > 100
     for one in told:
         name = one.removeprefix("#/components/schemas/")
         assert name in WHOLE["components"]["schemas"], one
 
 
-def test_every_schema_is_one_with_an_identity_of_its_own() -> None:
+def test_it_is_openapi_as_its_validator_reads_it() -> None:
+    whole: dict[Hashable, Any] = dict(WHOLE.items())
+    assert [one.message for one in OpenAPIV31SpecValidator(whole).iter_errors()] == []
+
+
+def test_every_schema_is_one() -> None:
     for schema in WHOLE["components"]["schemas"].values():
         Draft202012Validator.check_schema(schema)
-        assert schema["$id"].startswith("urn:acsard:")
+
+
+PAGE = Path(__file__).parents[3] / "deploy/web/README.md"
+
+TO_IT = PAGE.read_text().partition("| to the robot |")[2].partition("| from it |")[0]
+
+MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one]
+
+
+def test_the_page_has_a_message_of_each_kind() -> None:
+    assert {type(decode(one)) for one in MESSAGES} == set(KINDS.values())
+
+
+@pytest.mark.parametrize("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
+def test_what_the_socket_takes_is_what_its_schema_says(message: str) -> None:
+    meant = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
+    try:
+        decode(message)
+        taken = True
+    except FrameError:
+        taken = False
+    assert Draft202012Validator(meant).is_valid(json.loads(message)) == taken
+
+
+def test_the_socket_and_the_token_are_described() -> None:
+    assert WHOLE["paths"]["/ws"]["get"]["x-messages"]["$ref"].endswith(f"/{TO_ROBOT}")
+    assert set(WHOLE["paths"]["/token"]["post"]["responses"]) >= {"303", "401", "429"}
 
 
 def test_parameters_in_a_path_are_declared() -> None:

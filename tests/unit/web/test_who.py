@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.web.who import MAINTAINER, Asked, Refusal, Who, foreign, host_name, is_loopback, place
+from acsard.web.who import (
+    MAINTAINER,
+    Asked,
+    Refusal,
+    Who,
+    foreign,
+    host_name,
+    is_loopback,
+    place,
+    unmapped,
+)
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
 
@@ -110,3 +120,8 @@ def test_names_are_told_from_ports_and_loopback_from_names() -> None:
     assert [is_loopback(a) for a in ("127.1.2.3", "::1", "localhost", "10.0.0.1", "")] == [
         True, True, False, False, False,
     ]  # fmt: skip
+
+
+def test_an_ipv4_address_is_itself_by_a_socket_for_both() -> None:
+    told = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
+    assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]

@@ -1,0 +1,133 @@
+"""Who opens an invitation in a real browser: let in, whatever the network does, or told why not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from acsard.lan.authority import Authority
+from acsard.web.tokens import Vault
+from tests.system.browser import NAME, Page
+from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
+from tests.system.harness import Bus, Daemon, until
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("pages"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+]
+
+NEXT_MS = 1200
+"""After which the page would have knocked again, twice."""
+
+
+class Stranger:
+    """A phone, and the page of a robot that does not know it."""
+
+    def __init__(self, server: Page, browser: Browser) -> None:
+        self.server, self.browser = server, browser
+
+    def opens(self, token: str) -> None:
+        """The link of an invitation."""
+        self.browser.open(f"{self.server.away}/#token={token}")
+
+    def shows(self, name: str, words: str) -> None:
+        until(lambda: words in self.browser.text(name), 15.0, f"{name} says {words!r}")
+
+    @property
+    def tries(self) -> float:
+        """What was refused for want of a token that counts."""
+        counted = self.server.refused()
+        return sum(counted.get(one, 0) for one in ("no_token", "bad_token", "too_fast"))
+
+    def knocks_no_more(self, since: float, times: int) -> None:
+        """Once it was refused so often."""
+        until(lambda: self.tries >= since + times, 15.0, "it is refused")
+        before = self.tries
+        self.browser.js(f"new Promise(done => setTimeout(done, {NEXT_MS}))")
+        assert self.tries == before
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    where = tmp_path_factory.mktemp("invited")
+    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, where) as server:
+            yield server
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
+    with browsing(options=there) as browser:
+        browser.size(*PHONE)
+        browser.ask("Network.enable")
+        yield browser
+
+
+@pytest.fixture
+def stranger(server: Page, browser: Browser) -> Stranger:
+    browser.open("about:blank")
+    browser.ask("Network.clearBrowserCookies")
+    return Stranger(server, browser)
+
+
+@contextmanager
+def silent(browser: Browser, path: str) -> Iterator[None]:
+    """What the page asks there gets no answer."""
+    browser.ask("Network.setBlockedURLs", urls=[f"*/{path}"])
+    yield
+    browser.ask("Network.setBlockedURLs", urls=[])
+
+
+def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None:
+    browser = stranger.browser
+    token = stranger.server.invite("operator", "flaky")
+    with silent(browser, "token"):
+        stranger.opens(token)
+        stranger.shows("reason", "your invitation has no answer yet")
+        assert token in browser.js("location.hash")  # a reload shows it again
+    stranger.shows("role", "operator")
+    stranger.shows("mode", "READY")
+    assert browser.js("location.hash") == ""
+
+
+def test_an_invitation_that_is_not_valid_is_told_and_nobody_knocks_on(stranger: Stranger) -> None:
+    before = stranger.tries
+    stranger.opens("x" * 43)
+    stranger.knocks_no_more(before, 3)  # the invitation, the socket, and why
+    assert "this invitation is not valid" in stranger.browser.text("reason")
+    assert stranger.browser.js("location.hash") == ""
+
+
+def test_a_token_that_has_ended_is_told_as_that_and_a_new_link_in_its_tab_lets_in(
+    stranger: Stranger,
+) -> None:
+    stranger.opens(stranger.server.invite("viewer", "lent"))
+    stranger.shows("role", "viewer")
+    Vault(stranger.server.state / "acsard-web").revoke("lent")
+    before = stranger.tries
+    stranger.knocks_no_more(before, 2)  # the socket, and why
+    assert "this token has ended" in stranger.browser.text("reason")
+    token = stranger.server.invite("operator", "anew")
+    stranger.browser.js(f"location.hash = 'token={token}'")
+    stranger.shows("role", "operator")
+
+
+def test_who_comes_without_a_token_is_told_once_and_a_press_asks_again(stranger: Stranger) -> None:
+    browser = stranger.browser
+    before = stranger.tries
+    browser.open(stranger.server.away)
+    stranger.knocks_no_more(before, 2)
+    assert "who are you?" in browser.text("reason")
+    # Invited in another tab meanwhile.
+    token = stranger.server.invite("viewer", "tab")
+    posted = "fetch('token', {method: 'POST', body: new URLSearchParams({token: 'TOKEN'})})"
+    browser.js(posted.replace("TOKEN", token) + ".then(told => told.ok)")
+    browser.tap("again")
+    stranger.shows("role", "viewer")
+    assert browser.too_small() == []

@@ -1,0 +1,110 @@
+"""Where the page listens is where an invitation leads to, with a certificate or not at all."""
+
+from __future__ import annotations
+
+import argparse
+import socket
+from pathlib import Path
+
+import pytest
+
+from acsard.cli import web
+from acsard.host.addresses import own_addresses
+from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.lan.authority import Authority
+from acsard.web.listen import Listen, bound, invitations, listens, own_name, require_certificate
+
+OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
+
+
+@pytest.fixture
+def tls(tmp_path: Path) -> str:
+    """A certificate for all addresses of this machine, and for some that it has not."""
+    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", OWN, 1)
+    return str(tmp_path / "tls")
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def reached(port: int, host: str) -> bool:
+    try:
+        socket.create_connection((host, port), 5.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_an_address_is_read_and_beyond_this_machine_only_https() -> None:
+    assert listens("http://127.0.0.1:8080") == Listen(False, "127.0.0.1", 8080)
+    assert listens("https://[::]:8443/") == Listen(True, "::", 8443)
+    assert listens("https://[::]:8443").url == f"https://{own_name()}:8443/"
+    for wrong in ("127.0.0.1:8080", "http://:80", "http://127.0.0.1:0", "ftp://a:1", "https://a:x"):
+        with pytest.raises(UsageError, match="is no address"):
+            listens(wrong)
+    with pytest.raises(UsageError, match="only https"):
+        listens("http://0.0.0.0:8080")
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_an_invitation_has_the_own_certified_addresses_that_are_listened_at(
+    host: str, tls: str
+) -> None:
+    told = invitations([Listen(True, host, 8443), Listen(False, "127.0.0.1", 8080)], tls)
+    older = [at for at in own_addresses() if ":" not in at]
+    newer = [f"[{at}]" for at in own_addresses() if ":" in at and host == "::"]
+    assert told == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
+
+
+@pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
+def test_what_is_listened_at_everywhere_is_reached_by_what_is_invited_to(
+    host: str, by: set[str]
+) -> None:
+    [(one, opened)] = bound([Listen(True, host, free_port())], next_port=False)
+    with opened:
+        assert {at for at in ("127.0.0.1", "::1") if reached(one.port, at)} == by
+
+
+def test_both_everywheres_share_a_port() -> None:
+    port = free_port()
+    for one, opened in bound([Listen(True, at, port) for at in ("0.0.0.0", "::")], next_port=False):
+        with opened:
+            assert reached(one.port, "::1" if one.host == "::" else "127.0.0.1")
+
+
+def test_a_port_that_is_taken_is_told_or_passed_over() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        wished = Listen(False, "127.0.0.1", taken.getsockname()[1])
+        with pytest.raises(InUseError, match="choose another"):
+            bound([wished], next_port=False)
+        [(one, opened)] = bound([wished], next_port=True)
+        with opened:
+            assert one.port > wished.port
+
+
+def test_https_without_a_certificate_is_told_and_http_needs_none(tmp_path: Path) -> None:
+    away, here = listens("https://0.0.0.0:8443"), listens("http://127.0.0.1:8080")
+    require_certificate([here], "")
+    with pytest.raises(CertificateError, match="lan init"):
+        require_certificate([here, away], "")
+    with pytest.raises(CertificateError, match="lan init"):
+        require_certificate([away], str(tmp_path))
+
+
+@pytest.mark.parametrize("tls", [(), ("--tls", "nowhere")])
+def test_nobody_is_invited_to_where_the_server_could_not_start(
+    tmp_path: Path, tls: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    parser = argparse.ArgumentParser()
+    web.add(parser.add_subparsers())
+    words = ["web", *tls, "--address", "https://0.0.0.0:8443", "--invite", "viewer"]
+    with pytest.raises(CertificateError, match="lan init"):
+        web.main(parser.parse_args(words))
+    assert list(tmp_path.iterdir()) == []
