@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import ROOT, until
-from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError
+from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError, unavailable
 
 pytestmark = pytest.mark.systemd
 
@@ -29,7 +29,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
             container.install()
             yield container
     except UnavailableError as why:
-        pytest.skip(f"cannot boot a systemd: {why}")
+        unavailable(why)
 
 
 @pytest.fixture
