@@ -109,7 +109,7 @@ HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
 LOG = "tests/unit/cli/test_log.py"
-SERVICE = "tests/systemd/test_service.py"
+SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
@@ -118,7 +118,10 @@ GUIDED = "tests/system/test_calibrate.py"
 
 NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
 TWO_MACHINES = Shown("needs a second machine")
-BY_ROOT = Shown("makes places for a user of the system that only zenohd's package has")
+PLACES = Elsewhere(
+    "tests/systemd/test_fleet.py",
+    "test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own",
+)
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
@@ -158,6 +161,10 @@ TYPED = Elsewhere(
 _AWAY = "--tls tls --address https://0.0.0.0:8443"
 INVITED = Elsewhere(WEB, "test_an_invitation_is_a_link_and_a_code_and_lets_in")
 COOKIE = Elsewhere(WEB, "test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked")
+
+BY_THE_SERVICE = Elsewhere(
+    OPEN, "test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revoked"
+)
 
 _BRIDGE_FILE = "deploy/ros2/zenoh-bridge-ros2dds.json5"
 _LAUNCH_FILE = "deploy/ros2/acsar.launch.py"
@@ -292,6 +299,16 @@ COMMANDS: dict[str, How] = {
     ),
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
+    "sudo /opt/acsard/venv/bin/acsard lan init": BY_THE_SERVICE,
+    "sudo install -D -m 0644 -t /etc/systemd/system/acsard-web.service.d "
+    "deploy/systemd/lan.conf": BY_THE_SERVICE,
+    'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
+    "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
+    "--invite operator --name phone": BY_THE_SERVICE,
+    "sudo /opt/acsard/venv/bin/acsard web --revoke phone": BY_THE_SERVICE,
+    'sudo sh -c "/opt/acsard/venv/bin/acsard lan renew && systemctl restart acsard"': Elsewhere(
+        OPEN, "test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count"
+    ),
     # deploy/ros2
     "source /opt/ros/jazzy/setup.bash": NO_ROS,
     "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp": Run(),
@@ -391,9 +408,9 @@ COMMANDS: dict[str, How] = {
     "acsard lan add robot1 --directory fleet": Run("robot1"),
     "acsard lan add robot2 --directory fleet": Run("robot2"),
     "acsard lan add laptop-anna --role operator --directory fleet": Run("operators = "),
-    "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": BY_ROOT,
-    "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": BY_ROOT,
-    "sudo install -m 0644 router.json5 /etc/zenohd/": BY_ROOT,
+    "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": PLACES,
+    "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
+    "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
     "acsard router /etc/zenohd/router.json5": Elsewhere(
         ROUTER, "test_it_goes_whole", "with the file's addresses and certificates changed"
     ),

@@ -70,9 +70,10 @@ def main(args: argparse.Namespace) -> int:
             Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
     given: Overrides = {"record": {"directory": args.record}} if args.record else {}
-    config = recorded(load(args.config, given)[1])
+    where, loaded = load(args.config, given)
+    config = recorded(loaded)
     if args.invite:
-        return _invite(args, config)
+        return _invite(args, config, where)
     if args.tokens:
         return _list()
     if args.revoke:
@@ -120,8 +121,8 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
     return tuple(listens(text) for text in args.address or config.web.address)
 
 
-def _invite(args: argparse.Namespace, config: Config) -> int:
-    """A new token, shown once."""
+def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
+    """A new token, shown once; `where` the configuration is."""
     import segno
 
     from acsard.web.listen import invitations, require_certificate
@@ -132,8 +133,9 @@ def _invite(args: argparse.Namespace, config: Config) -> int:
     urls = invitations(listen, tls)
     if not urls:
         raise UsageError(
-            "nobody could come with it: web.address has no https://; add "
-            '"https://0.0.0.0:8443" there (or --address), and `acsard lan init` for a certificate'
+            f"nobody could come with it: web.address in {where} has no https://; add "
+            '"https://0.0.0.0:8443" there, or name another file by --config (or --address); and '
+            "`acsard lan init` makes a certificate"
         )
     vault = Vault(place())
     text, token = vault.invite(args.invite, args.name or args.invite, args.days)

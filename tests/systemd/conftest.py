@@ -17,6 +17,7 @@ from tests.systemd.container import (
     UnavailableError,
     build,
     needs,
+    unavailable,
 )
 
 
@@ -25,13 +26,13 @@ def rootfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A small Debian: kept where $ACSARD_TEST_ROOTFS says, else made and removed again."""
     missing = needs()
     if missing:
-        pytest.skip(f"cannot boot a systemd: {missing}")
+        unavailable(missing)
     kept = os.environ.get("ACSARD_TEST_ROOTFS")
     where = Path(kept) if kept else tmp_path_factory.mktemp("debian") / "rootfs"
     try:
         yield build(where)
     except UnavailableError as why:
-        pytest.skip(f"cannot make a root file system: {why}")
+        unavailable(f"cannot make a root file system: {why}")
     finally:
         if not kept:
             shutil.rmtree(where, ignore_errors=True)
@@ -46,7 +47,7 @@ def booted(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
             container.install()
             yield container
     except UnavailableError as why:
-        pytest.skip(f"cannot boot a systemd: {why}")
+        unavailable(why)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -15,18 +16,26 @@ import sys
 import sysconfig
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
+
+import pytest
 
 from tests.system.harness import ROOT, Heard, Program, until
 
+OURS = sys.version_info[:2]
+
 SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
-"""The Debian whose Python is ours, so that our installed packages run in there."""
+"""The Debian whose Python is ours, so that our installed packages run in there. With any other
+Python it is the Debian that we run on, and ours is lent to it."""
 
 PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
 
 UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
 
 HOME = "/opt/acsard"
+
+LENT = f"{HOME}/python"
+"""Where our own Python is in there, if Debian's is another."""
 
 PORT = "/dev/acsar"
 
@@ -43,6 +52,25 @@ class UnavailableError(Exception):
     """This machine cannot do it; why."""
 
 
+def unavailable(why: object) -> NoReturn:
+    """The test is skipped; where $ACSARD_TEST_SYSTEMD is "must", as in CI, it fails."""
+    text = f"cannot boot a systemd: {why}"
+    if os.environ.get("ACSARD_TEST_SYSTEMD") == "must":
+        pytest.fail(text, pytrace=False)
+    pytest.skip(text)
+
+
+def suite() -> str:
+    """The Debian to boot; "" where none has our Python nor libraries for it."""
+    if OURS in SUITES:
+        return SUITES[OURS]
+    try:
+        here = platform.freedesktop_os_release()
+    except OSError:
+        return ""
+    return here.get("VERSION_CODENAME", "") if here["ID"] == "debian" else ""
+
+
 def needs() -> str:
     """What is missing to boot a systemd here; "" when nothing is."""
     if os.geteuid() != 0:
@@ -50,8 +78,8 @@ def needs() -> str:
     missing = [tool for tool in ("mmdebstrap", "systemd-nspawn") if shutil.which(tool) is None]
     if missing:
         return f"no {' and no '.join(missing)} (Debian: mmdebstrap, systemd-container)"
-    if sys.version_info[:2] not in SUITES:
-        return f"no Debian has Python {sys.version_info[0]}.{sys.version_info[1]}"
+    if not suite():
+        return "no Debian has Python {}.{}, and this is none that could be lent ours".format(*OURS)
     return "" if _cgroups() else "no cgroup v2 hierarchy"
 
 
@@ -71,7 +99,7 @@ def build(where: Path) -> Path:
     words = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}"]
     words += ["--dpkgopt=force-unsafe-io"]
     words += [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in leave_out]
-    words += [SUITES[sys.version_info[:2]], str(where)]
+    words += [suite(), str(where)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         shutil.rmtree(where, ignore_errors=True)
@@ -113,6 +141,8 @@ class Container:
         ours = ("acsard", "deploy", "acsard.toml")
         words += [f"--bind-ro={ROOT / name}:{HOME}/src/{name}" for name in ours]
         words += [f"--bind-ro={sysconfig.get_path('purelib')}:{HOME}/packages"]
+        if OURS not in SUITES:
+            words += [f"--bind-ro={sys.base_prefix}:{LENT}"]
         settings = {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
         settings |= {"SYSTEMD_NSPAWN_API_VFS_WRITABLE": "yes"}
         with self._log.open("wb") as log:
@@ -165,6 +195,12 @@ class Container:
         done = subprocess.run(self.inside(*words), capture_output=True, text=True, timeout=60)
         return Ran(done.returncode, done.stdout, done.stderr)
 
+    def types(self, command: str, where: str = f"{HOME}/src") -> Ran:
+        """Run a line of a page as it stands there, in the clone or elsewhere."""
+        ran = self.run("sh", "-c", f"cd {where} && {command}")
+        assert ran.code == 0, f"{command}\n{ran.out}\n{ran.err}"
+        return ran
+
     def path(self, name: str) -> Path:
         """A file of the container as the host finds it."""
         return Path(f"/proc/{self.leader}/root{name}")
@@ -180,17 +216,21 @@ class Container:
 
     def install(self) -> None:
         """What an administrator puts in place; the packages are ours, by a path file."""
-        version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+        version = "python{}.{}".format(*OURS)
         packages = f"{HOME}/venv/lib/{version}/site-packages"
         python = f"{HOME}/venv/bin/python"
-        self.write(f"{HOME}/venv/pyvenv.cfg", "home = /usr/bin\n")
+        home = "/usr/bin" if OURS in SUITES else f"{LENT}/bin"
+        self.write(f"{HOME}/venv/pyvenv.cfg", f"home = {home}\n")
         self.write(f"{packages}/acsard.pth", f"{HOME}/src\n{HOME}/packages\n")
         self.write(
             f"{HOME}/venv/bin/acsard",
             f"#!{python}\nfrom acsard.cli import entry\n\nentry()\n",
             0o755,
         )
-        self.path(python).symlink_to("/usr/bin/python3")
+        self.path(python).symlink_to(f"{home}/{version}")
+        self.write("/etc/ld.so.conf.d/acsard.conf", f"{LENT}/lib\n")
+        self.run("ldconfig")
+        self.write("/usr/local/bin/sudo", '#!/bin/sh\nexec "$@"\n', 0o755)
         self.install_unit()
 
     def install_unit(self) -> None:

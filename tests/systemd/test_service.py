@@ -12,7 +12,7 @@ import pytest
 
 from acsard.lan.authority import Authority
 from tests.system.harness import ROOT, until
-from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError
+from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError, unavailable
 
 pytestmark = pytest.mark.systemd
 
@@ -30,7 +30,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
             container.install()
             yield container
     except UnavailableError as why:
-        pytest.skip(f"cannot boot a systemd: {why}")
+        unavailable(why)
 
 
 @pytest.fixture

@@ -1,0 +1,79 @@
+"""A phone on a cable to the container: another host, with an address of its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+import ssl
+import subprocess
+from contextlib import suppress
+
+import aiohttp
+
+from tests.system.hosts import inside, ip
+from tests.systemd.container import Container, UnavailableError
+
+ROBOT_AT, PHONE_AT = "192.168.77.1", "192.168.77.2"
+"""On a network that `lan.conf` names."""
+
+STRANGE, STRANGER_AT = "203.0.113.1", "203.0.113.2"
+"""The robot and the phone on one that it does not name."""
+
+CONNECT_S = 1.0
+"""What is dropped gets no answer."""
+
+
+class Phone:
+    """A network namespace; leaving takes it and the cable away."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+        self.name = f"acsard{os.getpid()}p"
+        self.authority = container.path("/etc/acsard/tls/ca.pem")
+        """What was brought to the phone."""
+
+    def __enter__(self) -> Phone:
+        try:
+            ip("netns", "add", self.name)
+            ip("-n", self.name, "link", "set", "lo", "up")
+            cable = ("link", "add", "cable", "type", "veth", "peer", "name", "cable")
+            ip("-n", self.name, *cable, "netns", str(self._container.leader))
+            for at in (PHONE_AT, STRANGER_AT):
+                ip("-n", self.name, "address", "add", f"{at}/24", "dev", "cable")
+            ip("-n", self.name, "link", "set", "cable", "up")
+        except subprocess.CalledProcessError as error:
+            self.__exit__()
+            raise UnavailableError(f"no network namespace: {error.stderr.decode()}") from error
+        for at in (ROBOT_AT, STRANGE):
+            self._container.types(f"ip address add {at}/24 dev cable")
+        self._container.types("ip link set cable up")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        ip("netns", "delete", self.name, check=False)
+
+    def reaches(self, port: int, at: str = ROBOT_AT) -> bool:
+        """Somebody on the phone gets a connection there."""
+        with inside(self.name), suppress(OSError):
+            socket.create_connection((at, port), CONNECT_S).close()
+            return True
+        return False
+
+    def shown(self, port: int) -> str:
+        """The certificate that it is shown, "" where nobody answers; its authority's or none."""
+        with inside(self.name), suppress(OSError):
+            return ssl.get_server_certificate(
+                (ROBOT_AT, port), ca_certs=str(self.authority), timeout=CONNECT_S
+            )
+        return ""
+
+    def browser(self, token: str = "") -> aiohttp.ClientSession:
+        """It knows the authority and keeps cookies; or a program with a token. Made and used
+        `inside`."""
+        trusted = ssl.create_default_context(cafile=str(self.authority))
+        told = {"Authorization": f"Bearer {token}"} if token else {}
+        return aiohttp.ClientSession(
+            connector=aiohttp.TCPConnector(ssl=trusted),
+            cookie_jar=aiohttp.CookieJar(unsafe=True),  # of an address, not a name
+            headers=told,
+        )

@@ -1,0 +1,41 @@
+"""What the page of fleets has root type for a router, in a real systemd."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.pages import blocks
+from tests.system.harness import until
+from tests.systemd.container import Container
+
+pytestmark = pytest.mark.systemd
+
+ACSARD = "/opt/acsard/venv/bin/acsard"
+
+CLONE, THERE = "/opt/acsard/src", "/tmp/router"
+
+BEFORE = (
+    f"cp {CLONE}/deploy/zenoh/router.json5 .",
+    f"{ACSARD} lan init --directory fleet",
+    f"{ACSARD} lan add router.local --directory fleet",
+    "cp fleet/clients/router.local/*.pem .",
+    "useradd --system zenohd",
+)
+"""What is brought to the server, and what zenohd's package makes."""
+
+
+def test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own(
+    container: Container,
+) -> None:
+    (places,) = (block for block in blocks("sh") if "install -d -o zenohd" in block.text)
+    container.run("mkdir", "-p", THERE)
+    for command in (*BEFORE, *places.commands()):
+        container.types(command, THERE)
+    key = "/etc/zenohd/tls/key.pem"
+    assert container.run("setpriv", "--reuid=65534", "--clear-groups", "cat", key).code != 0
+    router = (ACSARD, "router", "/etc/zenohd/router.json5")
+    container.run("systemd-run", "--unit=router", "--uid=zenohd", *router)
+    try:
+        until(lambda: "router_open" in container.messages("router"), 10.0, "it is open")
+    finally:
+        container.run("systemctl", "stop", "router")

@@ -1,0 +1,226 @@
+"""The page as an installed service, opened to phones by what its page says to type."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
+
+import aiohttp
+import pytest
+
+from tests.pages import Block, blocks
+from tests.system.browser import Hands, run
+from tests.system.harness import PATIENCE_S, until
+from tests.system.hosts import inside
+from tests.systemd.container import (
+    CONFIG,
+    PAGE,
+    UNIT,
+    Container,
+    UnavailableError,
+    unavailable,
+)
+from tests.systemd.phone import ROBOT_AT, STRANGE, Phone
+
+pytestmark = pytest.mark.systemd
+
+AWAY = f"https://{ROBOT_AT}:8443"
+"""What the phone opens."""
+
+LINK = re.compile(rf"{AWAY}/#token=(\S+)")
+
+SERVED_S = 20.0
+
+
+def of_the_page(language: str, words: str) -> Block:
+    """The one block of the page with these words."""
+    (found,) = (
+        block
+        for block in blocks(language)
+        if block.page == "deploy/web/README.md" and words in block.text
+    )
+    return found
+
+
+OPENING = of_the_page("console", "acsard-web.service.d").commands()
+"""The last of them invites."""
+
+REVOKING, RENEWING = of_the_page("console", "lan renew").commands()
+
+SETTINGS = 'mcu.port = "sim"\n' + of_the_page("toml", "https://0.0.0.0:8443").text
+
+
+ASK = """\
+import sys
+from urllib.request import urlopen
+
+print(urlopen(sys.argv[1]).read().decode())
+"""
+
+
+def clean(container: Container) -> None:
+    """No certificates and no tokens, as after the installation."""
+    container.reset()
+    container.run("systemctl", "clean", "--what=state", PAGE)
+    container.run("rm", "-rf", "/etc/acsard/tls")
+
+
+@pytest.fixture(scope="module")
+def robot(booted: Container) -> Iterator[Container]:
+    """The service on the simulator, its page for this computer alone."""
+    clean(booted)
+    booted.write(CONFIG, 'mcu.port = "sim"\n')
+    for unit in (UNIT, PAGE):
+        started = booted.start(unit)
+        assert started.code == 0, started.err + booted.messages(unit)
+    yield booted
+    clean(booted)
+
+
+@pytest.fixture(scope="module")
+def phone(robot: Container) -> Iterator[Phone]:
+    """Beside the robot, whose page has been opened for it."""
+    try:
+        with Phone(robot) as phone:
+            robot.write(CONFIG, SETTINGS)
+            for command in OPENING[:-1]:
+                robot.types(command)
+            is_served(robot, phone)
+            yield phone
+    except UnavailableError as why:
+        unavailable(why)
+
+
+def is_served(robot: Container, phone: Phone) -> None:
+    """The page answers the phone, and so does the daemon behind it."""
+    until(lambda: phone.shown(8443), SERVED_S, "the page is served")
+    until(lambda: '"mode"' in here(robot, "/api/state"), SERVED_S, "it hears the robot")
+
+
+def here(robot: Container, path: str) -> str:
+    """What somebody at the machine gets; "" for nothing."""
+    return robot.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}").out
+
+
+def invited(robot: Container, *more: str) -> str:
+    """The token of an invitation, as the page says to make one."""
+    told = robot.types(" ".join([OPENING[-1], *more])).out
+    found = LINK.search(told)
+    assert found, told
+    return found[1]
+
+
+def on(phone: Phone, story: Callable[[], Awaitable[None]]) -> None:
+    """What happens on the phone."""
+    with inside(phone.name):
+        run(story)
+
+
+async def let_in(browser: aiohttp.ClientSession, token: str) -> str:
+    """Post a token as the page does; the cookie it becomes."""
+    posted = browser.post(f"{AWAY}/token", data={"token": token}, headers={"Origin": AWAY})
+    async with posted as answer:
+        assert answer.status == 200, await answer.text()
+        assert "<html" in await answer.text()
+        (gone,) = answer.history
+        return gone.headers["Set-Cookie"]
+
+
+def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revoked(
+    robot: Container, phone: Phone
+) -> None:
+    token = invited(robot)
+
+    async def story() -> None:
+        async with phone.browser() as browser:
+            async with browser.get(AWAY) as answer:
+                assert (answer.status, "<html" in await answer.text()) == (200, True)
+            cookie = await let_in(browser, token)
+            assert {"HttpOnly", "Secure", "SameSite=Strict"} <= set(cookie.split("; "))
+            async with browser.ws_connect(f"{AWAY}/ws", origin=AWAY) as opened:
+                await drives_until_revoked(Hands(opened))
+            async with browser.get(f"{AWAY}/api/state") as answer:
+                assert answer.status == 401
+
+    async def drives_until_revoked(ours: Hands) -> None:
+        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        assert (hello["role"], hello["simulated"]) == ("operator", True)
+        assert hello["sender"].startswith("phone/")
+        await ours.say(subscribe="state", rate=50)
+        await ours.until_driving(0.2)
+        assert (await ours.call("stop"))["ok"]
+        await ours.state(lambda state: state["mode"] == "stopped" and state["linear"] == 0)
+        assert (await ours.call("clear"))["ok"]
+        await ours.until_driving(0.2)
+        holding = asyncio.create_task(ours.hold(0.2, 3 * PATIENCE_S))
+        await asyncio.to_thread(robot.types, REVOKING)
+        while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+            pass
+        assert ours.socket.close_code is not None
+        holding.cancel()
+        with suppress(asyncio.CancelledError, ConnectionError):
+            await holding
+
+    on(phone, story)
+    stands = until(
+        lambda: (state := json.loads(here(robot, "/api/state")))["linear"] == 0 and state,
+        SERVED_S,
+        "the robot stands",
+    )
+    assert stands["mode"] != "stopped", "nobody has stopped it: who drove is gone"
+
+
+def test_who_has_no_token_gets_the_empty_page_and_nothing_else(
+    robot: Container, phone: Phone
+) -> None:
+    async def story() -> None:
+        for token in ("", "x" * 43):
+            async with phone.browser(token) as stranger:
+                for path in ("/api/state", "/api/recordings", "/metrics", "/ws"):
+                    async with stranger.get(f"{AWAY}{path}") as answer:
+                        assert answer.status == 401, path
+                async with stranger.post(f"{AWAY}/api/srv/stop") as answer:
+                    assert answer.status == 401
+
+    on(phone, story)
+
+
+def test_the_unit_lets_in_the_networks_of_lan_conf_and_these_to_the_page_alone(
+    robot: Container, phone: Phone
+) -> None:
+    assert phone.reaches(8443)
+    assert not phone.reaches(8080), "without TLS for this computer alone"
+    assert not phone.reaches(7448), "the bus"
+    assert not phone.reaches(8443, STRANGE), "of a network that is not in it"
+    # That it was the unit, and no missing way:
+    robot.drop_in("wider.conf", "[Service]\nIPAddressAllow=203.0.113.0/24\n", PAGE)
+    robot.types("systemctl restart acsard-web")
+    is_served(robot, phone)
+    assert phone.reaches(8443, STRANGE)
+
+
+def test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count(
+    robot: Container, phone: Phone
+) -> None:
+    token = invited(robot, "--name guest")
+    before = phone.shown(8443)
+    robot.types(RENEWING)
+    is_served(robot, phone)
+    assert phone.shown(8443) not in ("", before)
+
+    async def story() -> None:
+        async with phone.browser(token) as guest, guest.get(f"{AWAY}/api/whoami") as answer:
+            assert (await answer.json())["name"] == "guest"
+
+    on(phone, story)
+
+
+def test_without_the_drop_in_it_stays_down_and_names_it(robot: Container, phone: Phone) -> None:
+    robot.types("rm -r /etc/systemd/system/acsard-web.service.d && systemctl daemon-reload")
+    robot.types("systemctl restart acsard-web")
+    until(lambda: robot.show("ActiveState", PAGE) == "failed", SERVED_S, "it gives up")
+    assert robot.show("ExecMainStatus", PAGE) == "77"
+    assert "lan.conf" in robot.messages(PAGE)
