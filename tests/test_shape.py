@@ -71,7 +71,7 @@ PURE_AMONG_SHELLS = (
 """Pure modules in rooms that do I/O."""
 
 PURE_IMPORTS = {
-    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
+    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "csv", "difflib", "enum",
     "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math", "msgspec", "numpy",
     "operator", "pickletools", "re", "rich.cells", "rich.console.Group", "rich.text", "statistics",
     "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash", "zlib",
