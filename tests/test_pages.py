@@ -203,6 +203,20 @@ def test_python_is_on_the_page_whose_examples_are_run() -> None:
     assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
+def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
+    """`tests/system/test_languages.py` runs them, with a key of their own."""
+    calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
+    sources = [
+        text_of(f"deploy/clients/{file}")
+        for file in ("rust/src/main.rs", "typescript/src/follow.ts")
+    ]
+    assert len(calls) == len(sources)
+    for call, source in zip(calls, sources, strict=True):
+        before, key, after = call.partition('"acsard/acsar/json/odom"')
+        assert key
+        assert re.search(rf"{re.escape(before)}[^()]+{re.escape(after)}", source), call
+
+
 # links and files
 
 
