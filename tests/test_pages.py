@@ -241,7 +241,7 @@ def test_every_link_leads_somewhere(page: str) -> None:
 def files_in(text: str) -> set[str]:
     """The words that are names of files or directories."""
     found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
-    kinds = (".py", ".js", ".toml", ".json5", ".c", ".md")
+    kinds = (".py", ".js", ".toml", ".json5", ".yaml", ".c", ".md")
     return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
 
 
@@ -274,6 +274,34 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
     listed = files_with("reset_odometry", "acsard", "deploy")
     assert {"values.py", "deploy/ros2/README.md"} <= listed
     assert listed <= recipe("## Add a verb", "A verb of the command line")
+
+
+LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
+"""Three published keys in one file."""
+
+READS_KEYS = {"checkup/budget_feed.py", "web/page/main.js"}
+"""Files that only follow some of them."""
+
+
+@each(
+    ("part", "pattern", "some", "beyond"),
+    [
+        ("key", LISTS_KEYS, "messages/report.py", READS_KEYS),
+        ("key", r"\bInterfaces\b", "incoming/queries.py", set()),
+        ("simulated fault", "stuck_encoder", "sim/named_faults.py", set()),
+        ("setting", "angular_jerk", "config/motion_rules.py", {"drive/limits.py"}),
+        ("ROS topic", "cmd_vel_teleop", "ros/transports.py", set()),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/definitions.py", set()),
+        ("firmware dialect", "trailing_comma", "mcu/codec.py", set()),
+    ],
+)
+def test_a_recipe_names_every_file_that_knows_one_like_it(
+    part: str, pattern: str, some: str, beyond: set[str]
+) -> None:
+    """`beyond` are files that use this one alone."""
+    knowing = files_with(pattern, "acsard", "deploy")
+    assert {some, *beyond} <= knowing
+    assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")
 
 
 def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:
