@@ -208,10 +208,12 @@ COMMANDS: dict[str, How] = {
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
     ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not soak'": PYTEST,
-    ".venv/bin/pytest -m 'languages and not soak'": PYTEST,
+    ".venv/bin/pytest -m languages": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
-    ".venv/bin/python -m tests.screens": Shown("prints what tests/unit/top and others assert"),
+    ".venv/bin/python -m tests.screens": Elsewhere(
+        "tests/test_screens.py", "test_each_screen_fits_its_width_and_says_the_whole_reason"
+    ),
     ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
         "installs into venvs of other Pythons, for who has them"
     ),

@@ -203,6 +203,20 @@ def test_python_is_on_the_page_whose_examples_are_run() -> None:
     assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
+def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
+    """`tests/system/test_languages.py` runs them, with a key of their own."""
+    calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
+    sources = [
+        text_of(f"deploy/clients/{file}")
+        for file in ("rust/src/main.rs", "typescript/src/follow.ts")
+    ]
+    assert len(calls) == len(sources)
+    for call, source in zip(calls, sources, strict=True):
+        before, key, after = call.partition('"acsard/acsar/json/odom"')
+        assert key
+        assert re.search(rf"{re.escape(before)}[^()]+{re.escape(after)}", source), call
+
+
 # links and files
 
 
@@ -227,7 +241,7 @@ def test_every_link_leads_somewhere(page: str) -> None:
 def files_in(text: str) -> set[str]:
     """The words that are names of files or directories."""
     found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
-    kinds = (".py", ".js", ".toml", ".json5", ".c", ".md")
+    kinds = (".py", ".js", ".toml", ".json5", ".yaml", ".c", ".md")
     return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
 
 
@@ -260,6 +274,34 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
     listed = files_with("reset_odometry", "acsard", "deploy")
     assert {"values.py", "deploy/ros2/README.md"} <= listed
     assert listed <= recipe("## Add a verb", "A verb of the command line")
+
+
+LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
+"""Three published keys in one file."""
+
+READS_KEYS = {"checkup/budget_feed.py", "web/page/main.js"}
+"""Files that only follow some of them."""
+
+
+@each(
+    ("part", "pattern", "some", "beyond"),
+    [
+        ("key", LISTS_KEYS, "messages/report.py", READS_KEYS),
+        ("key", r"\bInterfaces\b", "incoming/queries.py", set()),
+        ("simulated fault", "stuck_encoder", "sim/named_faults.py", set()),
+        ("setting", "angular_jerk", "config/motion_rules.py", {"drive/limits.py"}),
+        ("ROS topic", "cmd_vel_teleop", "ros/transports.py", set()),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/definitions.py", set()),
+        ("firmware dialect", "trailing_comma", "mcu/codec.py", set()),
+    ],
+)
+def test_a_recipe_names_every_file_that_knows_one_like_it(
+    part: str, pattern: str, some: str, beyond: set[str]
+) -> None:
+    """`beyond` are files that use this one alone."""
+    knowing = files_with(pattern, "acsard", "deploy")
+    assert {some, *beyond} <= knowing
+    assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")
 
 
 def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:

@@ -156,12 +156,16 @@ def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
 
 
 @pytest.mark.slow
-def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_prints_the_odometry(
+def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_odometry(
     examples: dict[str, Outcome],
 ) -> None:
     ended, state, late = examples["plain zenoh"]
     assert (ended.code, ended.err) == (0, "")
-    assert '"child_frame_id":"base_link"' in ended.out
+    seen = [json.loads(line) for line in ended.out.splitlines()]
+    assert len(seen) > 10
+    assert {odom["child_frame_id"] for odom in seen} == {"base_link"}
+    first, last = (one["pose"]["pose"]["position"]["x"] for one in (seen[0], seen[-1]))
+    assert first < 0.5 * state["x"] < last
     # Its own sleeps add up to some more than 2 s.
     assert state["x"] == pytest.approx(1.03, abs=0.05 + 0.5 * late), state["counters"]
 

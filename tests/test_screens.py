@@ -1,0 +1,45 @@
+"""`python -m tests.screens`: what a person sees at 40, 80 and 160 columns, as text."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from rich.cells import cell_len
+
+from tests.pages import ROOT
+from tests.screens import WAITING, WIDTHS
+
+LINE_BY_LINE = "echo state --short"
+"""Goes on below the last line, whatever the width: a terminal breaks it, a pipe does not."""
+
+
+def printed() -> dict[tuple[str, int], list[str]]:
+    """What it prints, by verb and width."""
+    words = [sys.executable, "-m", "tests.screens"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    screens: dict[tuple[str, int], list[str]] = {}
+    for line in done.stdout.splitlines():
+        if line.startswith("--- acsard "):
+            verb, _, width = line.removeprefix("--- acsard ").partition(", ")
+            shown = screens[verb, int(width.split()[0])] = []
+        else:
+            shown.append(line)
+    return screens
+
+
+@pytest.mark.slow
+def test_each_screen_fits_its_width_and_says_the_whole_reason() -> None:
+    screens = printed()
+    verbs = {verb for verb, _ in screens}
+    assert verbs == {"drive", "top", "fleet", LINE_BY_LINE}
+    assert set(screens) == {(verb, width) for verb in verbs for width in WIDTHS}
+    for (verb, width), lines in screens.items():
+        assert lines, verb
+        wide = [line for line in lines if cell_len(line) > width and verb != LINE_BY_LINE]
+        assert not wide, f"{verb} at {width} columns"
+    for verb, width in ((verb, width) for verb in ("drive", "top") for width in WIDTHS):
+        shown = " ".join(" ".join(screens[verb, width]).split())
+        assert WAITING.reason.partition(": ")[2] in shown, f"{verb} at {width} columns"
