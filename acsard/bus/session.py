@@ -8,9 +8,11 @@ from __future__ import annotations
 import json
 import os
 import re
+from typing import cast
 
 import zenoh
 
+from acsard.bus.access import Rule
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.bus.tls_trouble import trouble
 from acsard.config.settings import TLS, BusConfig
@@ -18,7 +20,12 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period."""
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period. Of
+stops too: one that is left out says the same as that of the millisecond before."""
+
+QUESTION_RATE_HZ = 1000.0
+"""Questions let in at the door per connection and key; without, one who may ask and never waits for
+an answer has all others wait behind him."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
@@ -67,6 +74,11 @@ def door_session(
     """The door's session: a router between the network, by TLS, and the daemon on this machine."""
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     settings |= _limits(robot_id, sources, limited, access)
+    # At the daemon all who come by the door are one link, of which none may lose another's.
+    settings["downsampling"] = [
+        _command_limits(robot_id, sources, limited),
+        _question_limits(access),
+    ]
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -197,13 +209,25 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
-    keys += limited
+    named = [*source_keys([*sources, "*"]), "imu", "stop"]
+    keys = [*(full_key(robot_id, key) for key in named), *limited]
+    return _at_most("commands", ["put", "delete"], keys, COMMAND_RATE_HZ)
+
+
+def _question_limits(access: dict[str, object]) -> dict[str, object]:
+    """One for each key that somebody may ask."""
+    rules = cast(list[Rule], access["rules"])
+    asked = [key for rule in rules if rule["messages"] == ["query"] for key in rule["key_exprs"]]
+    exact = [key for key in dict.fromkeys(asked) if "*" not in key]
+    return _at_most("questions", ["query"], exact, QUESTION_RATE_HZ)
+
+
+def _at_most(name: str, messages: list[str], keys: list[str], hz: float) -> dict[str, object]:
     return {
-        "id": "commands",
-        "messages": ["put", "delete"],
+        "id": name,
+        "messages": messages,
         "flows": ["ingress"],
-        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
+        "rules": [{"key_expr": key, "freq": hz} for key in keys],
     }
 
 

@@ -40,6 +40,10 @@ LONGEST_PROOF_NS = 2 * NS_PER_S
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
 """Who jumped takes so long: rather a backlog, let in by heaps, than a clock that was set."""
 
+ROSE_NS, AGAIN_NS = NS_PER_S // 50, JUMP_PROOF_NS // 2
+"""Who jumped and whose delays are all longer by so much, for so long, begins the proof again: no
+jitter, but a clock that was slewed, and goes evenly again."""
+
 GAP_NS = 2 * NS_PER_S
 """Who is silent for longer begins the proof again."""
 
@@ -75,6 +79,8 @@ class _Proof:
         self._heard_ns = -GAP_NS - 1  # too long ago: the first one begins it
         self._met_ns: int | None = None
         """When a delay was first met again: what falls passes each but once."""
+        self._prompt_ns = 0
+        """When one was last about as prompt."""
 
     def begin(self, delay: int, at_ns: int, share: float = STEADY, least_ns: int = 0) -> Sign:
         """From this command on, for no less than that."""
@@ -84,6 +90,7 @@ class _Proof:
 
     def _look_from(self, delay: int, at_ns: int) -> None:
         self._delay, self._since_ns, self._heard_ns, self._met_ns = delay, at_ns, at_ns, None
+        self._prompt_ns = at_ns
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Sign:
         """One more; what wavers begins it again.
@@ -98,6 +105,10 @@ class _Proof:
         if more < -allowed:
             self._look_from(delay, at_ns)
             return "steady"
+        if more <= ROSE_NS:
+            self._prompt_ns = at_ns
+        elif self._least_ns and at_ns - self._prompt_ns > AGAIN_NS:
+            return self.begin(delay, at_ns, self._share, self._least_ns)
         if more > allowed:
             return "steady"  # jitter, unless none is as prompt again
         if self._met_ns is None:

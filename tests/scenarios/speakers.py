@@ -17,6 +17,8 @@ from tests.scenarios.world import World
 Way = Literal["signed", "rmw", "header", "zenoh", "plain", "bridge"]
 STAMPED: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
 NUMBERED: tuple[Way, ...] = ("signed", "rmw")
+SHARED: tuple[Way, ...] = ("header", "plain", "bridge")
+"""All who send on a key this way look like one."""
 
 AHEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock by its own."""
@@ -36,6 +38,11 @@ class Speaker:
         """From now on its clock goes so fast."""
         self.ahead += (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
         self.rate, self._slewed_ns = rate, self.world.now_ns
+
+    @property
+    def gained(self) -> float:
+        """By how much it is ahead of where it was when its slewing began, s."""
+        return (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
 
     def message(self, linear: float) -> tuple[float, int, int]:
         """What it sends now: speed, stamp by its clock, number."""

@@ -239,10 +239,17 @@ pair = {
     "publish": lambda s, end: s.declare_publisher(deep(end)),
     "querier": lambda s, end: s.declare_querier(deep(end)),
 }
+form, _, number = form.partition("@")
 many = {
     "many": "acsard/**/x%d/**/odom",
     "many_chunks": "acsard/$*x%d$*",
     "many_exact": "acsard/acsar/x%d",
+}
+# What every role may, as fast as one process can.
+may = {
+    "may_stop": lambda: one.put("acsard/acsar/stop", b""),
+    "may_call": lambda: one.get("acsard/acsar/srv/stop", hold),
+    "may_ask": lambda: one.get("acsard/acsar/state", hold),
 }
 print("begun", flush=True)
 end = time.monotonic() + float(seconds)
@@ -255,6 +262,9 @@ elif form == "flood":
         one.put("acsard/acsar/cmd/app", b"x" * 60000)
         two.get("acsard/acsar/state", hold)
         one.put("acsard/acsar/stop/not", b"x")
+elif form in may:
+    while time.monotonic() < end:
+        may[form]()
 elif form == "sessions":
     kept = [one, two]
     while time.monotonic() < end:
@@ -263,7 +273,7 @@ elif form == "sessions":
         except zenoh.ZError:
             time.sleep(0.01)
 elif form in many:
-    kept = [one.declare_subscriber(many[form] % i, hold) for i in range(700)]
+    kept = [one.declare_subscriber(many[form] % i, hold) for i in range(int(number or 700))]
 else:
     if form.startswith("as_"):
         form = "publish"
@@ -273,4 +283,5 @@ time.sleep(max(0.0, end - time.monotonic()))
 os._exit(0)
 """
 """Somebody who is let in with some certificate: key expressions that take long to compare, many
-that take long to forget, or all the sessions there are; goes after so many seconds."""
+that take long to forget (`many@1500`: so many), what he may do without end, or all the sessions
+there are; goes after so many seconds."""
