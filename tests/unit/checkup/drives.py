@@ -29,8 +29,6 @@ class Told(Struct, frozen=True):
     metres: float
     off: float
     """m, of the place at the end."""
-    turned_off: float
-    """rad, of the heading at the end."""
 
 
 class Drive:
@@ -59,7 +57,7 @@ class Drive:
         kept: npt.NDArray[np.bool_] | None = None,
     ) -> Told:
         """Odometry adds up speeds x dt of lines with these stamps; `kept` are those that came."""
-        x, y, yaw = _path(np.diff(self.left), np.diff(self.right))
+        x, y, _ = _path(np.diff(self.left), np.diff(self.right))
         moved = left * dt, right * dt
         ex, ey, eyaw = _path(*moved)
         lines = []
@@ -71,10 +69,7 @@ class Drive:
                 Line(float(at[k]), (other, one, one, other), (b, a, a, b), float(eyaw[k]), 0.0)
             )
         metres = float(np.abs(np.diff(self.left) + np.diff(self.right)).sum()) * RADIUS / 2
-        return Told(
-            lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])),
-            float(yaw[-1] - eyaw[-1]),
-        )  # fmt: skip
+        return Told(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
 
     def speeds(self) -> tuple[Array, Array]:
         """rad/s, the mean of each period."""

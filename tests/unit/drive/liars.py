@@ -107,8 +107,10 @@ def stuck(speeds: Array, wheel: int, begun: int) -> Array:
 LIES: dict[str, Lie] = {"dead": dead, "reversed": reversed_, "stuck": stuck}
 
 
-def lines(speeds: Array) -> list[Feedback]:
-    return [Feedback(AT, WheelSpeeds(*row), PERIOD) for row in speeds.tolist()]
+def lines(speeds: Array, counts: int = 0) -> list[Feedback]:
+    """With the steps of encoders of so many counts, as the session tells them; 0 is none."""
+    step = math.tau / counts / PERIOD if counts else 0.0
+    return [Feedback(AT, WheelSpeeds(*row), PERIOD, steps=(step,) * 4) for row in speeds.tolist()]
 
 
 def wishes(told: Array) -> list[WheelSpeeds]:

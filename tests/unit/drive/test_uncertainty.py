@@ -134,8 +134,10 @@ def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
     lines += plain(drive[at:])
     ends = true_ends([drive], 500, DEFAULT, rng)
     values = nees(*fold(lines, DEFAULT), ends[:, 0])
-    print(f"50 gaps: NEES {values.mean():.2f}")
-    assert 2.5 < values.mean() < 3.4
+    inside = float((values < REGION).mean())
+    print(f"50 gaps: NEES {values.mean():.2f}, 95 % region holds {100 * inside:.1f} %")
+    assert 2.75 < values.mean() < 3.25
+    assert 0.92 < inside < 0.98
 
 
 # encoders
