@@ -15,6 +15,7 @@ import subprocess
 import sys
 import sysconfig
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -179,8 +180,9 @@ class Container:
             raise AssertionError(f"systemd-nspawn ended with {self._nspawn.returncode}")
         pids = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text()
         for pid in map(int, pids.split()):
-            if Path(f"/proc/{pid}/comm").read_text().strip() == "systemd":
-                return pid
+            with suppress(OSError):  # one that has ended meanwhile
+                if Path(f"/proc/{pid}/comm").read_text().strip() == "systemd":
+                    return pid
         return 0
 
     def _is_up(self) -> bool:
