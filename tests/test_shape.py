@@ -49,6 +49,7 @@ PURE_AMONG_SHELLS = (
     "record.plausible",
     "record.published",
     "record.replay",
+    "record.room",
     "record.steps",
     "record.story",
     "record.table",
