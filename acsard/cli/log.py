@@ -10,14 +10,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli import log_export, log_report
+from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
 from acsard.messages.text import json_line, printable
 
 if TYPE_CHECKING:
-    from acsard.record.file import Closing, Recording
+    from acsard.record.closing import Closing
+    from acsard.record.file import Recording
     from acsard.record.story import Told
 
 SERVICE = Path("/var/lib/acsard/record")
@@ -38,7 +39,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
     show = inner.add_parser("show", help="tell what happened, sentence by sentence")
     show.add_argument("file", nargs="?", metavar="FILE")
-    _span(show)
+    log_span.add(show)
     show.add_argument("--json", action="store_true", help="print one JSON object a line")
     show.set_defaults(main=show_one)
     replay = inner.add_parser(
@@ -58,19 +59,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     recover.add_argument("--force", action="store_true", help="write over what is there")
     recover.set_defaults(main=recover_one)
     export = log_export.add(inner)
-    _span(export)
+    log_span.add(export)
     export.set_defaults(main=export_one)
     report = log_report.add(inner)
-    _span(report)
+    log_span.add(report)
     report.set_defaults(main=report_one)
     for one in (show, replay, recover, export, report):
         _directory(one, argparse.SUPPRESS)
-
-
-def _span(parser: argparse.ArgumentParser) -> None:
-    when = "seconds after the beginning, or HH:MM:SS of its day"
-    parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
-    parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
 
 
 def _directory(parser: argparse.ArgumentParser, default: object) -> None:
@@ -85,7 +80,8 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
     from acsard.host.errors import RecordingError
-    from acsard.record.file import Recording, closing
+    from acsard.record.closing import closing
+    from acsard.record.file import Recording
 
     where, files = _files(args)
     if not files:
@@ -100,17 +96,19 @@ def list_all(args: argparse.Namespace) -> int:
 
 
 def _row(path: Path, last: Closing) -> str:
+    from acsard.record.closing import how_it_ends
+
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
     row = f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}"
-    return printable(row).rstrip()
+    return printable(row).rstrip() + _bracketed(how_it_ends(last.cut))
 
 
 def _row_of_all(recording: Recording) -> str:
     """Of one without an end: all of it has to be read."""
     import msgspec
 
-    from acsard.record.file import Closing
+    from acsard.record.closing import Closing
     from acsard.record.story import Told, summary
 
     events: list[Told] = []
@@ -124,32 +122,55 @@ def _row_of_all(recording: Recording) -> str:
     return row + _state(recording)
 
 
+def _bracketed(text: str) -> str:
+    return f"  [{text}]" if text else ""
+
+
 def _state(recording: Recording) -> str:
     """What is missing of it, once it has been read."""
-    if recording.damaged:
-        return f"  [{recording.damaged} damaged chunks are left out]"
-    return "" if recording.whole else "  [no end: cut, or being written]"
+    damaged = f"{recording.damaged} damaged chunks are left out" if recording.damaged else ""
+    return _bracketed("; ".join(filter(None, [damaged, _ending(recording)])))
+
+
+def _ending(recording: Recording) -> str:
+    """Why its end is not the daemon's."""
+    from acsard.record.closing import how_it_ends
+
+    return how_it_ends(recording.cut) if recording.ended else "no end: cut, or being written"
 
 
 def show_one(args: argparse.Namespace) -> int:
     """Tell its story."""
-    import msgspec
-
     from acsard.record.replayed import steps
-    from acsard.record.story import Story
+    from acsard.record.story import Story, Told
 
     recording = _recording(args)
-    story, began_s = Story(), recording.about.wall_ns / 1e9
-    begin, end = (_seconds(text, began_s) for text in (args.begin, args.end))
+    begin, end = log_span.span(args, recording)
+    story, last = Story(), recording.about.wall_ns / 1e9
+    inside = begin <= 0.0
     for step in steps(recording):
+        now = step.inputs.now
+        seconds, last = (now.mono_ns - recording.about.mono_ns) / 1e9, now.wall_ns / 1e9
+        inside = begin <= seconds <= end
         for one in story.step(step):
-            if (begin is None or one.seconds >= begin) and (end is None or one.seconds <= end):
-                text = msgspec.json.encode(one).decode() if args.json else ""
-                print(json_line(text) if args.json else printable(_sentence(one)))
+            if inside:
+                _tell(one, args.json)
+    ending = _ending(recording)
+    if ending and inside:
+        _tell(Told(last, "cut", ending.removeprefix("cut: "), "warning"), args.json)
     note = _state(recording)
     if note:
         print(f"{recording.path}:{note}", file=sys.stderr)
     return int(Exit.OK)
+
+
+def _tell(one: Told, as_json: bool) -> None:
+    import msgspec
+
+    if as_json:
+        print(json_line(msgspec.json.encode(one).decode()))
+    else:
+        print(printable(_sentence(one)))
 
 
 def replay_one(args: argparse.Namespace) -> int:
@@ -200,8 +221,7 @@ def recover_one(args: argparse.Namespace) -> int:
 def export_one(args: argparse.Namespace) -> int:
     """Write it for other programs."""
     recording = _recording(args)
-    began_s = recording.about.wall_ns / 1e9
-    trouble = log_export.export_one(recording, args, lambda text: _seconds(text, began_s))
+    trouble = log_export.export_one(recording, args)
     note = trouble or _state(recording).strip()
     if note:
         print(f"{recording.path}: {note}", file=sys.stderr)
@@ -212,13 +232,7 @@ def report_one(args: argparse.Namespace) -> int:
     """Draw it."""
     plotly = log_report.library()
     recording = _recording(args)
-    began_s = recording.about.wall_ns / 1e9
-    notes = log_report.report_one(
-        recording,
-        args,
-        plotly,
-        log_report.Words(lambda text: _seconds(text, began_s), _clock, _state),
-    )
+    notes = log_report.report_one(recording, args, plotly, log_report.Words(_clock, _state))
     for note in notes:
         print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
@@ -256,24 +270,6 @@ def _recording(args: argparse.Namespace) -> Recording:
         which = "recording" if name is None else f"recording {name}"
         raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard log` lists them")
     return Recording(files[-1])
-
-
-def _when(text: str) -> str:
-    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
-        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
-    return text
-
-
-def _seconds(text: str | None, began_s: float) -> float | None:
-    """Wall-clock time of what `_when` let through."""
-    if text is None:
-        return None
-    if ":" not in text:
-        return began_s + float(text)
-    hours, minutes, seconds = [*text.split(":"), "0"][:3]
-    day = time.localtime(began_s)
-    midnight = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, 0, 0, 0, 0, 0, -1))
-    return midnight + int(hours) * 3600 + int(minutes) * 60 + float(seconds)
 
 
 def _sentence(one: Told) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from acsard.cli import log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
@@ -44,23 +44,17 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     return parser
 
 
-def export_one(
-    recording: Recording,
-    args: argparse.Namespace,
-    seconds: Callable[[str | None], float | None],
-) -> str:
+def export_one(recording: Recording, args: argparse.Namespace) -> str:
     """Write it, tell what was written, and return why it ends early, "" if it does not."""
     from acsard.record.export import Span, export
 
     kind: Kind = args.kind
     new = Path(args.new) if args.new else _name(recording.path, kind)
-    begin, end = (
-        (None if s is None else int(s * 1e9)) for s in map(seconds, (args.begin, args.end))
-    )
+    span = Span(*log_span.span(args, recording))
     other = None if args.config is None else load(args.config)[1]
     try:
         with telling(recording) as tell:
-            done = export(recording, new, kind, other, Span(begin, end), tell, args.force)
+            done = export(recording, new, kind, other, span, tell, args.force)
     except OSError as error:
         denied = isinstance(error, PermissionError)
         raise ExitError(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 @contextmanager
 def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
     """Call it with the wall-clock time that was reached, ns; on leaving its line is gone."""
-    from acsard.record.file import closing
+    from acsard.record.closing import closing
 
     if not sys.stderr.isatty():
         yield lambda wall_ns: None

@@ -11,9 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from acsard.cli import log_span
 from acsard.cli.log_progress import telling
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
+from acsard.values import NS_PER_S
 
 if TYPE_CHECKING:
     from acsard.record.file import Recording
@@ -27,8 +29,6 @@ tells what to type.
 class Words(NamedTuple):
     """How the verbs of `acsard log` read and tell."""
 
-    seconds: Callable[[str | None], float | None]
-    """Wall-clock time of --from or --to."""
     clock: Callable[[float, bool], str]
     state: Callable[[Recording], str]
     """What is missing of a recording, once it has been read."""
@@ -84,7 +84,7 @@ def report_one(
 def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Words) -> list[str]:
     """For the page's server: to standard output, and how far it is, in percent, to the other."""
     from acsard.host.parent import end_with_parent
-    from acsard.record.file import closing
+    from acsard.record.closing import closing
 
     end_with_parent(signal.SIGKILL)
     last, began = closing(recording.path), recording.about.wall_ns / 1e9
@@ -117,7 +117,8 @@ def _drawn(
     from acsard.report.page import page
 
     about, looked = recording.about, Onlooker(recording)
-    course = Course(looked.config, words.seconds(args.begin), words.seconds(args.end))
+    began, (begin, end) = about.wall_ns / NS_PER_S, log_span.span(args, recording)
+    course = Course(looked.config, began + begin, began + end)
     for number, (step, outputs, robot) in enumerate(looked.steps()):
         if number % EVERY == 0:
             tell(step.inputs.now.wall_ns)

@@ -1,15 +1,15 @@
-"""A directory of recordings, bounded in bytes, days and files kept.
+"""A directory of recordings, bounded in bytes, days and by the room there is on the disk.
 
     000012-20261121T070027Z.mcap.part   being written, or cut by a crash
     000012-20261121T070027Z.mcap        finished
+    000012-20261121T070027Z.near.mcap   finished, less than a minute from what happened
     000012-20261121T070027Z.kept.mcap   finished, and something happened in it
 
-The number gives the order, whatever the clocks said. What is kept goes last.
+The number gives the order, whatever the clocks said. `room` says which of them go.
 """
 
 from __future__ import annotations
 
-import calendar
 import fcntl
 import math
 import os
@@ -18,9 +18,13 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from msgspec import Struct, field
+
 from acsard.config.settings import RECORD, RecordConfig
-from acsard.host.errors import RecordingError
-from acsard.record.file import MODE, About, Recording, Writing, rewrite
+from acsard.record.file import MODE, About, Writing
+from acsard.record.recovery import recover
+from acsard.record.room import AROUND_NS, Bounds, Disk, Ended, Kind, Steady, share, too_much
+from acsard.values import NS_PER_S, Instant
 
 DIRECTORY_MODE = 0o750
 
@@ -33,14 +37,14 @@ PRIVATE = Path("/var/lib/private")
 """Of services with a user of their own; only root gets in there."""
 
 KEPT = ".kept.mcap"
+NEAR = ".near.mcap"
 WHOLE = ".mcap"
 PART = ".mcap.part"
 
-KEPT_FILES = 50
-"""So many of those in which something happened stay, the newest."""
+ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
-FILES = 100
-"""A file may have this part of all bytes: what is kept is at most half."""
+TRIM_ROUNDS = 600
+"""Between two looks for what is too old: a file may grow for an hour."""
 
 S_PER_DAY = 86400
 
@@ -64,23 +68,45 @@ def _number(path: Path) -> int | None:
     return int(head) if head.isdecimal() and rest.endswith((WHOLE, PART)) else None
 
 
-def _began_s(path: Path) -> float:
-    """Seconds since 1970 by its name; one without a time in it never gets old."""
-    stamp = path.name.partition("-")[2].partition(".")[0]
-    try:
-        return calendar.timegm(time.strptime(stamp, STAMP))
-    except ValueError:
-        return math.inf
+def _kind(path: Path) -> Kind:
+    return "kept" if path.name.endswith(KEPT) else "near" if path.name.endswith(NEAR) else "plain"
+
+
+def _stem(path: Path) -> str:
+    return path.name.partition(".")[0]
+
+
+class Run(Struct):
+    """What a daemon knows of its recordings from its start on, whatever becomes of the disk."""
+
+    numbers: set[int] = field(default_factory=set)
+    """Of the files that ended in it."""
+    clock: Steady = field(default_factory=Steady)
 
 
 class Ring:
     """Makes room, begins and ends files. Everything may raise `OSError`."""
 
-    def __init__(self, settings: RecordConfig, crashed: bool = True) -> None:
-        """Take the directory, and make whole what was cut: by a crash, or by a disk of late."""
+    def __init__(
+        self,
+        settings: RecordConfig,
+        cut: str = "crash",
+        kind: Kind = "kept",
+        run: Run | None = None,
+        refused: bool = False,
+    ) -> None:
+        """Take the directory, and make whole what was cut, of which it makes this `kind`.
+
+        `cut` is a word of `CUTS`, `refused` says that the disk was full.
+        """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
-        self.file_bytes = self._bytes // FILES
+        self._run = run or Run()
+        self._rounds = self.file_bytes = 0
+        self.said: list[str] = []
+        """What did not become whole, and why."""
+        self.cut_ns: int | None = None
+        """When a crash has cut the newest, ns since 1970."""
         here = self._directory.resolve()
         self._open = os.environ.get(RECORD) == settings.directory and here.is_relative_to(PRIVATE)
         if not self._directory.is_dir():
@@ -94,14 +120,38 @@ class Ring:
             os.close(self._lock)
             raise OSError(error.errno, "another daemon records there") from None
         try:
-            for path in listed(self._directory):
-                if path.name.endswith(PART):
-                    _recover(path, KEPT if crashed else WHOLE)
+            for left in self._directory.glob(f".*{PART}.new"):
+                left.unlink()  # a copy that did not become whole
+            self.trim(None, refused)  # first: what is made whole needs room
+            self._recover(cut, kind)
         except OSError:
             self.close()
             raise
         if self._open:
             self._let_in()
+
+    def _recover(self, cut: str, kind: Kind) -> None:
+        for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
+            seen, disk = part.stat(), self._disk()
+            whole = part.with_name(_stem(part) + ENDINGS[kind])
+            try:
+                said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
+            except OSError as error:  # to record what comes is more than that
+                said = f"{part.name} cannot be made whole: {error.strerror}"
+            self.said += [said] if said else []
+            if cut != "crash":
+                self._run.numbers.add(_number(part) or 0)
+            elif whole.exists():
+                self.cut_ns = seen.st_mtime_ns
+                self._near(part, seen.st_mtime_ns)
+
+    def _near(self, part: Path, cut_ns: int) -> None:
+        """What ended less than a minute before it stays, too."""
+        for path in listed(self._directory):
+            before_ns = cut_ns - path.stat().st_mtime_ns
+            earlier = (_number(path) or 0) < (_number(part) or 0)
+            if earlier and before_ns < AROUND_NS:
+                self.keep(path)
 
     def _let_in(self) -> None:
         """Also to what a version has left that recorded for itself alone."""
@@ -125,40 +175,70 @@ class Ring:
         self._sync()
         return writing
 
-    def end(self, writing: Writing, keep: bool) -> Path:
+    def end(self, writing: Writing, kind: Kind) -> Path:
         """Finish a file; where it is now."""
         writing.finish()
-        stem = writing.path.name.removesuffix(PART)
-        path = writing.path.with_name(stem + (KEPT if keep else WHOLE))
+        path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
+        self._run.numbers.add(_number(path) or 0)
         self._sync()
         return path
 
     def keep(self, path: Path) -> None:
         """Something happened close to what is in this finished file."""
-        if path.exists() and not path.name.endswith(KEPT):
-            path.rename(path.with_name(path.name.removesuffix(WHOLE) + KEPT))
+        if path.exists() and path.name.endswith(WHOLE) and _kind(path) == "plain":
+            path.rename(path.with_name(_stem(path) + NEAR))
             self._sync()
 
-    def trim(self, wall_ns: int) -> None:
-        """Remove what is too much or too old; what is being written stays."""
-        ended = [path for path in listed(self._directory) if not path.name.endswith(PART)]
-        kept = [path for path in ended if path.name.endswith(KEPT)]
-        plain = [path for path in ended if not path.name.endswith(KEPT)]
-        sizes = {path: path.stat().st_size for path in ended}
-        oldest_s = wall_ns / 1e9 - self._days * S_PER_DAY
-        gone = {path for path in plain if _began_s(path) < oldest_s}
-        gone.update(kept[: max(0, len(kept) - KEPT_FILES)])
-        room = self._bytes - self.file_bytes - sum(sizes[p] for p in ended if p not in gone)
-        for path in plain + kept:
-            if room >= 0:
-                break
-            if path not in gone:
-                gone.add(path)
-                room += sizes[path]
-        for path in ended:
-            if path in gone:
-                path.unlink(missing_ok=True)
+    def tend(self, now: Instant) -> None:
+        """Once a second: where others want the room, or days have gone by, the oldest go."""
+        jumped_ns = self._run.clock.look(now)
+        if jumped_ns:
+            self._set(jumped_ns)
+        self._rounds += 1
+        if self._rounds % TRIM_ROUNDS == 0 or self._disk().low:
+            self.trim(now)
+
+    def _set(self, jumped_ns: int) -> None:
+        """The clock was set: what ended in this run is no older for that."""
+        for path in listed(self._directory):
+            if _number(path) in self._run.numbers:
+                seen = path.stat()
+                at_ns = max(0, seen.st_mtime_ns + jumped_ns)
+                os.utime(path, ns=(seen.st_atime_ns, at_ns))
+
+    def trim(self, now: Instant | None, refused: bool = False) -> None:
+        """Remove what is too much or too old; what is being written stays.
+
+        `now` is None where no clock was looked at.
+        """
+        ended, disk = self._ended(), self._disk()
+        believed = now is not None and self._run.clock.believed(now)
+        oldest_s = (
+            now.wall_ns / NS_PER_S - self._days * S_PER_DAY if now and believed else -math.inf
+        )
+        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, refused)
+        for name in gone:
+            with suppress(OSError):  # somebody else's: to record comes first
+                (self._directory / name).unlink()
+        own = sum(one.size for one in ended)
+        self.file_bytes = share(self._bytes, own, disk)
+
+    def _ended(self) -> list[Ended]:
+        found = []
+        for path in listed(self._directory):
+            if not path.name.endswith(PART):
+                seen, number = path.stat(), _number(path) or 0
+                here = number in self._run.numbers
+                size, at_s = seen.st_size, seen.st_mtime
+                found.append(Ended(path.name, number, _kind(path), size, at_s, here))
+        return found
+
+    def _disk(self) -> Disk:
+        told = os.statvfs(self._directory)
+        if not told.f_blocks:  # it does not say
+            return Disk(0, self._bytes)
+        return Disk(told.f_blocks * told.f_frsize, told.f_bavail * told.f_frsize)
 
     def _sync(self) -> None:
         """The names are on the disk too."""
@@ -167,18 +247,3 @@ class Ring:
             os.fsync(handle)
         finally:
             os.close(handle)
-
-
-def _recover(path: Path, ending: str) -> None:
-    """A finished file of what is whole of one that was cut; one without anything goes."""
-    whole = path.with_name(path.name.removesuffix(PART) + ending)
-    written = path.with_name(f".{path.name}.new")
-    written.unlink(missing_ok=True)
-    try:
-        count = rewrite(Recording(path), written)
-    except RecordingError:
-        count = 0
-    if count:
-        written.rename(whole)
-    written.unlink(missing_ok=True)
-    path.unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple, Protocol
 
@@ -21,7 +22,7 @@ from acsard.record.steps import Step
 from acsard.robot import Robot
 from acsard.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.ros.names import TYPE_HASHES
-from acsard.values import Outputs
+from acsard.values import NS_PER_S, Outputs
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
@@ -30,10 +31,10 @@ SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".ros
 
 
 class Span(NamedTuple):
-    """From when to when, wall-clock ns; None is the beginning or the end."""
+    """From when to when, s after the beginning, however the clock was set in between."""
 
-    begin_ns: int | None = None
-    end_ns: int | None = None
+    begin: float = -math.inf
+    end: float = math.inf
 
 
 WHOLE = Span()
@@ -180,13 +181,14 @@ def export(
 
 
 def _all(course: Course, sink: _Sink, span: Span, progress: Progress) -> None:
-    begin_ns, end_ns = span
+    began_ns = None
     for number, step in enumerate(course.steps()):
-        wall_ns = step.inputs.now.wall_ns
+        now = step.inputs.now
+        began_ns = now.mono_ns if began_ns is None else began_ns
         if number % EVERY == 0:
-            progress(wall_ns)
+            progress(now.wall_ns)
         outputs = lived(course.robot, step)
-        if (begin_ns is None or wall_ns >= begin_ns) and (end_ns is None or wall_ns <= end_ns):
+        if span.begin <= (now.mono_ns - began_ns) / NS_PER_S <= span.end:
             sink.step(step, outputs)
 
 

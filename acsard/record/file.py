@@ -11,22 +11,19 @@ from __future__ import annotations
 import errno
 import io
 import os
-import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import IndexType, Writer
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from acsard.host.errors import RecordingError
 from acsard.record import earlier
+from acsard.record.closing import DAMAGE, END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
 from acsard.record.story import NEWS, Told, summary
 from acsard.values import NS_PER_S
@@ -51,16 +48,6 @@ Topic = Literal["steps", "events", "state"]
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
 """In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
 
-DAMAGE = (
-    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
-    ValueError, OverflowError, EOFError, MemoryError,
-)  # fmt: skip
-"""All that the library raises for bytes that are no MCAP."""
-
-
-Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""A time that calendars have."""
-
 
 class About(Struct, frozen=True):
     """Whose recording it is."""
@@ -77,17 +64,6 @@ class About(Struct, frozen=True):
     format: str = FORMAT
     started_ns: Ns = 0
     """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
-
-
-class Closing(Struct, frozen=True):
-    """What a finished file says of itself at its end, so that a list need not read all of it."""
-
-    wall_ns: Ns
-    """When it began."""
-    last_ns: Ns
-    """When its last message begins."""
-    said: str
-    """What happened, in a few words."""
 
 
 class Writing:
@@ -149,11 +125,10 @@ class Writing:
         if not os.fstat(self._file.fileno()).st_nlink:  # the disk takes it, and nobody will find it
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
-    def finish(self) -> None:
-        """Write the end of the file and close it."""
-        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news))
-        fields = msgspec.to_builtins(last)
-        self._writer.add_metadata("acsard end", {key: str(value) for key, value in fields.items()})
+    def finish(self, cut: str = "") -> None:
+        """Write the end of the file and close it; `cut` says why it comes late."""
+        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news), cut)
+        self._writer.add_metadata(END, fields(last))
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -177,20 +152,29 @@ class Recording:
             self._data = path.read_bytes()
         except OSError as error:
             raise RecordingError(f"cannot read {path}: {error.strerror}") from None
-        self.whole = False
+        self.ended = False
         """It was read to its end, and has one."""
         self.damaged = 0
         """Chunks that could not be read, in the midst of others."""
+        self.cut = ""
+        """A word of `CUTS` where somebody else than the daemon has finished it."""
         self.about = self._about()
 
+    @property
+    def whole(self) -> bool:
+        """It has an end, and nothing before it is damaged."""
+        return self.ended and not self.damaged
+
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Topic, wall-clock time in ns and bytes of each; sets `whole` and `damaged`."""
-        self.whole, self.damaged = False, 0
+        """Topic, wall-clock time in ns and bytes of each; sets `ended`, `damaged`, `cut`."""
+        self.ended, self.damaged, self.cut = False, 0, ""
         topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
         for record in self._records():
             if isinstance(record, Footer):
-                self.whole = not self.damaged
+                self.ended = True
                 return
+            if isinstance(record, Metadata) and record.name == END:
+                self.cut = record.metadata.get("cut", "")
             if not isinstance(record, Chunk):
                 continue
             try:
@@ -235,37 +219,32 @@ class Recording:
         return about
 
 
-def closing(path: Path) -> Closing | None:
-    """What the file says of itself at its end; None where it has none, or it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            for metadata in make_reader(stream).iter_metadata():
-                if metadata.name == "acsard end":
-                    return msgspec.convert(metadata.metadata, Closing, strict=False)
-    except (OSError, *DAMAGE):
-        pass  # who reads all of it will say what is wrong
-    return None
-
-
-def rewrite(recording: Recording, path: Path) -> int:
+def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """All that is whole of it as a new, finished file; the number of messages.
 
-    Raises `OSError`, and leaves nothing behind where it cannot be written.
+    `cut` says why, where it has no end. Raises `OSError`, and leaves nothing behind where it
+    cannot be written.
     """
     writing = Writing(path, recording.about)
     try:
         count = 0
         for topic, wall_ns, data in recording.messages():
             if topic == "events":
-                writing.event(msgspec.json.decode(data, type=Told))
+                writing.event(event_of(recording, data))
             else:
                 writing.add(topic, wall_ns, data)
             count += 1
-        writing.finish()
-    except (OSError, msgspec.MsgspecError) as error:
+        writing.finish(recording.cut or ("" if recording.ended else cut))
+    except (OSError, RecordingError):
         writing.close()
         path.unlink()
-        if isinstance(error, OSError):
-            raise
-        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None
+        raise
     return count
+
+
+def event_of(recording: Recording, data: bytes) -> Told:
+    """Raises `RecordingError` where it is none."""
+    try:
+        return msgspec.json.decode(data, type=Told)
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None

@@ -19,13 +19,15 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.record.batch import encode
-from acsard.record.directory import Ring
+from acsard.record.directory import Ring, Run
 from acsard.record.file import About, Writing
+from acsard.record.recovery import FULL
+from acsard.record.room import AROUND_NS, Kind
 from acsard.record.state import freeze
 from acsard.record.steps import Taken
 from acsard.record.story import told
 from acsard.robot import Robot
-from acsard.values import NS_PER_S, Event, Inputs, Outputs, Recording
+from acsard.values import NS_PER_S, Event, Inputs, Instant, Outputs, Recording
 
 MOST = 4096
 """Steps that wait for the thread: a disk may take 10 s, at 100 Hz, before any is lost."""
@@ -38,9 +40,6 @@ RETRY_ROUNDS = 5
 
 BATCH = 256
 """Steps in a message at most: as many as a second has, unless commands pour in."""
-
-AROUND_NS = 60 * NS_PER_S
-"""Before and after something that happened, what is kept."""
 
 LONGEST_NS = 3600 * NS_PER_S
 """What a file holds at most."""
@@ -162,11 +161,18 @@ class _Disk:
         """What the next file begins with; None when steps before it are missing."""
         self._recent: list[tuple[Path, int]] = []
         """What ended less than a minute ago, and when; nothing has happened close to it yet."""
-        self._number = self._began_ns = self._last_ns = 0
+        self._number = self._began_ns = 0
+        self._last = Instant(0, 0)
         self._happened_ns = -AROUND_NS
         self._reason: str | None = None
         """The last one written to this file."""
-        self._keep = self._told = False
+        self._kind: Kind = "plain"
+        """What the file is that is being written."""
+        self._told = self._refused = False
+        self._run: Run | None = None
+        """Since the directory was taken first: what is cut later, the disk has cut."""
+        self._cut_ns: int | None = None
+        """When a crash has cut what was before this run, wall clock; looked at once."""
         self._pause = 0
 
     def round(self, items: list[Taken | _Start], over: bool) -> None:
@@ -174,7 +180,7 @@ class _Disk:
         written = 0
         try:
             if self._pause == 0 or over:
-                ring = self._ring = self._ring or Ring(self._config.record, not self.trouble)
+                ring = self._ring = self._ring or self._take()
                 for start, steps in _runs(items):
                     self._write(ring, start, steps)
                     written += len(steps)
@@ -189,6 +195,20 @@ class _Disk:
             self._start = None
         if self._start is None and self._writing is None and self._pause == 0:
             self._ask()
+
+    def _take(self) -> Ring:
+        """The directory, and what is told of it."""
+        record = self._config.record
+        if self._run is None:
+            run = Run()
+            ring, self._run = Ring(record, run=run, refused=self._refused), run
+            self._cut_ns = ring.cut_ns
+        else:
+            ring = Ring(record, "disk", self._kind, self._run, self._refused)
+        self._refused = False
+        for text in ring.said:
+            self._say(Event("recording", text, "warning"))
+        return ring
 
     def _write(self, ring: Ring, start: _Start | None, steps: list[Taken]) -> None:
         if start is not None:
@@ -207,14 +227,14 @@ class _Disk:
             )
             self._reason = batch[-1].outputs.reason
             self._number += len(batch)
-            self._last_ns = batch[-1].inputs.now.mono_ns
+            self._last = batch[-1].inputs.now
             for _, outputs, _ in batch:
                 for event in outputs.events:
                     self._event(ring, self._writing, event, outputs)
 
     def _begin(self, ring: Ring, start: _Start, first: Taken) -> None:
         now = first.inputs.now
-        ring.trim(now.wall_ns)
+        ring.trim(now)
         about = About(
             robot=self._config.robot.id,
             version=__version__,
@@ -226,7 +246,10 @@ class _Disk:
         )
         self._writing, self._start = ring.begin(about), None
         self._began_ns, self._reason = now.mono_ns, None
-        self._keep = now.mono_ns - self._happened_ns < AROUND_NS
+        if self._cut_ns is not None:
+            since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
+            self._happened_ns = now.mono_ns - max(0, since_ns)
+        self._kind = "near" if now.mono_ns - self._happened_ns < AROUND_NS else "plain"
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)
 
@@ -234,7 +257,7 @@ class _Disk:
         now = outputs.now
         writing.event(told(event, now.wall_ns))
         if event.name in HAPPENED:
-            self._keep, self._happened_ns = True, now.mono_ns
+            self._kind, self._happened_ns = "kept", now.mono_ns
             for path, ended_ns in self._recent:
                 if now.mono_ns - ended_ns < AROUND_NS:
                     ring.keep(path)
@@ -247,19 +270,20 @@ class _Disk:
         if self._writing is None:
             return
         self._writing.flush()
+        ring.tend(self._last)
         if self.trouble or not self._told:
             self.trouble, self._told = "", True
             self._say(Event("recording", f"to {self.where}"))
-        long = self._last_ns - self._began_ns > LONGEST_NS
+        long = self._last.mono_ns - self._began_ns > LONGEST_NS
         if long or self._writing.size > ring.file_bytes:
             self._ask()
 
     def _finish(self, ring: Ring) -> None:
         writing, self._writing = self._writing, None
         if writing is not None:
-            path, last_ns = ring.end(writing, self._keep), self._last_ns
+            path, last_ns = ring.end(writing, self._kind), self._last.mono_ns
             recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
-            self._recent = recent if self._keep else [*recent, (path, last_ns)]
+            self._recent = recent if self._kind != "plain" else [*recent, (path, last_ns)]
 
     def _fail(self, error: OSError) -> None:
         text = f"{self.where}: {error.strerror or error}"
@@ -269,6 +293,7 @@ class _Disk:
         for open_one in (self._writing, self._ring):
             if open_one is not None:
                 open_one.close()
+        self._refused = error.errno in FULL
         self._writing = self._ring = None
         self._pause = RETRY_ROUNDS
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
+from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import PART, STAMP, listed
-from acsard.record.file import closing
 from acsard.values import NS_PER_S
 
 
@@ -53,8 +53,9 @@ def _row(path: Path) -> Listed:
         return Listed(path.name, _begun(path), None, size, str(error))
     if last is None:
         return Listed(path.name, _begun(path), None, size, "")
+    events = "; ".join(filter(None, [last.said, how_it_ends(last.cut)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
-    return Listed(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, last.said)
+    return Listed(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
 
 
 def _begun(path: Path) -> float | None:

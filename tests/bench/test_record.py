@@ -25,6 +25,9 @@ ROUNDS, SPAN_S, SETTLES_S, REST_S = 10, 9.0, 1.0, 30.0
 MORE = 0.4
 """Points of a core that recording may take."""
 
+DRIVING, IDLE = 400e6, 60e6
+"""Bytes a day that it may write."""
+
 
 class Cost(NamedTuple):
     processor: float
@@ -87,6 +90,7 @@ def test_recording_costs_little_and_makes_no_period_late(tmp_path: Path) -> None
     # Within what two like it differ by, on this machine now.
     noise = max(one.p99 for one in off) - min(one.p99 for one in off)
     assert median(one.p99 for one in on) <= median(one.p99 for one in off) + noise
+    assert 0 < median(one.bytes_ for one in on) * 86_400 < DRIVING
 
 
 def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
@@ -98,4 +102,4 @@ def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
         time.sleep(REST_S)
         rate = (size(tmp_path) - written) / (time.monotonic() - began)
     print(f"\nat rest: {rate:.0f} bytes a second, {rate * 0.0864:.0f} MB a day")
-    assert rate * 86_400 < 60e6
+    assert rate * 86_400 < IDLE

@@ -11,7 +11,9 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from acsard.report.page import page
-from tests.unit.report.driven import followed
+from tests.system.chromium import DESKTOP, PHONE, browsing
+from tests.system.harness import until
+from tests.unit.report.driven import drive_of_two, followed
 from tests.unit.report.test_page import EVIL, clock, evil_steps, origin
 
 BROWSER = shutil.which("chromium")
@@ -53,3 +55,30 @@ def test_it_is_drawn_and_no_strangers_program_runs(tmp_path: Path) -> None:
     assert len(re.findall(r'<g class="trace bars"', drawn)) >= 3
     title, *_ = re.findall(r"<title>(.*?)</title>", drawn)  # the others are in the pictures
     assert title.startswith("&lt;script&gt;document.title")
+
+
+WIDER = """[...document.querySelectorAll('body *')]
+    .filter(one => one.checkVisibility() && !one.closest('svg'))
+    .map(one => [one.tagName + '.' + one.className, one.getBoundingClientRect()])
+    .filter(([, box]) => box.left < -0.5 || box.right > innerWidth + 0.5)
+    .map(([name, box]) => [name, box.left, box.right])"""
+
+DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
+
+
+def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -> None:
+    path = tmp_path / "new.html"
+    course, _ = drive_of_two()
+    long = origin(file=f"{'0' * 70}.mcap", robot="robot-" * 12)
+    path.write_text(page(course, long, get_plotlyjs(), clock), encoding="utf-8")
+    with browsing() as browser:
+        for width, height in (DESKTOP, PHONE):
+            browser.size(width, height, touch=width < 600)
+            browser.open(path.as_uri())
+            until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+            assert browser.js("innerWidth") == width
+            assert browser.js("document.documentElement.scrollWidth") <= width
+            assert browser.js(WIDER) == []
+            widths = "[...document.querySelectorAll('.main-svg')].map(b => b.clientWidth)"
+            assert 0.7 * width < max(browser.js(widths)) <= width
+            print(f"{width}: {browser.js('document.documentElement.scrollWidth')} px wide")

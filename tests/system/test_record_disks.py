@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -26,6 +26,8 @@ pytestmark = [
 ]
 
 SPAN_S = 5.0
+
+RECORDINGS = Path(__file__).parents[1] / "recordings"
 
 SLOW = """\
 #define _GNU_SOURCE
@@ -118,6 +120,55 @@ def test_a_disk_that_is_full_is_said_and_costs_only_records(tmp_path: Path) -> N
             daemon.process.terminate()
             assert daemon.ended(5.0) == 0
         lived_again(tmp_path, path / "record")
+
+
+def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
+    """As many of them as there is room for, the last one cut."""
+    with suppress(OSError):
+        for name in names:
+            (where / name).write_bytes(content)
+            os.utime(where / name, (0, time.time() - 3600.0))
+
+
+@contextmanager
+def records(where: Path, record: Path) -> Iterator[Daemon]:
+    """A daemon that drives a while, until a second of it is on the disk."""
+    with (
+        Daemon(where, words=["--record", str(record)]) as daemon,
+        Bus(daemon.endpoint) as bus,
+    ):
+        bus.linked()
+        with bus.commanding(0.3):
+            until(lambda: sum(p.stat().st_size for p in record.glob("*.part")) > 9000, 30.0, "it")
+        assert bus.state()["recording"] == ""
+        yield daemon
+
+
+def test_a_ring_larger_than_its_disk_loses_the_oldest_and_records_on(tmp_path: Path) -> None:
+    recorded = (RECORDINGS / "quiet.mcap").read_bytes()
+    with disk(tmp_path, f"size={12 * len(recorded)}") as path:
+        record = path / "record"
+        record.mkdir()
+        kept, *_ = names = ["000001-20260101T000000Z.kept.mcap"] + [
+            f"{number:06}-20260101T000000Z.mcap" for number in range(2, 30)
+        ]
+        fill(record, recorded, iter(names))
+        with records(tmp_path, record) as daemon:
+            daemon.process.kill()
+            daemon.process.wait()
+        (cut,) = record.glob("*.part")
+        lines = replayed(tmp_path, cut)
+        fill(path, b"others" * 1000, (f"{number}" for number in range(10_000)))
+        with records(tmp_path, record) as daemon:
+            daemon.process.terminate()
+            assert daemon.ended(5.0) == 0
+        left = sorted(one.name for one in record.glob("*.mcap*"))
+        assert left[0] == kept
+        assert names[1] not in left, "the oldest went"
+        whole, new = record / left[-2], record / left[-1]
+        assert whole.name[:6] == cut.name[:6] < new.name[:6]
+        assert replayed(tmp_path, whole) == lines
+        assert replayed(tmp_path, new) > 0
 
 
 def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:

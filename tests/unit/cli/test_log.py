@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -11,12 +13,13 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.cli.log import SERVICE
-from acsard.config.settings import Config
+from acsard.config.settings import Config, RecordConfig
+from acsard.record.directory import Ring
 from acsard.record.file import Writing
 from acsard.record.steps import Taken
 from acsard.values import Event
 from tests.scenarios.taped import Tape
-from tests.scenarios.world import World
+from tests.scenarios.world import START, World
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +93,101 @@ def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
     hours, minutes, seconds = first.split(":")
     after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
     assert names("--from", after) == names("--from", "1.5")
+
+
+def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int = 0) -> None:
+    """Set its clock to that time of day."""
+    day = time.localtime(START.wall_ns / 1e9)
+    begin = (day.tm_year, day.tm_mon, day.tm_mday + days, hours, minutes, 0, 0, 0, -1)
+    world.wall_offset_ns = int((time.mktime(begin) + seconds) * 1e9) - world.now_ns
+
+
+def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
+    """Two seconds before midnight until three after it, a stop in the first second of the new day;
+    or the clock is set in the place of midnight."""
+    tape = Tape()
+    world = World(recorder=tape)
+    starts_at(world, 23, 59, 58.0)
+    world.run(2.0)
+    if set_to:
+        starts_at(world, *set_to)
+    world.run(0.5)
+    world.call("stop")
+    world.run(2.5)
+    tape.write(where / "000001-20270115T235958Z.mcap", Config())
+    return tape
+
+
+@pytest.mark.parametrize(
+    ("set_to", "hour"),
+    [(None, "00:00"), ((14, 3, 0.0, 20), "14:03"), ((6, 0, 0.0, -3), "06:00")],
+)
+def test_a_time_of_day_is_found_over_midnight_and_where_the_clock_was_set(
+    set_to: tuple[int, int, float, int] | None,
+    hour: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    taped(tmp_path, set_to)
+
+    def names(*words: str) -> set[str]:
+        _, out, _ = log(capsys, tmp_path, "show", "1", "--json", *words)
+        return {json.loads(line)["name"] for line in out.splitlines()}
+
+    assert names("--to", "23:59:59") >= {"start"}
+    assert "stop" not in names("--to", "23:59:59")
+    assert "stop" in names("--from", f"{hour}:00")
+    assert "start" not in names("--from", f"{hour}:00")
+    assert "stop" in names("--to", f"{hour}:02")
+    assert names("--from", f"{hour}:02.5", "--to", f"{hour}:02.7") == set()
+    assert names("--from", "3.5") == set()
+    assert "stop" in names("--from", "2", "--to", "3.4")
+
+
+@pytest.mark.slow
+def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    taped(tmp_path, None)
+    rows = {}
+    for name, words in (("all", ()), ("new", ("--from", "00:00")), ("old", ("--to", "00:00"))):
+        assert log(capsys, tmp_path, "export", "1", f"{name}.csv", "--csv", *words)[0] == 0
+        rows[name] = len((tmp_path / f"{name}.csv").read_text().splitlines()) - 1
+    assert abs(rows["old"] + rows["new"] - rows["all"]) <= 1
+    assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and a start
+    assert log(capsys, tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
+    assert re.search(r"<dt>How long</dt><dd>(2\.9|3\.0) s", (tmp_path / "new.html").read_text())
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_what_a_kill_has_cut_says_so_once_it_is_whole(
+    cut: bool, where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "000002-20270115T080000Z.mcap.part"
+    (data,) = [path.read_bytes() for path in where.glob("000001*")]
+    shutil.copy(next(where.glob("*.part")), part)
+    if not cut:
+        part.unlink()
+        (tmp_path / part.stem).write_bytes(data)
+    Ring(RecordConfig(str(tmp_path))).close()
+    told = "cut: the daemon or the computer ended without a word"
+    _, out, _ = log(capsys, tmp_path)
+    assert (told in out) is cut
+    _, out, err = log(capsys, tmp_path, "show")
+    assert (out.splitlines()[-1].endswith(f"  ! {told}"), told in err) == (cut, cut)
+    _, out, _ = log(capsys, tmp_path, "show", "--json")
+    last = json.loads(out.splitlines()[-1])
+    assert (last["name"] == "cut", last["text"] == told.removeprefix("cut: ")) == (cut, cut)
+    if cut:
+        new = tmp_path / "new.html"
+        _, _, err = log(capsys, tmp_path, "report", "2", str(new))
+        assert (told in err, told in new.read_text()) == (True, True)
+    copy = tmp_path / "copy.mcap"
+    assert (
+        log(capsys, tmp_path, "recover", str(next(tmp_path.glob("*2-*.mcap"))), str(copy))[0] == 0
+    )
+    assert (told in log(capsys, tmp_path, "show", str(copy))[1]) is cut
 
 
 def test_what_a_stranger_recorded_moves_no_cursor(
@@ -193,7 +291,7 @@ def test_what_was_cut_is_written_as_a_finished_file(
     assert code == 0
     assert f"messages in {new}" in out
     assert main(["log", "replay", str(new)]) == 0
-    assert capsys.readouterr().err == ""
+    assert "cut, or still being written, when it was recovered" in capsys.readouterr().err
     assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
 
@@ -205,9 +303,9 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     seen: list[bool] = []
     finish = Writing.finish
 
-    def looked(writing: Writing) -> None:
+    def looked(writing: Writing, cut: str = "") -> None:
         seen.append(new.exists())
-        finish(writing)
+        finish(writing, cut)
 
     monkeypatch.setattr(Writing, "finish", looked)
     assert log(capsys, where, "recover", str(cut), str(new))[0] == 0

@@ -133,7 +133,7 @@ def test_a_namespace_is_in_front_of_every_topic(path: Path, tmp_path: Path) -> N
 def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
     new = tmp_path / "new.mcap"
     begin_ns, end_ns = START.wall_ns + 5 * 10**8, START.wall_ns + 10**9
-    export(Recording(path), new, "mcap", span=Span(begin_ns, end_ns))
+    export(Recording(path), new, "mcap", span=Span(0.5, 1.0))
     with new.open("rb") as stream:
         times = [
             m.log_time for _, c, m in make_reader(stream).iter_messages() if c.topic == "/odom"
@@ -144,7 +144,7 @@ def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
 
 def test_a_time_with_nothing_in_it_writes_nothing(path: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing in that time"):
-        export(Recording(path), tmp_path / "new.mcap", "mcap", span=Span(START.wall_ns + 10**12))
+        export(Recording(path), tmp_path / "new.mcap", "mcap", span=Span(1000.0))
     assert not [*tmp_path.iterdir()]
 
 
@@ -154,7 +154,7 @@ def test_what_stands_there_stays_unless_it_is_to_go(kind: Kind, path: Path, tmp_
     first = export(recording, new, kind)
     with pytest.raises(FileExistsError):
         export(recording, new, kind)
-    half = Span(None, START.wall_ns + 10**9)
+    half = Span(end=1.0)
     again = export(recording, new, kind, span=half, force=True)
     assert again.count < first.count
     assert [*tmp_path.iterdir()] == [new]
@@ -240,7 +240,7 @@ def umask(mask: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])
 def test_who_may_read_it_is_what_the_umask_says(mask: int, path: Path, tmp_path: Path) -> None:
-    begin = Span(None, START.wall_ns + 10**8)
+    begin = Span(end=0.1)
     with umask(mask):
         export(Recording(path), tmp_path / "a.csv", "csv", span=begin)
         export(Recording(path), tmp_path / "bag", "rosbag2", span=begin)

@@ -13,7 +13,8 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.host.errors import RecordingError
-from acsard.record.file import MODE, About, Closing, Recording, Writing, closing, rewrite
+from acsard.record.closing import Closing, closing
+from acsard.record.file import MODE, About, Recording, Writing, rewrite
 from acsard.record.replayed import config_of, live, steps
 from acsard.record.steps import status_of
 from acsard.values import Instant
@@ -79,19 +80,27 @@ def on_a_machine(tape: Tape) -> None:
         tape.taken[at] = taken._replace(inputs=replace(taken.inputs, now=now, received=reads))
 
 
-def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("speed", "most"), [(None, 60e6), (0.5, 400e6)])
+def test_an_idle_day_is_less_than_60_mb_and_one_of_driving_less_than_400(
+    speed: float | None, most: float, tmp_path: Path
+) -> None:
     tape, sizes = Tape(), []
     world = World(recorder=tape)
     world.run(3.0)
+    if speed is not None:
+        world.drive(speed, 0.2, seconds=1.0, hz=20.0)
     del tape.taken[:-BATCH]
-    for seconds in (0.0, 20.0):
-        world.run(seconds)
-        path = tmp_path / f"{seconds}.mcap"
+    for seconds in (0.0, 10.0):
+        if speed is None:
+            world.run(seconds)
+        else:
+            world.hold(speed, 0.2, seconds=seconds)
+        path, now_ns = tmp_path / f"{seconds}.mcap", world.now_ns
         on_a_machine(tape)
         tape.write(path, Config())
-        sizes.append((path.stat().st_size, len(tape.taken)))
-    (little, few), (much, many) = sizes
-    assert (much - little) / (many - few) * 200 * 86_400 < 60e6  # 200 steps a second
+        sizes.append((path.stat().st_size, now_ns))
+    (little, began_ns), (much, ended_ns) = sizes
+    assert 0 < (much - little) / ((ended_ns - began_ns) / 1e9) * 86_400 < most
 
 
 def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> None:
@@ -225,5 +234,8 @@ def test_a_finished_file_says_at_its_end_what_happened(
     cut.write_bytes(whole.read_bytes()[:-100])
     assert closing(cut) is None
     rewrite(Recording(cut), new)
-    assert closing(new) == said == Closing(said.wall_ns, said.last_ns, said.said)
+    assert closing(new) == replace(said, cut="open")
+    assert said == Closing(said.wall_ns, said.last_ns, said.said)
+    rewrite(Recording(new), tmp_path / "again.mcap", "crash")
+    assert closing(tmp_path / "again.mcap") == closing(new), "it was finished before"
     assert closing(tmp_path / "none") is None

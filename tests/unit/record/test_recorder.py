@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import stat
 import threading
@@ -14,14 +16,15 @@ from msgspec.structs import replace
 
 from acsard.config.settings import Config, RecordConfig
 from acsard.record import recorder as module
+from acsard.record.closing import closing
 from acsard.record.directory import KEPT, listed
 from acsard.record.export import export
-from acsard.record.file import Recording
+from acsard.record.file import About, Recording, Writing
 from acsard.record.recorder import MOST, Recorder
 from acsard.record.replayed import live, steps
 from acsard.values import Event
 from tests.scenarios.taped import Tape
-from tests.scenarios.world import World
+from tests.scenarios.world import START, World
 
 SECRET = "PRIVATE KEY of a robot"
 
@@ -177,7 +180,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     ended_s = bench.world.now_ns / 1e9
     rest(14.0)
     paths = bench.end()
-    kept = [path.name.endswith(KEPT) for path in paths]
+    kept = [not path.name.endswith("Z.mcap") for path in paths]
     began = [Recording(path).about.mono_ns / 1e9 for path in paths]
     spans = list(zip(began, [*began[1:], bench.world.now_ns / 1e9], strict=True))
     close = [s < began_s + minute - 0.5 and e > ended_s - minute + 0.5 for s, e in spans]
@@ -185,6 +188,81 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     assert 2 <= sum(close) <= sum(near) <= len(paths) - 2, (close, near)
     for has, must, may in zip(kept, close, near, strict=True):
         assert must <= has <= may
+
+
+def die(bench: Bench) -> None:
+    """As a process does that is killed: what is open is closed, nothing else."""
+    disk = bench.recorder._disk
+    assert disk._writing is not None
+    assert disk._ring is not None
+    disk._writing.close()
+    disk._ring.close()
+
+
+@pytest.mark.parametrize("after_s", [5.0, 300.0])
+def test_the_minute_before_and_after_a_crash_is_kept(
+    after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(14.0)
+    die(bench)
+    cut_s = START.wall_ns / 1e9 - after_s
+    *before, cut = listed(tmp_path)
+    assert len(before) > 2
+    for number, path in enumerate([cut, *reversed(before)]):
+        os.utime(path, (0, cut_s - 40.0 * number))  # as if each had lasted for 40 s
+    again = Bench(tmp_path, monkeypatch)
+    again.world.run(1.0)
+    again.write()
+    kept = [not path.name.endswith("Z.mcap") for path in again.end()]
+    assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
+
+
+@pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
+def test_a_clock_that_is_set_costs_no_recording(
+    jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot without a clock of its own, that was off for weeks, hears the time once it drives."""
+    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(module, "AROUND_NS", 0)
+    for _ in range(2):  # one run after another
+        bench = Bench(tmp_path, monkeypatch)
+        bench.world.drive(0.5, 0.2, seconds=1.0)
+        for days in (0, *jumps):
+            bench.world.wall_offset_ns += days * 86_400 * 10**9
+            bench.drive(6.0)
+        bench.end()
+    numbers = [int(path.name[:6]) for path in listed(tmp_path)]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    bench.world.call("stop")
+    bench.world.run(1.0)
+    bench.write()
+    bench.recorder._disk._fail(OSError(errno.ENOSPC, "No space left on device"))
+    bench.drive(module.RETRY_ROUNDS + 3.0)
+    first, second = bench.end()
+    assert first.name.endswith(KEPT)
+    last = closing(first)
+    assert last is not None
+    assert last.cut == "disk"
+    assert live(Recording(second)).tally.same
+
+
+def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "000001-20270115T080000Z.mcap.part"
+    Writing(path, About("acsar", "9.0", "3.13", 1, 2, format="later")).close()
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.run(1.0)
+    bench.write()
+    bench.world.run(1.0)
+    assert ("warning", True) in [(one.level, path.name[:24] in one.text) for one in bench.said]
+    assert len(bench.end()) == 2
 
 
 def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -> None:

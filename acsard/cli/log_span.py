@@ -1,0 +1,114 @@
+"""`--from` and `--to` of `acsard log`: a part of a recording, by seconds or by the time of day.
+
+A recording may go over midnight, and its clock may be set in the middle of it: the time of day is
+looked for wherever the clock went on by itself. What comes of it are seconds from the beginning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import time
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from acsard.values import NS_PER_S, Instant
+
+if TYPE_CHECKING:
+    from acsard.record.file import Recording
+
+SET_NS = 5 * NS_PER_S
+"""A clock that goes so far from the other one was set."""
+
+
+class Stretch(NamedTuple):
+    """A part in which the clock went on by itself."""
+
+    at: float
+    """s after the beginning of the recording."""
+    begin: float
+    end: float
+    """s since 1970."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare both."""
+    when = "seconds after the beginning, or the time of day: HH:MM, HH:MM:SS"
+    parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
+    parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+
+
+def _when(text: str) -> str:
+    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
+        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
+    return text
+
+
+def span(args: argparse.Namespace, recording: Recording) -> tuple[float, float]:
+    """From when to when, s after its beginning."""
+    texts = (args.begin, args.end)
+    found = stretches(recording) if any(":" in text for text in texts if text) else []
+    begin, end = (None if text is None else _seconds(text, found) for text in texts)
+    return -math.inf if begin is None else begin, math.inf if end is None else end
+
+
+def _seconds(text: str, found: list[Stretch]) -> float:
+    if ":" not in text:
+        return float(text)
+    hours, minutes, seconds = [*text.split(":"), "0"][:3]
+    clock = int(hours), int(minutes), float(seconds)
+    away, at = math.inf, 0.0
+    for number, one in enumerate(found):
+        least = one.at if number else -math.inf
+        most = found[number + 1].at if number + 1 < len(found) else math.inf
+        for day in (-1, 0, 1):
+            moment = _on(one.begin, day, *clock)
+            far = max(one.begin - moment, moment - one.end, 0.0)
+            if far < away:
+                away, at = far, min(max(one.at + moment - one.begin, least), most)
+    return at
+
+
+def _on(near: float, day: int, hours: int, minutes: int, seconds: float) -> float:
+    """That time of day, so many days after that of `near`, s since 1970."""
+    told = time.localtime(near)
+    whole = (told.tm_year, told.tm_mon, told.tm_mday + day, hours, minutes, 0, 0, 0, -1)
+    return time.mktime(whole) + seconds
+
+
+def stretches(recording: Recording) -> list[Stretch]:
+    """Where its clock went on by itself, in order; one, where nobody has set it."""
+    found: list[Stretch] = []
+    last_ns, before = 0, b""
+    for topic, wall_ns, data in recording.messages():
+        if topic != "steps":
+            continue
+        if found and 0 <= wall_ns - last_ns < SET_NS:
+            found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
+        else:
+            times = [*_instants(recording, before), *_instants(recording, data)]
+            if not found and times:
+                found.append(_from(recording, times[0]))
+            for one, other in pairwise(times):
+                ahead_ns = other.wall_ns - other.mono_ns - one.wall_ns + one.mono_ns
+                if abs(ahead_ns) >= SET_NS:
+                    found[-1] = found[-1]._replace(end=one.wall_ns / NS_PER_S)
+                    found.append(_from(recording, other))
+        last_ns, before = wall_ns, data
+    return found
+
+
+def _from(recording: Recording, now: Instant) -> Stretch:
+    at = (now.mono_ns - recording.about.mono_ns) / NS_PER_S
+    return Stretch(at, now.wall_ns / NS_PER_S, now.wall_ns / NS_PER_S)
+
+
+def _instants(recording: Recording, data: bytes) -> list[Instant]:
+    """When each step of a message was."""
+    from acsard.record.batch import BatchError, decode
+
+    try:
+        return [step.inputs.now for step in decode(data, "", recording.about.format)]
+    except BatchError:
+        return []

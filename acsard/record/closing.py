@@ -1,0 +1,67 @@
+"""What a recording says of itself at its end, and what there is to say of one that was cut."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from msgspec import Meta, Struct
+
+END = "acsard end"
+"""The metadata that is the closing."""
+
+DAMAGE = (
+    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
+    ValueError, OverflowError, EOFError, MemoryError,
+)  # fmt: skip
+"""All that the library raises for bytes that are no MCAP."""
+
+Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+"""A time that calendars have."""
+
+CUTS = {
+    "crash": "cut: the daemon or the computer ended without a word",
+    "disk": "cut: the disk took no more",
+    "open": "cut, or still being written, when it was recovered",
+}
+"""Why somebody else than the daemon finished a file."""
+
+
+class Closing(Struct, frozen=True):
+    """What a finished file says of itself at its end, so that a list need not read all of it."""
+
+    wall_ns: Ns
+    """When it began."""
+    last_ns: Ns
+    """When its last message begins."""
+    said: str
+    """What happened, in a few words."""
+    cut: str = ""
+    """Why it was finished later, a word of `CUTS`; "" where the daemon did it."""
+
+
+def how_it_ends(cut: str) -> str:
+    """In words; "" where there is nothing to say. A word of a later version is only a cut."""
+    return CUTS.get(cut, "cut") if cut else ""
+
+
+def fields(last: Closing) -> dict[str, str]:
+    """As metadata have it."""
+    return {key: str(value) for key, value in msgspec.to_builtins(last).items()}
+
+
+def closing(path: Path) -> Closing | None:
+    """What the file says of itself at its end; None where it has none, or it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            for metadata in make_reader(stream).iter_metadata():
+                if metadata.name == END:
+                    return msgspec.convert(metadata.metadata, Closing, strict=False)
+    except (OSError, *DAMAGE):
+        pass  # who reads all of it will say what is wrong
+    return None

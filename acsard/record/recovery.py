@@ -1,0 +1,139 @@
+"""A recording that was cut -> a finished one: beside it, or in its place where there is no room.
+
+Nothing that anybody could read is thrown away: what this version cannot read is left as it is.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Chunk, DataEnd, Footer, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from acsard.host.errors import RecordingError
+from acsard.record.closing import DAMAGE, END, Closing, fields
+from acsard.record.file import MAGIC, Recording, event_of, rewrite
+from acsard.record.story import NEWS, Told, summary
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What a disk says that has no room."""
+
+HEAD = struct.Struct("<BQ")
+"""Of a record: what it is, and its bytes after this."""
+
+
+def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
+    """Make a finished file `whole` of `part`; what there is to tell of it, "" where it went well.
+
+    `cut` is a word of `CUTS`; `room` says that the disk has some for a copy. One with nothing in it
+    goes; one that cannot be read here only gets the other name. Raises `OSError`.
+    """
+    seen = part.stat()
+    try:
+        if not _begins(part):
+            part.unlink()
+            return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
+        recording = Recording(part)
+        if not any(True for _ in recording.messages()):
+            if recording.damaged:
+                raise RecordingError(f"{part} has nothing whole in it")
+            part.unlink()
+            return ""
+        if not room or not _beside(recording, part, whole, cut):
+            _in_place(recording, part, cut)
+            part.rename(whole)
+    except RecordingError as error:
+        part.rename(whole)
+        return f"it was cut and stays so, as {whole.name}: {error}"
+    os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))  # when it ended, not when it was found
+    return ""
+
+
+def _begins(part: Path) -> bool:
+    """It can be told whose it is; without that nobody can read any of it."""
+    with part.open("rb") as stream:
+        try:
+            for record in StreamReader(stream, emit_chunks=True).records:
+                if isinstance(record, Attachment):
+                    return True
+                if isinstance(record, Chunk):
+                    return False
+        except DAMAGE:
+            pass
+    return False
+
+
+def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
+    """A copy, without what is damaged; False where the disk is full."""
+    written = part.with_name(f".{part.name}.new")
+    written.unlink(missing_ok=True)
+    try:
+        rewrite(recording, written, cut)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        return False
+    written.rename(whole)
+    part.unlink()
+    return True
+
+
+def _in_place(recording: Recording, part: Path, cut: str) -> None:
+    """The end goes where the last whole chunk ends, or one before, if that is the room there is."""
+    news, last_ns = list[Told](), recording.about.wall_ns
+    for topic, wall_ns, data in recording.messages():
+        last_ns = max(last_ns, wall_ns)
+        if topic == "events" and (told := event_of(recording, data)).name in NEWS:
+            news.append(told)
+    if recording.ended:
+        return
+    end = _end(Closing(recording.about.wall_ns, last_ns, summary(news), cut))
+    with part.open("r+b", buffering=0) as stream:
+        for at in reversed(list(_ends(part.read_bytes()))):
+            try:
+                stream.truncate(at)
+                stream.seek(at)
+                if stream.write(end) == len(end):
+                    os.fsync(stream.fileno())
+                    return
+            except OSError as error:
+                if error.errno not in FULL:
+                    raise
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _end(last: Closing) -> bytes:
+    """The least that makes a file a finished one: no index, which is read without, too."""
+    builder = RecordBuilder()
+    Metadata(END, fields(last)).write(builder)
+    DataEnd(0).write(builder)
+    Footer(0, 0, 0).write(builder)
+    return bytes(builder.end()) + MAGIC
+
+
+def _ends(data: bytes) -> Iterator[int]:
+    """Where each chunk ends that is whole; what is damaged between two of them stays."""
+    at = len(MAGIC)
+    while at + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        end = at + HEAD.size + length
+        if not opcode or end > len(data) or opcode == Opcode.DATA_END:
+            return
+        if opcode == Opcode.CHUNK and _sound(data[at + HEAD.size : end]):
+            yield end
+        at = end
+
+
+def _sound(content: bytes) -> bool:
+    try:
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
+        return bool(breakup_chunk(chunk, validate_crc=True))
+    except DAMAGE:
+        return False

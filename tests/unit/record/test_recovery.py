@@ -1,0 +1,93 @@
+"""What was cut becomes whole in its place, where there is no room for a copy."""
+
+from __future__ import annotations
+
+import os
+import random
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from acsard.config.settings import Config
+from acsard.record.closing import closing
+from acsard.record.file import Recording
+from acsard.record.recovery import recover
+from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.world import World
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    tape, path = Tape(), tmp_path_factory.mktemp("record") / "whole.mcap"
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=4.0)
+    world.call("stop")
+    world.run(0.5)
+    tape.write(path, Config())
+    return path.read_bytes()
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    return list(Recording(path).messages())
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
+    data: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, dice = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(4)
+    (_, first), *_ = chunks(data)
+    for _ in range(20):
+        tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
+        part.write_bytes(data[: dice.randrange(first + 1, len(data) - 8)] + tail)
+        os.utime(part, (0, 1e9))
+        before = messages(part)
+        assert recover(part, whole, "crash", room) == ""
+        assert messages(whole) == before
+        recording = Recording(whole)
+        assert len(list(recording.messages())) == len(before) > 0
+        assert (recording.whole, part.exists()) == (True, False)
+        assert whole.stat().st_mtime == 1e9
+        last = closing(whole)
+        assert last is not None
+        assert recording.cut == last.cut
+        assert last.last_ns == max(wall_ns for _, wall_ns, _ in before)
+        with whole.open("rb") as stream:
+            assert len(list(make_reader(stream).iter_messages())) == len(before)
+
+
+def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(data[: chunks(data)[-1][1] + 3])
+    recover(part, whole, "crash", room=False)
+    last = closing(whole)
+    assert last is not None
+    assert last.cut == "crash"
+    assert last.said == "1 takeover, 1 stop (stopped by unnamed (native))"
+
+
+def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    torn = bytearray(data)
+    for begin, end in (chunks(data)[1], chunks(data)[-1]):
+        torn[begin + 80 : end] = bytes(end - begin - 80)
+    part.write_bytes(torn[: chunks(data)[-1][1]])
+    recover(part, whole, "crash", room=False)
+    recording = Recording(whole)
+    assert len(list(recording.messages())) > 2
+    assert (recording.ended, recording.damaged) == (True, 1)
+
+
+def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    for content, told in ((b"", ""), (b"\x89MC", "it has no beginning")):
+        part.write_bytes(content)
+        said = recover(part, whole, "crash", room=True)
+        assert told in said
+        assert bool(said) == bool(told)
+        assert list(tmp_path.iterdir()) == []
