@@ -8,11 +8,9 @@ from __future__ import annotations
 import json
 import os
 import re
-from typing import cast
 
 import zenoh
 
-from acsard.bus.access import Rule
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.bus.tls_trouble import trouble
 from acsard.config.settings import TLS, BusConfig
@@ -22,10 +20,6 @@ from acsard.messages.topics import full_key, source_keys
 COMMAND_RATE_HZ = 1000.0
 """Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period. Of
 stops too: one that is left out says the same as that of the millisecond before."""
-
-QUESTION_RATE_HZ = 1000.0
-"""Questions let in at the door per connection and key; without, one who may ask and never waits for
-an answer has all others wait behind him."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
@@ -74,11 +68,6 @@ def door_session(
     """The door's session: a router between the network, by TLS, and the daemon on this machine."""
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     settings |= _limits(robot_id, sources, limited, access)
-    # At the daemon all who come by the door are one link, of which none may lose another's.
-    settings["downsampling"] = [
-        _command_limits(robot_id, sources, limited),
-        _question_limits(access),
-    ]
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -121,7 +110,11 @@ def _limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], access: dict[str, object]
 ) -> dict[str, object]:
     """Who may do what, and how often."""
-    limits = [_command_limits(robot_id, sources, limited)]
+    # Stops for themselves: no DELETE on their key, which is none, may keep one out.
+    limits = [
+        _command_limits(robot_id, sources, limited),
+        _at_most("stops", ["put"], [full_key(robot_id, "stop")]),
+    ]
     return {"access_control": access, "downsampling": limits}
 
 
@@ -209,25 +202,16 @@ def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
     """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    named = [*source_keys([*sources, "*"]), "imu", "stop"]
-    keys = [*(full_key(robot_id, key) for key in named), *limited]
-    return _at_most("commands", ["put", "delete"], keys, COMMAND_RATE_HZ)
+    keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
+    return _at_most("commands", ["put", "delete"], [*keys, *limited])
 
 
-def _question_limits(access: dict[str, object]) -> dict[str, object]:
-    """One for each key that somebody may ask."""
-    rules = cast(list[Rule], access["rules"])
-    asked = [key for rule in rules if rule["messages"] == ["query"] for key in rule["key_exprs"]]
-    exact = [key for key in dict.fromkeys(asked) if "*" not in key]
-    return _at_most("questions", ["query"], exact, QUESTION_RATE_HZ)
-
-
-def _at_most(name: str, messages: list[str], keys: list[str], hz: float) -> dict[str, object]:
+def _at_most(name: str, messages: list[str], keys: list[str]) -> dict[str, object]:
     return {
         "id": name,
         "messages": messages,
         "flows": ["ingress"],
-        "rules": [{"key_expr": key, "freq": hz} for key in keys],
+        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
     }
 
 
