@@ -71,10 +71,11 @@ PURE_AMONG_SHELLS = (
 """Pure modules in rooms that do I/O."""
 
 PURE_IMPORTS = {
-    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "difflib", "enum",
-    "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math", "msgspec", "numpy",
-    "operator", "pickletools", "re", "rich.cells", "rich.console.Group", "rich.text", "statistics",
-    "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash", "zlib",
+    "__future__", "array", "binascii", "bisect", "collections", "contextlib", "csv",
+    "difflib", "enum", "functools", "hashlib", "heapq", "html", "ipaddress",
+    "itertools", "math", "msgspec", "numpy", "operator", "pickletools", "re", "rich.cells",
+    "rich.console.Group", "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib",
+    "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
 itself, knows the time or anything of chance."""
