@@ -80,7 +80,15 @@ def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, 
     return share, resident_kb(page.pid), Periods.between(first, last), late
 
 
+SHARE, MEMORY_KB = 0.10, 120_000
+"""Of a core, and of memory, that the page may take for twenty viewers."""
+
+LATER = 2.0
+"""Times as late as without viewers: so much do two rounds differ on a machine at work."""
+
+
 def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
+    rounds: dict[int, list[tuple[int, float]]] = {}
     for count in (0, 20, 1, 0, 20):  # a daemon each, since lateness is of the last minute
         with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as page, Bus(daemon.endpoint) as b:
             b.linked()
@@ -96,7 +104,12 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
                 f"daemon {periods.missed} of {periods.elapsed:.0f} periods missed, "
                 f"late p99 {late:.0f} us"
             )
-            assert kb < 120_000
+            rounds.setdefault(count, []).append((periods.missed, late))
+            assert kb < MEMORY_KB
+            assert share < SHARE
+    alone, watched_by_all = rounds[0], rounds[20]
+    assert min(late for _, late in watched_by_all) < LATER * max(late for _, late in alone)
+    assert min(missed for missed, _ in watched_by_all) <= max(missed for missed, _ in alone)
 
 
 def lines_with(peer: Peer, speed: float, after: float) -> float | None:
