@@ -220,6 +220,7 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
 def test_a_clock_that_is_set_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -227,15 +228,21 @@ def test_a_clock_that_is_set_costs_no_recording(
     """A robot without a clock of its own, that was off for weeks, hears the time once it drives."""
     monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
     monkeypatch.setattr(module, "AROUND_NS", 0)
+    seen = set[str]()
+
+    def there() -> set[str]:
+        return {path.name.partition(".")[0] for path in listed(tmp_path)}
+
     for _ in range(2):  # one run after another
         bench = Bench(tmp_path, monkeypatch)
         bench.world.drive(0.5, 0.2, seconds=1.0)
         for days in (0, *jumps):
             bench.world.wall_offset_ns += days * 86_400 * 10**9
             bench.drive(6.0)
+            seen |= there()
         bench.end()
-    numbers = [int(path.name[:6]) for path in listed(tmp_path)]
-    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(seen) > 6
+    assert seen <= there()
 
 
 def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
