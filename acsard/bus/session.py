@@ -18,8 +18,8 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period. Of
-stops too: one that is left out says the same as that of the millisecond before."""
+"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period. The
+door lets in as many stops: one that is left out says the same as that of the millisecond before."""
 
 MAX_SESSIONS = 256
 """Clients at once, at the machine and at the door each; idle connections of strangers must not
@@ -67,7 +67,9 @@ def door_session(
 ) -> zenoh.Session:
     """The door's session: a router between the network, by TLS, and the daemon on this machine."""
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    settings |= _limits(robot_id, sources, limited, access)
+    # No DELETE on their key, which is none, may keep a stop out. At the daemon none is limited.
+    stops = _at_most("stops", ["put"], [full_key(robot_id, "stop")])
+    settings |= _limits(robot_id, sources, limited, access, stops)
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -107,14 +109,14 @@ def _listening() -> dict[str, object]:
 
 
 def _limits(
-    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...], access: dict[str, object]
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+    *more: dict[str, object],
 ) -> dict[str, object]:
     """Who may do what, and how often."""
-    # Stops for themselves: no DELETE on their key, which is none, may keep one out.
-    limits = [
-        _command_limits(robot_id, sources, limited),
-        _at_most("stops", ["put"], [full_key(robot_id, "stop")]),
-    ]
+    limits = [_command_limits(robot_id, sources, limited), *more]
     return {"access_control": access, "downsampling": limits}
 
 

@@ -19,6 +19,10 @@ FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
 
 TOLD_EVERY_NS = 60 * NS_PER_S
 
+UNANSWERED = 4
+"""Questions in a row without an end, each a second old at least: what comes in at the door does not
+arrive, though the connection stands."""
+
 NAMES = 5
 """Holders of connections that are named, those with most of them."""
 
@@ -43,6 +47,8 @@ class Look(Struct, frozen=True):
     """The name in the certificate of each connection from outside, "" where Zenoh has none."""
     linked: bool = False
     """The daemon is connected."""
+    unanswered: int = 0
+    """Questions in a row that the daemon has left without an end."""
 
 
 class Watch:
@@ -79,6 +85,9 @@ class Watch:
             return Event(self._events["stuck"], text, "error")
         if look.at_ns - self._linked_ns > self._patience_ns:
             text = "nothing is heard of the daemon any more"
+            return Event(self._events["alone"], text, "warning")
+        if look.unanswered >= UNANSWERED:
+            text = f"the daemon, though connected, has left {look.unanswered} questions unanswered"
             return Event(self._events["alone"], text, "warning")
         return None
 

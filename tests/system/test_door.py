@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from acsard.door.watch import UNANSWERED
 from tests.system.harness import (
     Bus,
     Daemon,
+    Program,
     acsard,
     children,
     finish,
@@ -139,3 +141,36 @@ def test_without_a_tls_endpoint_there_is_no_door_to_open(tmp_path: Path) -> None
     assert "no tls/ endpoint" in done.err
     with Daemon(tmp_path) as daemon:
         assert not children(daemon.pid, "acsard door")
+
+
+def listening(endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
+    tmp_path: Path, certificates: Certificates, answers: bool
+) -> None:
+    """Zenoh has been seen to read no more from a door on a machine with much other work."""
+    plain, tls = free_endpoint(), free_tls_endpoint()
+    bus = {"listen": [plain, tls], "tls": str(certificates.robot)}
+    config = write_config(tmp_path / "a.toml", {"bus": bus})
+    asked: list[zenoh.Query] = []
+
+    def on_query(query: zenoh.Query) -> None:
+        asked.append(query)
+        if answers:
+            query.drop()
+
+    with zenoh.open(listening(plain)) as daemon:
+        daemon.declare_queryable("acsard/acsar/info", on_query)
+        with Program(acsard("door", "--config", str(config)), tmp_path) as door:
+            until(lambda: len(asked) > UNANSWERED + 2 * answers, 30.0, f"questions\n{door}")
+            if answers:
+                assert door.process.poll() is None
+                return
+            assert door.ended(10.0) == 1
+            assert "door_alone" in door.stdout + door.stderr

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from acsard.door.watch import ALONE_NS, FIRST_NS, STUCK_NS, TOLD_EVERY_NS, Look, Watch, crowd
+from acsard.door.watch import (
+    ALONE_NS,
+    FIRST_NS,
+    STUCK_NS,
+    TOLD_EVERY_NS,
+    UNANSWERED,
+    Look,
+    Watch,
+    crowd,
+)
 
 S = 10**9
 MOST = 4
@@ -53,6 +62,16 @@ def test_a_machine_that_stands_still_as_a_whole_is_nobody_s_fault() -> None:
     assert watch.reopen(look(S), MOMENT) is None
     assert watch.reopen(look(S), 60 * S) is None
     assert watch.reopen(look(61 * S), MOMENT) is None
+
+
+def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
+    watch = Watch(MOST, 0)
+    for number in range(UNANSWERED):
+        assert watch.reopen(Look(S, linked=True, unanswered=number), 0) is None
+    over = watch.reopen(Look(S, linked=True, unanswered=UNANSWERED), 0)
+    assert over is not None
+    assert (over.name, over.level) == ("door_alone", "warning")
+    assert "4 questions unanswered" in over.text
 
 
 def test_without_the_daemon_it_closes() -> None:
