@@ -125,10 +125,8 @@ def test_too_fast_a_wish_is_scaled_with_its_curvature_kept(world: World) -> None
 
 def test_wheels_can_be_commanded_by_name_in_any_order(world: World) -> None:
     names = list(reversed(world.config.joints.as_tuple()))
-    world.send(0.0, source="ros2_control")
-    world.run(0.05)
-    for _ in range(40):
-        payload = msgspec.msgpack.encode({"name": names, "velocity": [10.0, 10.0, 10.0, 10.0]})
+    for speed in (0.0, *[10.0] * 40):
+        payload = msgspec.msgpack.encode({"name": names, "velocity": [speed] * 4})
         world.put("wheel_cmd/ros2_control", payload)
         world.run(0.05)
     assert world.lines()[-1] == b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
