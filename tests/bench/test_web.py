@@ -58,7 +58,11 @@ asyncio.run(main())
 """
 """Headless pages that look at four keys at 10 Hz each."""
 
-SECONDS = 10.0
+SECONDS, RATE_HZ = 10.0, 100.0
+
+TIMEOUT_MS = 250.0
+"""Of source teleop."""
+
 
 COMMANDS = 300
 
@@ -109,7 +113,9 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
             assert share < SHARE
     alone, watched_by_all = rounds[0], rounds[20]
     assert min(late for _, late in watched_by_all) < LATER * max(late for _, late in alone)
-    assert min(missed for missed, _ in watched_by_all) <= max(missed for missed, _ in alone)
+    # One in a thousand more is the machine's.
+    most = max(missed for missed, _ in alone) + SECONDS * RATE_HZ / 1000
+    assert min(missed for missed, _ in watched_by_all) <= most
 
 
 def lines_with(peer: Peer, speed: float, after: float) -> float | None:
@@ -239,7 +245,7 @@ def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
         f"{1000 * moves / by_bench['p50']:.0f}, one lifted "
         f"{1000 * lifts / by_bench['p50']:.0f} times that at p50"
     )
-    assert lifts < moves
+    assert lifts < TIMEOUT_MS / 4, "it is said, and no timeout is waited for"
 
 
 async def _read(ours: Hands) -> None:
