@@ -89,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
             _say_who(robot, many, endpoint)
             waiting = nullcontext(_nothing)
-        elif tls and (why := robot.whoami().unlisted):
+        elif tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             waiting = nullcontext(_nothing)
         with waiting as heard:
