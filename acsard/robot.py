@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 
 from acsard.config.live import changed
+from acsard.config.motion_rules import longest_reply
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
 from acsard.drive.answered import Answered
@@ -67,7 +68,10 @@ class Robot:
     def __init__(self, config: Config) -> None:
         self.config = config
         """In force; another one after a step that was asked to `set` something."""
-        self.session = McuSession(config.mcu, config.rate_hz, config.feedback.wheel_speed)
+        longest_s = longest_reply(config.feedback.fault_time)
+        self.session = McuSession(
+            config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
+        )
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(
             config.odometry,

@@ -90,8 +90,8 @@ def nobody(endpoint: str) -> str:
     if endpoint.startswith(TLS):
         return (
             "no robot is seen: over TLS only exact keys pass, so name them, --id robot1,robot2 "
-            "(or [access] wildcards = true at the robot); or your certificate is in no role's "
-            "list: `acsard whoami --id robot1` tells"
+            "(or [access] wildcards = true at the robot); or your certificate may see none: "
+            "`acsard whoami --id robot1` tells"
         )
     return f"no robot is seen at {endpoint}; does a daemon run there, or behind that router?"
 

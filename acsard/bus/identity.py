@@ -17,7 +17,7 @@ from msgspec import Struct
 from acsard.bus.access import MAY, least_role
 from acsard.bus.certificates import common_name
 from acsard.host import clock
-from acsard.messages.topics import whoami_key
+from acsard.messages.topics import full_key, whoami_key
 from acsard.values import NS_PER_S, ROLES, Role
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
@@ -36,25 +36,39 @@ class Identity(Struct, frozen=True):
     """The name in its certificate, "" without one."""
     sender: str
     """Its name on each command."""
+    robot: str = ""
+    """The id that was asked for."""
+    endpoint: str = ""
+    """Where."""
 
     def lacks(self, key: str) -> str:
         """Why one may not use a key below the robot's id, "" when that is not known."""
         least = least_role(key)
         if not self.role:
-            return self.unlisted
+            return self.silence
         if ROLES.index(self.role) >= ROLES.index(least):
             return ""
         return f"{self.words()}; {key} is for a certificate that is {least}"
 
     @property
-    def unlisted(self) -> str:
-        """That our certificate has no role, as far as can be told from here; "" without one."""
-        if self.role or not self.certificate:
-            return ""
+    def silence(self) -> str:
+        """Why nobody answers us, the likeliest first; "" with a role, or without a certificate.
+
+        From here the silence of a robot that is not there, one that is stuck, and one that does
+        not know our certificate are the same: none of them is claimed.
+        """
+        return "" if self.role or not self.certificate else self._nobody()
+
+    def _nobody(self) -> str:
+        where = f" at {self.endpoint}" if self.endpoint else ""
+        asked = full_key(self.robot, whoami_key(ROLES[0])) if self.robot else ""
+        who = f" as '{self.robot}'{where} (asked: {asked})" if asked else where
+        told = f"nobody answers{who}: is --id right, and does that robot's daemon run, unstuck?"
+        if not self.certificate:
+            return told
         return (
-            f"your certificate {self.certificate} is in no role's list: add that name to viewers, "
-            "operators or maintainers of [access] in the robot's acsard.toml (behind a router: to "
-            "the router's list) and restart both; or no daemon of this robot.id runs there"
+            f"{told} If so: a certificate in no role's list ([access] in the robot's acsard.toml; "
+            f"behind a router the router's) gets no answer either; yours is {self.certificate}"
         )
 
     def words(self) -> str:
@@ -63,11 +77,11 @@ class Identity(Struct, frozen=True):
             whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
             whose += "" if self.certificate else " a certificate here, by this link"
             return f"{whose} is {self.role}: {MAY[self.role]}"
-        return self.unlisted or "nobody answers: no daemon of this robot.id runs there"
+        return self._nobody()
 
 
-def identity(ask: Ask, tls: str, sender: str) -> Identity:
-    """Ask who we are; `tls` is the directory of our certificate, "" for none."""
+def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
+    """Ask this robot, there, who we are; `tls` is our certificate's directory, "" for none."""
     answers: SimpleQueue[str] = SimpleQueue()
     for one in ROLES:
         ask(whoami_key(one), lambda sample: answers.put(str(sample.key_expr)))
@@ -79,7 +93,7 @@ def identity(ask: Ask, tls: str, sender: str) -> Identity:
             end = min(end, _now_s() + WHOAMI_MORE_S)
             best = max(best, next((n for n, r in enumerate(ROLES) if r == role), -1))
     name = common_name(tls) if tls else ""
-    return Identity(ROLES[best] if best >= 0 else "", name, sender)
+    return Identity(ROLES[best] if best >= 0 else "", name, sender, robot, endpoint)
 
 
 def _now_s() -> float:

@@ -167,7 +167,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
                 or f"is `acsard run` running, is this its bus.listen, has it room (at most "
                 f"{MAX_SESSIONS} connections)? ({first_line(error)})"
             )
-        ) from error
+        ) from None  # its own words are those of its source files
 
 
 def _base(mode: str) -> dict[str, object]:

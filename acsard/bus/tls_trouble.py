@@ -6,6 +6,7 @@ ends. What must not: the session itself.
 
 from __future__ import annotations
 
+import errno
 import socket
 import ssl
 import time
@@ -17,6 +18,9 @@ PATIENCE_S = 2.0
 
 REFUSAL_S = 0.5
 """Who does not want our certificate says so at once; who wants it waits for us."""
+
+AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
+"""No machine takes it, so that nothing is known of its ports."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's verify codes (X509_V_ERR_...); the others are of an authority that is not ours."""
@@ -39,6 +43,11 @@ def trouble(endpoint: str, directory: str) -> str:
     except TimeoutError:
         return f"{host} is silent on port {port}: is it on, and does a firewall drop connections?"
     except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno in AWAY:
+            return (
+                f"{host} is not there ({error.strerror}): is it on, is it in this network, is the "
+                "address its own?"
+            )
         return f"nobody listens on port {port} of {host} ({error}); is the robot's bus.listen this?"
     with plain:
         return _tls_trouble(plain, host, directory)

@@ -15,6 +15,7 @@ from acsard.checkup.findings import StoppedError, WireLostError, motor_name, mot
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
 from acsard.checkup.restarts import RestartedError, Restarts
+from acsard.config.motion_rules import LONGEST_REPLY_S
 from acsard.config.settings import McuConfig, WheelMap
 from acsard.config.wire_time import line_bytes, wire_ns
 from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
@@ -34,8 +35,12 @@ FAREWELL = 5
 class Board:
     """One wire; entering opens it, leaving sends zeros and falls silent, whatever happened."""
 
-    def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
+    def __init__(
+        self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = LONGEST_REPLY_S
+    ) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
+        self.longest_reply_s = longest_reply
+        """The most that mcu.reply_period may be."""
         self.armed = False
         """The motors have been seen to stand: from now on a runaway ends the check."""
         # its language, as it is found out

@@ -54,6 +54,9 @@ WARN reply rate: lossy | {rate:.0f} Hz, {way}
 FAIL reply rate: slow | {rate:.0f} Hz, {way}
     one reply in {gap:.0f} ms: the host takes {quiet:.0f} ms of silence for a lost link
     -> write mcu.reply_period = {period:g}, or have every line answered
+FAIL reply rate: rare | {rate:.1f} Hz, {way}
+    one reply in {gap:.0f} ms: too seldom for a link by any setting
+    -> have every line answered, or reports of its own every {most:g} s or sooner
 FAIL reply rate: none | too few replies
     lines go unanswered
     -> the firmware must answer every line, or by its clock

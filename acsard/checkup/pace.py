@@ -42,11 +42,13 @@ def rate(board: Board) -> Finding:
     unset_s = max(0.1, 4 * period_s)  # what the host waits for when nothing is configured
     quiet_s = max(unset_s, 3 * configured)
     slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < ANSWERED
-    period = float(f"{gap_s:.1g}")
+    most_s = board.longest_reply_s
+    rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
     keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
+    outcome = "rare" if rare else "slow" if slow else "lossy" if lossy else "right"
     return manual.find(
-        f"reply rate: {'slow' if slow else 'lossy' if lossy else 'right'}",
-        keys if 3 * gap_s > 1.1 * unset_s else {},
+        f"reply rate: {outcome}",
+        keys if 3 * gap_s > 1.1 * unset_s and not rare else {},
         rate=1 / gap_s,
         way="by its own clock" if board.own_clock else "when spoken to",
         longest=max(gaps) * 1000,
@@ -54,6 +56,7 @@ def rate(board: Board) -> Finding:
         gap=gap_s * 1000,
         quiet=quiet_s * 1000,
         period=period,
+        most=most_s,
     )
 
 

@@ -26,6 +26,7 @@ from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.outside import Operator, Wire
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
+from acsard.config.motion_rules import longest_reply
 from acsard.config.settings import Config
 
 LIFTED = "lifted"
@@ -83,7 +84,8 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     why = ""
     seen: list[Restart] = []
     try:
-        with Board(wire, config.mcu, config.rate_hz) as board:
+        longest_s = longest_reply(config.feedback.fault_time)
+        with Board(wire, config.mcu, config.rate_hz, longest_s) as board:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(manual.find("wheels: not lifted"))

@@ -92,8 +92,9 @@ def writable(path: str | None) -> Path:
     if not text and not Path(where).is_file():
         raise ExitError(
             Exit.FAILURE,
-            "--write has no configuration file to write to: name it by --config, or make an "
-            "acsard.toml here (an empty one is valid)",
+            "--write has no configuration file to write to: on the robot, name it by --config, or "
+            "make an acsard.toml there (an empty one is valid); a file on another machine changes "
+            "nothing for the robot",
         )
     return Path(where)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from acsard.cli.common import (
@@ -62,7 +61,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Print until told otherwise."""
     from acsard.bus.fleet import follow
-    from acsard.cli.waiting import explained, waits_for
+    from acsard.cli.waiting import QUIET_S, explained, lost_by, nothing, waits_for
     from acsard.client import connect
 
     where, many = robots_address(args)
@@ -72,7 +71,9 @@ def main(args: argparse.Namespace) -> int:
             raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
         with (
             connect(endpoint, robot_id=robot_id, tls=tls) as robot,
-            explained(waits_for(robot, args.topic[0], where)) as heard,
+            explained(
+                waits_for(robot, args.topic[0], where), QUIET_S, lost_by(robot, where)
+            ) as heard,
         ):
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
@@ -83,21 +84,16 @@ def main(args: argparse.Namespace) -> int:
     warn_of_unknown(topic)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         samples = robot.samples(topic, args.timeout)
-        waiting: AbstractContextManager[Callable[[], None]]
-        waiting = explained(waits_for(robot, topic, where))
+        look = waits_for(robot, topic, where)
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
             _say_who(robot, many, endpoint)
-            waiting = nullcontext(_nothing)
-        elif tls and (why := robot.whoami().unlisted):
+            look = nothing
+        elif tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
-            waiting = nullcontext(_nothing)
-        with waiting as heard:
+            look = nothing  # it has been told already
+        with explained(look, QUIET_S, lost_by(robot, where)) as heard:
             return _print(samples, decoder, args.n, bool(many), heard)
-
-
-def _nothing() -> None:
-    """Why nothing comes has been told already."""
 
 
 def _print(

@@ -69,8 +69,8 @@ def _once(fleet: Fleet, asked: Client | None) -> int:
         time.sleep(0.1)
     rows = fleet.rows()
     if not any(row.here or row.state for row in rows):
-        unlisted = "" if asked is None else asked.whoami().unlisted
-        raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), unlisted))))
+        silence = "" if asked is None else asked.whoami().silence
+        raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
     width = shutil.get_terminal_size((160, 24)).columns
     print("\n".join(table(rows, width)))
     for told in filter(None, (fleet.seen, fleet.more)):

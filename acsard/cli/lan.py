@@ -95,21 +95,27 @@ def main_init(args: argparse.Namespace) -> int:
 
     directory = args.directory.resolve()
 
+    robots: list[str] = []
+
     def keys(config: Config) -> dict[str, object]:
+        robots.append(config.robot.id)
         return identities.keys(config, directory)
 
     if args.write:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
+    else:
+        robots.append(load(None)[1].robot.id)
     names = identities.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
         _configure(args.write, keys)
     _admit_service(directory)
-    host = socket.gethostname()
+    host, robot = socket.gethostname(), robots[-1]
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
     lines = "" if args.write else _LINES.format(directory=directory, port=identities.PORT)
     print(_certified(names))
-    print(_NEXT.format(directory=directory, port=identities.PORT, host=host, lines=lines, **files))
+    where = f"tls/{host}.local:{identities.PORT}"
+    print(_NEXT.format(directory=directory, robot=robot, where=where, lines=lines, **files))
     return 0
 
 
@@ -217,5 +223,7 @@ Wrote {directory}:
 
 Copy clients/<role>/ to who may do that, and there:
 
-acsard echo state --connect tls/{host}.local:{port} --tls <that directory>
+acsard echo state --id {robot} --connect {where} --tls <that directory>
+
+From Python: connect("{where}", robot_id="{robot}", tls="<that directory>")
 """

@@ -31,7 +31,7 @@ def connect(
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
     try:
-        yield Client(session, where.robot_id, source, where.tls)
+        yield Client(session, where.robot_id, source, where.tls, where.endpoint)
     finally:
         _close(session)
 
@@ -48,7 +48,7 @@ async def connect_async(
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=_close)
     try:
-        yield AsyncClient(Client(session, where.robot_id, source, where.tls))
+        yield AsyncClient(Client(session, where.robot_id, source, where.tls, where.endpoint))
     finally:
         await in_thread(lambda: _close(session), 5.0)
 

@@ -10,6 +10,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Generator, Iterator
+from numbers import Real
 from typing import Any, Protocol
 
 import zenoh
@@ -77,10 +78,11 @@ def drive(
     """Drive for `seconds` and until it stands, yielding how long to wait before the next step.
 
     Raises `NotDrivenError` with the daemon's reason when it does not drive us, `NoAnswerError`
-    when it is silent.
+    when it is silent, `UsageError` for what is no number, or no time.
     """
-    if not (math.isfinite(linear) and math.isfinite(angular) and math.isfinite(seconds)):
-        raise UsageError("linear, angular and seconds must be finite numbers")
+    _require(linear=linear, angular=angular, seconds=seconds)
+    if seconds <= 0:
+        raise UsageError(f"seconds = {seconds:g}: a drive takes a time above 0; back is linear < 0")
     watch = _Watch(robot)
     try:
         # Each time: the robot may have been stopped and cleared, or started, since the last drive.
@@ -95,6 +97,12 @@ def drive(
         # Whatever interrupts the drive, the robot is told to stop.
         robot.send(0.0, 0.0)
         watch.end()
+
+
+def _require(**numbers: object) -> None:
+    for name, value in numbers.items():
+        if not isinstance(value, Real) or not math.isfinite(value):
+            raise UsageError(f"{name} = {value!r}: it must be a finite number")
 
 
 def _opening(robot: Driven, watch: _Watch) -> Iterator[float]:

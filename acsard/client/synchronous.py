@@ -12,7 +12,9 @@ from typing import Any
 import msgspec
 import zenoh
 
+from acsard.bus.fleet import around
 from acsard.bus.identity import Identity, identity
+from acsard.bus.quiet import why as why_quiet
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.client.driving import UnheardError, drive
 from acsard.host import clock
@@ -41,8 +43,15 @@ TIMED_OUT = "Timeout"
 class Client:
     """A connection to one robot; make it with `connect`."""
 
-    def __init__(self, session: zenoh.Session, robot_id: str, source: str, tls: str = "") -> None:
-        self.session, self._tls = session, tls
+    def __init__(
+        self,
+        session: zenoh.Session,
+        robot_id: str,
+        source: str,
+        tls: str = "",
+        endpoint: str = "",
+    ) -> None:
+        self.session, self._tls, self._endpoint = session, tls, endpoint
         self._id, self.source = robot_id, source
         self.name = own_name()
         """Who calls services, in the daemon's log; set it to what you like."""
@@ -55,7 +64,7 @@ class Client:
 
     def like(self, robot_id: str) -> Client:
         """The same connection, to another robot behind it."""
-        other = Client(self.session, robot_id, self.source, self._tls)
+        other = Client(self.session, robot_id, self.source, self._tls, self._endpoint)
         other.name = self.name
         return other
 
@@ -76,9 +85,11 @@ class Client:
             self._put(0.0, 0.0, stamp_ns)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long, then to a stand; returns when the robot stands.
+        """Drive for so long (above 0 s), then to a stand; returns when the robot stands.
 
-        Raises `NotDrivenError` with the daemon's reason as soon as it does not follow us.
+        Above its `[limits]` the robot drives at them, and that is no error: `get("config")` has
+        them, `get("cmd_vel_out")` what is applied. Raises `NotDrivenError` with the daemon's reason
+        as soon as it does not follow us.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
@@ -110,7 +121,7 @@ class Client:
 
     def whoami(self) -> Identity:
         """Who we are to the daemon; the role is "" when it answers none of them."""
-        return identity(self.ask, self._tls, self.sender)
+        return identity(self.ask, self._tls, self.sender, self._id, self._endpoint)
 
     def pose(self) -> Pose:
         """Where base_link is in odom now."""
@@ -200,31 +211,36 @@ class Client:
                 )
             if reply.err is not None:
                 raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
-        self._require(name)
-        listed = key_hint(name) if unknown(name) else "`acsard topics`"
-        raise NoAnswerError(
-            f"no answer on {self.key(name)}; is the daemon running with robot.id "
-            f'"{self._id}", is there such a key ({listed}), and may you ask it?',
-        )
+        raise self._unanswered(name)
 
-    def _require(self, name: str) -> None:
-        """Raises `NotPermittedError` or `NoAnswerError` when our certificate may be why nobody
-        answers."""
-        if not self._tls:
-            return
-        us = self.whoami()
-        if us.unlisted:
-            raise NoAnswerError(f"no answer on {self.key(name)}: {us.unlisted}")
-        if why := us.lacks(name.partition("?")[0]):
-            raise NotPermittedError(why)
+    def _unanswered(self, name: str) -> MendableError:
+        """Why nobody answers: one reason where one can be seen."""
+        key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
+        if unknown(key):
+            return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
+        if self._tls:
+            us = self.whoami()
+            if us.silence:
+                return NoAnswerError(f"{no_answer}: {us.silence}")
+            if why := us.lacks(key):
+                return NotPermittedError(why)
+        seen = around(self.session, self._id, self._endpoint)
+        if seen is None or seen.here or not self._endpoint:
+            return NoAnswerError(
+                f"{no_answer}; is the daemon of robot.id {self._id!r} stuck, or has it no such key "
+                "(`acsard topics`), and may you ask it?"
+            )
+        return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """The same with what our certificate has to do with it."""
+        """The same by its documented name, with what our certificate has to do with it."""
+        if isinstance(error, UnheardError) and not self._tls:
+            return NotDrivenError(str(error))
         if not self._tls:
             return error
         us = self.whoami()
-        if us.unlisted:
-            return NoAnswerError(f"{error}; {us.unlisted}")
+        if us.silence:
+            return NoAnswerError(f"{error}; {us.silence}")
         if isinstance(error, NoAnswerError):
             return error
         if us.role == "viewer":

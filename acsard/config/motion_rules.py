@@ -105,8 +105,7 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 def _reply_problems(config: Config) -> list[str]:
     """Lines so far apart that one that is lost is a fault, or a new start."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
-    share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
-    most = min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
+    most = longest_reply(fault_s)
     if period <= most:
         return []
     way = ""
@@ -116,6 +115,12 @@ def _reply_problems(config: Config) -> list[str]:
         f"mcu.reply_period = {period:g}: a line that is lost would be a fault of a wheel, or look "
         f"like a new start; write {most:g} at most (the firmware must report more often){way}"
     ]
+
+
+def longest_reply(fault_s: float) -> float:
+    """The most that mcu.reply_period may be, s, where a fault takes `fault_s` (0 for no faults)."""
+    share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
+    return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
 
 
 def _rounded_up(value: float) -> float:

@@ -16,7 +16,7 @@ from acsard.config.settings import Config
 from acsard.doctor.certificates import certificates
 from acsard.doctor.daemon import daemon, door, found, routers
 from acsard.doctor.finding import Finding
-from acsard.doctor.machine import clock_and_scheduling, meddlers
+from acsard.doctor.machine import clock_set, meddlers, scheduling
 from acsard.doctor.port import serial_port
 from acsard.doctor.running import Running, compared
 
@@ -54,7 +54,10 @@ def examine(
         yield Finding("configuration", "warning", warning, "see acsard.toml")
     yield from serial_port(config)
     yield from meddlers()
-    yield from clock_and_scheduling()
+    yield from clock_set()
+    yield from scheduling(
+        config.control.real_time, running.info.pid if isinstance(running, Running) else None
+    )
     for directory in dict.fromkeys((config.bus.tls, address.tls)):
         yield from certificates(directory)
     yield from routers(config)

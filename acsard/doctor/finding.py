@@ -12,7 +12,7 @@ LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
 
 
 class Finding(Struct, frozen=True):
-    """One thing that was looked at; `mend` is what to do unless it is ok."""
+    """One thing that was looked at; `mend` is what to do, or can be done where it is ok."""
 
     subject: str
     level: Level

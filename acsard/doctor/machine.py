@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from acsard.doctor.finding import Finding
-from acsard.host import clock
+from acsard.host import clock, real_time
 from acsard.host.processes import running
 from acsard.values import NS_PER_S
+
+REAL = "run it as the service (deploy/systemd), which has it; without, load adds lateness"
 
 LEAST_YEAR = 2026
 """A clock before this was never set: boards without a battery start in the past."""
@@ -27,17 +27,27 @@ def meddlers() -> Iterator[Finding]:
         yield Finding("ModemManager", "warning", "runs, and talks to new serial ports", mend)
 
 
-def clock_and_scheduling() -> Iterator[Finding]:
-    """Stamps need a clock that was set; the loop likes to be real-time."""
+def clock_set() -> Iterator[Finding]:
+    """Stamps need a clock that was set."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < LEAST_YEAR:
         mend = "set it (timedatectl), or let chrony do; odometry stamps are wall-clock times"
         yield Finding("clock", "warning", f"stands in {year}", mend)
     else:
         yield Finding("clock", "ok", f"stands in {year}")
-    allowed, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    if os.geteuid() == 0 or allowed != 0:
+
+
+def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
+    """The loop likes to be real-time: has the daemon of this process got it, if one runs here, or
+    may we ask for it? `wanted` is control.real_time."""
+    has = None if pid is None else real_time.has(pid)
+    if not wanted:
+        yield Finding("real time", "ok", "is not asked for (control.real_time = false)")
+    elif has:
+        yield Finding("real time", "ok", f"the daemon that runs (pid {pid}) has it")
+    elif has is False:
+        yield Finding("real time", "warning", f"the daemon that runs (pid {pid}) has none", REAL)
+    elif real_time.allowed():
         yield Finding("real time", "ok", "may be asked for")
     else:
-        mend = "run it as the service (deploy/systemd), which has it; without, load adds lateness"
-        yield Finding("real time", "warning", "is not allowed for you", mend)
+        yield Finding("real time", "warning", "is not allowed for you", REAL)

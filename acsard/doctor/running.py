@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import msgspec
 from msgspec import Struct
@@ -16,7 +16,8 @@ from acsard.client import Client, connect
 from acsard.config.live import flat, live
 from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import SIMULATOR, Config
-from acsard.doctor.finding import Finding
+from acsard.config.validation import write
+from acsard.doctor.finding import Finding, Level
 from acsard.host import clock
 from acsard.host.processes import name_of
 from acsard.messages.schema import DiagnosticStatus, Info, RobotState
@@ -29,19 +30,32 @@ SHOWN = 6
 """Keys that are named one by one; more are another file."""
 
 
-WAYS = (
+OPTIONS = (
+    "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
+)  # fmt: skip
+"""What `acsard run` takes as options: whoever gave one meant it."""
+
+WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
-        False,
-        "(by its options or environment, or the file has changed since)",
-        "what follows is of the daemon; to have the file's, start it anew without those options",
+        lambda key: key in OPTIONS,
+        "ok",
+        "by its options (`acsard run --help`), or the file has changed since",
+        "to keep {which}, write it into the file: {lines}",
     ),
     (
-        True,
-        "(set while it ran, or the file has changed since)",
+        lambda key: key not in OPTIONS and live(key) is None,
+        "warning",
+        "by its environment, or the file has changed since",
+        "what follows is of the daemon; write its values into the file, or start it anew",
+    ),
+    (
+        lambda key: live(key) is not None,
+        "warning",
+        "set while it ran, or the file has changed since",
         "its next start has the file's; `acsard set KEY VALUE --write` puts one into the file",
     ),
 )
-"""How a value can be another than the file's, by whether it can be set, and what to do."""
+"""How a value can be another than the file's, by its key, and what to do."""
 
 
 class Running(Struct, frozen=True):
@@ -52,7 +66,9 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """When that was asked for, by this machine's wall clock."""
+    """The middle of the time from asking for that to its answer, by this machine's wall clock."""
+    trip_ns: int = 0
+    """How long that took."""
     rows: tuple[DiagnosticStatus, ...] = ()
     """Its diagnostics."""
     here: bool = True
@@ -67,9 +83,12 @@ def asked(config: Config, address: Address) -> Running:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(WATCHED_S)
         rows = tuple(robot.get("diagnostics").status)
-        runs, state = _configuration(robot, info, config), robot.get("state")
-        here = name_of(info.pid) == "acsard"
-        return Running(info, runs, before, state, clock.now().wall_ns, rows, here)
+        runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
+        asked = clock.now()
+        state, answered = robot.get("state"), clock.now()
+        trip_ns = answered.mono_ns - asked.mono_ns
+        looked_ns = asked.wall_ns + trip_ns // 2
+        return Running(info, runs, before, state, looked_ns, trip_ns, rows, here)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -82,11 +101,22 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
         return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
 
 
-def differences(runs: Config, file: Config) -> dict[str, str]:
-    """Each key that the daemon has otherwise than the file, with both values in words."""
+class Difference(Struct, frozen=True):
+    """A value of the daemon's and the file's."""
+
+    its: object
+    ours: object
+
+    def words(self, key: str) -> str:
+        """Both."""
+        return f"{key} = {_text(self.its)}, not {_text(self.ours)}"
+
+
+def differences(runs: Config, file: Config) -> dict[str, Difference]:
+    """Each key that the daemon has otherwise than the file, with both values."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
-        key: f"{key} = {_text(its.get(key))}, not {_text(ours.get(key))}"
+        key: Difference(its.get(key), ours.get(key))
         for key in its | ours
         if its.get(key) != ours.get(key)
     }
@@ -99,13 +129,22 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     if not others:
         yield Finding("configuration", "ok", f"the daemon that runs ({who}) has it")
         return
-    for settable, how, mend in WAYS:
-        told = [words for key, words in others.items() if (live(key) is not None) == settable]
-        if told:
-            more = f"; and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
-            text = f"the daemon that runs ({who}) has other values {how}: "
-            text += f"{'; '.join(told[:SHOWN])}{more}"
-            yield Finding("configuration", "warning", text, mend)
+    for belongs, level, how, mend in WAYS:
+        its = {key: one for key, one in others.items() if belongs(key)}
+        if not its:
+            continue
+        told = [one.words(key) for key, one in its.items()]
+        more = f"; and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
+        text = f"the daemon that runs ({who}) has other values ({how}): "
+        text += f"{'; '.join(told[:SHOWN])}{more}"
+        mend = mend.format(which="them" if len(its) > 1 else "it", lines=_tables(its))
+        yield Finding("configuration", level, text, mend)
+
+
+def _tables(its: Mapping[str, Difference]) -> str:
+    """The daemon's values as lines of the file."""
+    parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
+    return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def answers(endpoint: str) -> bool:

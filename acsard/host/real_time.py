@@ -21,7 +21,7 @@ on its core, and a step takes a thousandth of this."""
 DOZE = "/dev/cpu_dma_latency"
 """The kernel's device for how long a processor may take to wake."""
 
-_CAP_IPC_LOCK = 14
+_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
@@ -42,8 +42,30 @@ def ask() -> str:
     )
 
 
+def has(pid: int) -> bool | None:
+    """Whether the first thread of a process, a daemon's loop, is real-time; None where that cannot
+    be seen."""
+    try:
+        policy = os.sched_getscheduler(pid)
+    except OSError:
+        return None
+    return policy & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+
+
+def allowed() -> bool:
+    """Whether a daemon that we start would get it: by the capability, or by the limit; root
+    without the capability, as in a container, is held to the limit like anybody else."""
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
+
+
+def _capable(capability: int) -> bool:
+    effective = Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0]
+    return bool(int(effective, 16) >> capability & 1)
+
+
 def _schedule() -> bool:
-    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR):
+    if has(0):
         return True  # as systemd started us
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -70,8 +92,7 @@ def _lock() -> bool:
     # Under a finite limit the call might succeed and a later allocation fail: all or nothing. Root
     # without the capability, as in a container, is held to the limit like anybody else.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
-    effective = Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0]
-    if not unlimited and not int(effective, 16) >> _CAP_IPC_LOCK & 1:
+    if not unlimited and not _capable(_CAP_IPC_LOCK):
         return False
     # As pages are touched: to lock whole thread stacks and arenas would take ten times the memory.
     flags = _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT

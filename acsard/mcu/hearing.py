@@ -12,6 +12,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.mcu.codec import TOKENS
+from acsard.mcu.whose_silence import BUSY, HOST
 from acsard.values import NS_PER_S
 
 PATIENCE_NS = 3 * NS_PER_S
@@ -47,6 +48,8 @@ class Heard(Struct):
     lines: int = 0
     good: int = 0
     last: bytes = b""
+    late_s: float = 0.0
+    """This computer did not run for so long within that time, and heard nothing then."""
 
     def take(self, data: bytes) -> None:
         """Bytes as they came, before their lines."""
@@ -91,6 +94,8 @@ class Heard(Struct):
     @property
     def words(self) -> str:
         """All of it, for `state`."""
+        if self.looks == "sparse" and self.late_s:
+            return f"{HOST} {self.late_s:.2f} s, and heard too little for a link: {BUSY}"
         mend = f"{MENDS[self.looks]} `acsard mcu check` looks closer"
         return f"the microcontroller: {self.counted}; {mend}"
 

@@ -45,6 +45,10 @@ BAD_LINES = 5
 """Bad lines in a row after which a checked link is asked anew."""
 
 
+SPARSE = 2
+"""Silences in a row between single good lines; one alone is a link that was lost for a moment."""
+
+
 class Link:
     """Counts good and bad lines; `sign` alone moves the state."""
 
@@ -53,7 +57,9 @@ class Link:
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines when it was too long for the link, else 0."""
+        """Time between the last two good lines when again it was too long for the link, else 0."""
+        self._silences = 0
+        """So many in a row, each ended by one good line."""
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
 
@@ -66,7 +72,8 @@ class Link:
         if sign in ("closed", "opened", "restarted"):
             self._heard_ns = None
         if sign in ("closed", "opened"):
-            self._bad_in_row, self.sparse_s = 0, 0.0
+            self._bad_in_row = 0
+            self.excuse()
 
     def silent(self, now_ns: int) -> bool:
         """No good line within `quiet`, or none at all in this session."""
@@ -76,15 +83,20 @@ class Link:
         """Count a good line; the time since the one before, None for the first of a session."""
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
-            self.sparse_s = 0.0
+            self.excuse()
         else:
             self.missed()
             if since_ns is not None:
-                self.sparse_s = since_ns / NS_PER_S
+                self._silences += 1
+                self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE else 0.0
         self._good_in_row += 1
         self._bad_in_row = 0
         self._heard_ns = at_ns
         return since_ns
+
+    def excuse(self) -> None:
+        """The last good lines were no sparse ones: in time, or it was not the board that waited."""
+        self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
         """What came, or did not, is no reason to trust the link; a link that is up stays so."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from acsard.config.motion_rules import LONGEST_REPLY_S
 from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.codec import Codec, FrameError
@@ -42,9 +43,14 @@ class McuSession:
     """Follows one serial port."""
 
     def __init__(
-        self, mcu: McuConfig, rate_hz: float, wheel_speed: float = FeedbackConfig().wheel_speed
+        self,
+        mcu: McuConfig,
+        rate_hz: float,
+        wheel_speed: float = FeedbackConfig().wheel_speed,
+        longest_reply: float = LONGEST_REPLY_S,
     ) -> None:
-        """`wheel_speed` rad/s is the fastest a wheel can turn."""
+        """`wheel_speed` rad/s is the fastest a wheel can turn, `longest_reply` s the most that
+        mcu.reply_period may be."""
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._lines = LineReader()
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
@@ -55,7 +61,7 @@ class McuSession:
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self.snapping = Snapping()
         self._hearing = Hearing()
-        self._wants_samples = mcu.wants_samples
+        self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
         self.good_lines = 0
         self.restarted = False
@@ -103,7 +109,10 @@ class McuSession:
             if more > 0:
                 self._reject("too_long", more)
                 self._bad()
-            self.lateness.look(now.mono_ns, good=bool(feedback))
+            if self.lateness.look(now.mono_ns, good=bool(feedback)):
+                self._link.excuse()
+            heard = self._hearing.now
+            heard.late_s = max(heard.late_s, self.lateness.step_s)
             self._judge(now.mono_ns)
         self._announce()
         return feedback
@@ -145,14 +154,20 @@ class McuSession:
             if self._damaged:
                 return "the microcontroller's replies come damaged; asking it for the check again"
             if self._link.sparse_s:
-                apart = f"{self._link.sparse_s:.2f}"
-                return (
-                    f"the microcontroller's lines come {apart} s apart; if it reports "
-                    f"by its own clock, set mcu.reply_period = {apart}"
-                )
+                return self._sparse()
             if heard is not None:
                 return heard.words
         return self.lateness.words(self.link)
+
+    def _sparse(self) -> str:
+        apart = f"{self._link.sparse_s:.2f}"
+        told = f"the microcontroller's lines come {apart} s apart"
+        if float(apart) > self._longest_reply:
+            return (
+                f"{told}: too seldom for a link by any setting; firmware that reports by its own "
+                f"clock must do so every {self._longest_reply:g} s or sooner"
+            )
+        return f"{told}; if it reports by its own clock, set mcu.reply_period = {apart}"
 
     @property
     def note(self) -> str:

@@ -33,14 +33,18 @@ class Lateness:
         self._looked_ns: int | None = None
         self.late_s = 0.0
         """The longest time since the last good line in which there was no step; 0 for none."""
+        self.step_s = 0.0
+        """The time between the last two steps when that was so long, else 0."""
 
-    def look(self, now_ns: int, good: bool) -> None:
-        """A step, and whether a good line came with it."""
+    def look(self, now_ns: int, good: bool) -> bool:
+        """A step, and whether a good line came with it; True when the silence that this one ends
+        was ours."""
         before_ns, self._looked_ns = self._looked_ns, now_ns
-        if good:
-            self.late_s = 0.0
-        elif before_ns is not None and now_ns - before_ns >= self._least_ns:
-            self.late_s = max(self.late_s, (now_ns - before_ns) / NS_PER_S)
+        passed_ns = 0 if before_ns is None else now_ns - before_ns
+        self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
+        late_s = max(self.late_s, self.step_s)
+        self.late_s = 0.0 if good else late_s
+        return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
         """How the link is, for people."""

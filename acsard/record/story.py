@@ -114,12 +114,17 @@ NEWS = {
     "link_stale": "board silence",
     "link_late": "computer stall",
     "mcu_restarted": "board restart",
-    "commander": "takeover",
+    "commander": "change of who drives",
     "command_refused": "refused command",
     "wheels_doubted": "doubted wheel",
     "link_up": "",
 }
 """What a list says of a recording, and how; nothing of what only ends something else."""
+
+
+def _several(word: str) -> str:
+    first, _, rest = word.partition(" of ")
+    return f"{first}s of {rest}" if rest else f"{word}s"
 
 
 def summary(events: Iterable[Told]) -> str:
@@ -134,6 +139,6 @@ def summary(events: Iterable[Told]) -> str:
         if event.name == "stop" and event.by and event.by not in stopped:
             stopped.append(event.by)
         counts[word] += event.count
-    said = [f"{count} {word}{'s' * (count > 1)}" for word, count in counts.items()]
+    said = [f"{count} {_several(word) if count > 1 else word}" for word, count in counts.items()]
     text = ", ".join(said)
     return f"{text} (stopped by {', '.join(stopped)})" if stopped else text

@@ -183,7 +183,7 @@ async def _held(leaving: asyncio.Event) -> None:
 def _connected(address: Address) -> Client:
     """The way to the daemon; blocks."""
     session = client_session(address.endpoint, address.tls)
-    return Client(session, address.robot_id, SOURCE, address.tls)
+    return Client(session, address.robot_id, SOURCE, address.tls, address.endpoint)
 
 
 def _reach(wanted: Wanted) -> Reach:

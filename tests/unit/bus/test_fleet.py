@@ -47,6 +47,6 @@ def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
     assert "exact keys" not in nobody("tcp/127.0.0.1:7448")
 
 
-def test_where_certificates_decide_who_is_in_no_list_is_told_how_to_find_out() -> None:
-    assert "in no role's list: `acsard whoami" in nobody("tls/router.local:7447")
+def test_where_certificates_decide_who_sees_nobody_is_told_how_to_find_out() -> None:
+    assert "`acsard whoami --id robot1` tells" in nobody("tls/router.local:7447")
     assert "whoami" not in nobody("tcp/127.0.0.1:7448")

@@ -51,10 +51,23 @@ def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> 
     assert Identity("", "", "x").lacks("config") == ""
 
 
-def test_a_certificate_without_a_role_is_named_with_what_to_do_whatever_the_key() -> None:
-    nobody = Identity("", "anna", "joe/1/aa")
-    for told in (nobody.words(), nobody.unlisted, nobody.lacks("state"), nobody.lacks("srv/set")):
-        assert "your certificate anna is in no role's list" in told
-        assert "viewers, operators or maintainers of [access]" in told
-        assert "no daemon" in told  # which looks the same from here
-    assert Identity("viewer", "anna", "x").unlisted == Identity("", "", "x").unlisted == ""
+def test_a_silence_is_first_a_question_about_the_id_and_no_claim_about_a_list() -> None:
+    nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
+    for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
+        assert told.startswith("nobody answers as 'robot1' at tls/a.local:7449")
+        assert "asked: acsard/robot1/whoami/viewer" in told
+        assert told.index("is --id right") < told.index("daemon run") < told.index("role's list")
+        assert "yours is anna" in told
+        assert "add" not in told
+    stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    assert stranger.words().startswith("nobody answers as 'robot1' at tcp/127.0.0.1:7448")
+    assert "certificate" not in stranger.words()
+    assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
+
+
+def test_who_is_asked_and_where_is_told_with_the_role() -> None:
+    def nobody(name: str, take: Any) -> None:
+        pass
+
+    found = identity(nobody, "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    assert (found.robot, found.endpoint) == ("robot1", "tcp/127.0.0.1:7448")

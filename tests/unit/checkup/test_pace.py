@@ -31,6 +31,25 @@ def test_the_pace_is_judged_by_what_the_host_waits_for(
         assert rate.keys == ({"mcu.reply_period": 0.1} if faults else {})
 
 
+@pytest.mark.parametrize("period_s", [0.26, 0.74])
+def test_no_setting_is_advised_that_would_be_refused(period_s: float) -> None:
+    with Robot().board() as board, board.wire.mcu.sparse_replies(period_s):  # type: ignore[attr-defined]
+        board.armed = False
+        rate = pace.rate(board)
+    assert (rate.verdict, rate.keys) == ("FAIL", {})
+    assert "mcu.reply_period" not in rate.mend
+    assert rate.mend.endswith("every 0.25 s or sooner")
+
+
+def test_what_is_advised_is_never_rounded_above_the_limit() -> None:
+    with Robot().board() as board, board.wire.mcu.sparse_replies(0.12):  # type: ignore[attr-defined]
+        board.longest_reply_s = 0.15
+        rate = pace.rate(board)
+    period = rate.keys["mcu.reply_period"]
+    assert isinstance(period, float)
+    assert 0.1 <= period <= 0.15
+
+
 def test_a_slow_answer_is_a_warning() -> None:
     with Robot("slow_reply").board() as board:
         pace.rate(board)

@@ -17,6 +17,7 @@ from acsard.cli.common import (
     require_followed,
     robot_address,
     warn_of_unknown,
+    writable,
 )
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
@@ -256,3 +257,10 @@ def test_where_it_is_recorded_is_told_whole_to_who_stands_elsewhere(
     monkeypatch.chdir(tmp_path)
     named = recorded(parse(b"", {"record": {"directory": "box"}}))
     assert named.record.directory == str(tmp_path / "box")
+
+
+def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> None:
+    with pytest.raises(ExitError) as raised:
+        writable(None)
+    assert "on the robot" in str(raised.value)
+    assert "acsard.toml there" in str(raised.value)

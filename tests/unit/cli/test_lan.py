@@ -576,3 +576,16 @@ def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
     assert done.returncode == Exit.USAGE
     assert "encrypted" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("write", [True, False])
+def test_init_prints_how_this_robot_is_asked_by_its_id(
+    write: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("acsard.toml").write_text('[robot]\nid = "robot7"\n')
+    words = ("--write", "acsard.toml") if write else ()
+    assert lan("init", "--directory", "tls", *words) == 0
+    told = capsys.readouterr().out
+    assert "acsard echo state --id robot7 --connect tls/" in told
+    assert 'robot_id="robot7"' in told

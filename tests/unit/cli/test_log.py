@@ -53,7 +53,7 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
-    assert first.endswith("1 takeover, 1 stop (stopped by unnamed (native))")
+    assert first.endswith("1 change of who drives, 1 stop (stopped by unnamed (native))")
     assert second.endswith("[no end: cut, or being written]")
 
 

@@ -63,3 +63,32 @@ def test_who_leaves_leaves_nobody_behind() -> None:
     with explained(lambda: "why", NEVER_S):
         pass
     await_end()
+
+
+def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
+    """What has been told once it is so many lines."""
+    said, end = "", time.monotonic() + 10.0
+    while said.count("\n") < lines:
+        assert time.monotonic() < end, f"told only: {said}"
+        time.sleep(0.001)
+        said += capsys.readouterr().err
+    return said
+
+
+def test_what_ceases_is_explained_once_for_each_silence(capsys: pytest.CaptureFixture[str]) -> None:
+    with explained(lambda: "", 0.01, lambda: "its certificate has ended") as heard:
+        for _ in range(2):
+            heard()
+            assert told(1, capsys) == "acsard: its certificate has ended\n"
+    await_end()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_silence_in_which_nothing_is_wrong_is_looked_at_again(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = iter(["", "", "the way to it is cut"])
+    with explained(lambda: "", 0.001, lambda: next(found)) as heard:
+        heard()
+        assert told(1, capsys) == "acsard: the way to it is cut\n"
+    await_end()

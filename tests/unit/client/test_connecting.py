@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,3 +66,12 @@ def test_every_error_that_the_client_tells_of_can_be_had_from_it() -> None:
     errors = {name for name in told if name.endswith("Error")}
     assert errors == {n for n in client.__all__ if n.endswith("Error")} - {"AcsardError"}
     assert all(issubclass(getattr(client, name), client.AcsardError) for name in errors)
+
+
+def test_a_daemon_that_is_not_there_is_one_sentence_without_the_bus_s_own_errors() -> None:
+    with pytest.raises(client.UnreachableError) as raised, client.connect("tcp/127.0.0.1:1"):
+        pass
+    shown = "".join(traceback.format_exception(raised.value))
+    assert "no daemon answers at tcp/127.0.0.1:1" in shown
+    assert "ZError" not in shown
+    assert ".rs" not in shown

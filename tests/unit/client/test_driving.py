@@ -273,8 +273,21 @@ def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
     world: Any = World(followed)
-    with pytest.raises(UsageError, match="finite"):
-        next(drive(world, float("nan"), 0.0, 1.0))
+    given: Any
+    for given in (float("nan"), float("inf"), "0.1", None, [0.1]):
+        for place, name in enumerate(("linear", "angular", "seconds")):
+            numbers = [0.1, 0.1, 0.1]
+            numbers[place] = given
+            with pytest.raises(UsageError, match=f"^{name} = .*finite"):
+                next(drive(world, *numbers))
+    assert world.sent == []
+
+
+@pytest.mark.parametrize("seconds", [0, -1, -0.5])
+def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -> None:
+    world: Any = World(followed)
+    with pytest.raises(UsageError, match=f"seconds = {seconds:g}: a drive takes a time above 0"):
+        next(drive(world, 5.0, 0.0, seconds))
     assert world.sent == []
 
 

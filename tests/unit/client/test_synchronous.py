@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from acsard.client import Client
+from acsard import client
+from acsard.client import Client, NoAnswerError
+from acsard.client.driving import UnheardError
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.incoming.commands import Arrival, Receiver
@@ -28,6 +30,9 @@ class Session:
 
     def new_timestamp(self) -> None:
         return None
+
+    def get(self, key: str, *_: Any, **__: Any) -> list[Any]:
+        return []  # nobody answers
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
         key = key.removeprefix("acsard/acsar/")
@@ -64,3 +69,23 @@ def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
     for one in (session, other):
         client_of(one).send(0.5)
     assert session.heard[0].sender != other.heard[0].sender
+
+
+@pytest.mark.parametrize("name", ["odm", "statte"])
+def test_a_key_that_there_is_not_is_the_one_reason_that_is_told(
+    session: Session, name: str
+) -> None:
+    with pytest.raises(NoAnswerError) as raised:
+        client_of(session).reply(name)
+    told = str(raised.value)
+    assert f"acsard/acsar/{name}" in told
+    assert "did you mean" in told
+    assert "daemon" not in told
+
+
+def test_a_drive_of_which_nothing_arrives_ends_with_an_error_that_the_docs_name(
+    session: Session,
+) -> None:
+    found = client_of(session).unheard(UnheardError("the daemon hears no command of source app"))
+    assert type(found).__name__ in client.__doc__.split()
+    assert isinstance(found, client.NotDrivenError)

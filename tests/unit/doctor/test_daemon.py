@@ -2,32 +2,61 @@
 
 from __future__ import annotations
 
-import pytest
+import socket
 
-from acsard.doctor.daemon import clocks, gyro
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.settings import BusConfig, Config
+from acsard.doctor.daemon import clocks, door, gyro
+from acsard.doctor.running import Running
+from acsard.messages.schema import Time
+from tests.unit.doctor.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000
 S = 10**9
 
 
+def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
+    """Of a daemon whose clock is `apart` s ahead, asked within `trip` s."""
+    state = replace(STATE, stamp=Time.from_ns(NOW + int(apart * S)), counters=counters)
+    return Running(INFO, Config(), state, state, NOW, int(trip * S), (), here)
+
+
 @pytest.mark.parametrize("apart", [0.0, 0.3, -0.3])
 def test_clocks_that_agree_are_no_finding(apart: float) -> None:
-    assert list(clocks(NOW + int(apart * S), NOW, {"commands": 7})) == []
+    assert list(clocks(seen(apart, commands=7))) == []
 
 
 @pytest.mark.parametrize(
     ("apart", "words"), [(3600.0, "3600.0 s ahead of"), (-0.5, "0.5 s behind")]
 )
 def test_clocks_that_do_not_are_a_warning_with_its_mend(apart: float, words: str) -> None:
-    (finding,) = clocks(NOW + int(apart * S), NOW, {})
+    (finding,) = clocks(seen(apart))
     assert (finding.subject, finding.level) == ("clock", "warning")
     assert words in finding.text
     assert "timedatectl" in finding.mend
 
 
+def test_an_answer_that_was_late_is_no_clock_that_is_wrong() -> None:
+    assert list(clocks(seen(-0.5, trip=1.0))) == list(clocks(seen(0.5, trip=1.0))) == []
+    assert len(list(clocks(seen(-2.0, trip=1.0)))) == 1
+
+
+def test_a_daemon_on_this_machine_has_its_clock() -> None:
+    assert list(clocks(seen(-3.0, here=True))) == []
+
+
 def test_stamps_that_were_replaced_are_told() -> None:
-    (finding,) = clocks(NOW, NOW, {"stamps_replaced": 12})
+    (finding,) = clocks(seen(0.0, stamps_replaced=12))
     assert "12 commands" in finding.text
+
+
+def test_a_door_is_told_where_it_listens() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as door_of_ours:
+        endpoint = f"tls/0.0.0.0:{door_of_ours.getsockname()[1]}"
+        (finding,) = door(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
+    assert (finding.level, finding.text) == ("ok", f"open at {endpoint}")
 
 
 @pytest.mark.parametrize("does", ["off", "used", "waiting for rest"])

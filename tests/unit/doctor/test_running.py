@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 from msgspec.structs import replace
 
-from acsard.config.settings import BusConfig, Config, McuConfig, RobotConfig
+from acsard.config.parsing import parse
+from acsard.config.settings import BusConfig, Config, DriveConfig, McuConfig, RobotConfig
 from acsard.doctor.running import SHOWN, Running, compared, differences
 from acsard.messages.schema import Info, RobotState, Time
 
@@ -27,14 +30,28 @@ def test_a_daemon_that_runs_with_the_file_has_it() -> None:
 
 def test_each_key_that_is_otherwise_is_told_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert [*differences(runs, FILE).values()] == [
+    assert [one.words(key) for key, one in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
         "mcu.baud_rate = 57600, not 115200",
     ]
     (finding,) = compared(running(runs), FILE)
-    assert finding.level == "warning"
+    assert finding.level == "ok"
     assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
-    assert "without those options" in finding.mend
+    assert "to keep them, write" in finding.mend
+    assert "anew" not in finding.mend  # would lead back to the simulator
+
+
+def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> None:
+    bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
+    runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
+    (finding,) = compared(running(runs), FILE)
+    keep = finding.mend.partition("into the file: ")[2]
+    assert parse("\n".join(re.split(r"; |(?<=]) (?=\w)", keep)).encode()) == runs
+
+
+def test_what_is_no_option_of_run_is_a_warning() -> None:
+    (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
+    assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
 
 
 def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
@@ -67,7 +84,9 @@ def test_another_file_is_not_told_key_by_key() -> None:
         robot=RobotConfig("other"),
         mcu=McuConfig("/dev/x", 9600, True, 0.1, "auto", 400),
         bus=BusConfig(listen=("tcp/127.0.0.1:1",)),
+        drive=DriveConfig(0.06, 0.31, 1.1, 1.01, 0.99),
     )
-    (finding,) = compared(running(runs), FILE)
+    by_option, finding = compared(running(runs), FILE)
+    assert by_option.text.count(", not ") == 4
     assert finding.text.count(", not ") == SHOWN
-    assert f"and {len(differences(runs, FILE)) - SHOWN} more" in finding.text
+    assert f"and {len(differences(runs, FILE)) - 4 - SHOWN} more" in finding.text

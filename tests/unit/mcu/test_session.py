@@ -15,6 +15,7 @@ from acsard.mcu.check import seal
 from acsard.mcu.feedback import APART_NS, Feedback
 from acsard.mcu.link_state import BAD_LINES, GOOD_LINES
 from acsard.mcu.session import LONG_GAP_NS, McuSession
+from acsard.mcu.whose_silence import is_ours
 from acsard.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
 
@@ -28,8 +29,10 @@ SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 class Bench:
     """A session, its time, and a port that can be opened and closed."""
 
-    def __init__(self, mcu: McuConfig | None = None, rate_hz: float = 100.0) -> None:
-        self.session = McuSession(mcu or McuConfig(), rate_hz)
+    def __init__(
+        self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
+    ) -> None:
+        self.session = McuSession(mcu or McuConfig(), rate_hz, longest_reply=longest_reply)
         self.now_ns = 1000 * MS
         self.opened = 0
         self.port_open = False
@@ -740,8 +743,42 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
     assert "nothing at all heard" in bench.session.words()
 
 
-def test_lines_too_far_apart_are_still_told_as_that() -> None:
-    bench = Bench().open()
+@pytest.mark.parametrize(
+    ("apart", "longest", "told", "untold"),
+    [
+        (20, 0.25, "set mcu.reply_period = 0.20", "seldom"),
+        (20, 0.15, "every 0.15 s or sooner", "mcu.reply_period"),
+        (74, 0.25, "every 0.25 s or sooner", "mcu.reply_period"),
+        (136, 0.25, "every 0.25 s or sooner", "mcu.reply_period"),
+    ],
+)
+def test_lines_too_far_apart_are_told_and_no_setting_that_would_be_refused(
+    apart: int, longest: float, told: str, untold: str
+) -> None:
+    bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
-        bench.wait(10, *([] if tick % 20 else [GOOD]))
-    assert "set mcu.reply_period = 0.20" in bench.session.words()
+        bench.wait(10, *([] if tick % apart else [GOOD]))
+    assert f"lines come {apart / 100:.2f} s apart" in bench.session.words()
+    assert told in bench.session.words()
+    assert untold not in bench.session.words()
+
+
+def test_one_silence_is_no_clock_of_the_boards_own() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up()
+    for _ in range(20):
+        bench.wait(10)
+    bench.wait(10, GOOD)
+    assert (bench.link(), "reply_period" in bench.session.words()) == ("stale", False)
+
+
+@pytest.mark.parametrize("port", ["sim", "/dev/board"])
+def test_lines_that_we_were_late_to_hear_are_no_advice_about_the_board(port: str) -> None:
+    bench = Bench(McuConfig(port=port)).up()
+    told = set()
+    for _ in range(20):  # a step of this computer's is late, and finds what came meanwhile
+        bench.wait(200)
+        told.add(bench.session.words())
+        bench.wait(10, GOOD)
+        told.add(bench.session.words())
+    assert not [words for words in told if "reply_period" in words or "seldom" in words]
+    assert any(is_ours(words) for words in told)

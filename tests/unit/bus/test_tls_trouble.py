@@ -1,0 +1,32 @@
+"""Why a TLS endpoint cannot be reached: each way the connection ends has its sentence."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from typing import Any
+
+import pytest
+
+from acsard.bus.tls_trouble import trouble
+
+
+@pytest.mark.parametrize(
+    ("number", "told", "untold"),
+    [
+        (errno.EHOSTUNREACH, "robot.local is not there (No route to host)", "listens"),
+        (errno.ENETUNREACH, "robot.local is not there (Network is unreachable)", "listens"),
+        (errno.ECONNREFUSED, "nobody listens on port 7449 of robot.local", "not there"),
+    ],
+)
+def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
+    number: int, told: str, untold: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def connection(*_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    found = trouble("tls/robot.local:7449", "")
+    assert told in found
+    assert untold not in found
