@@ -175,7 +175,9 @@ class Page:
         if self._tries.spent(peer, now_ns):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
         self._tries.failed(peer, now_ns)
-        return Refusal("bad_token", "this token has ended, was revoked, or never was one")
+        return Refusal(
+            "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
+        )
 
     def refused(self, why: Refusal, origin: str) -> web.Response:
         """The answer to who may not, counted; `origin` is for the log."""
