@@ -18,8 +18,11 @@ from acsard.values import ROLES
 if TYPE_CHECKING:
     from acsard.config.settings import Config
     from acsard.web.listen import Listen
+    from acsard.web.tokens import Vault
 
-MOST_DAYS = 3650
+MOST_DAYS, MOST_HOURS = 3650, 72
+
+USUAL_DAYS = 30
 
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
@@ -53,8 +56,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     doing.add_argument("--tokens", action="store_true", help="list the tokens")
     doing.add_argument("--revoke", metavar="NAME", help="end a token; its pages close at once")
     parser.add_argument("--name", type=_name, help="of the token: whose it is (default: the role)")
-    parser.add_argument(
-        "--days", type=_days, default=30, metavar="N", help="until the token ends (default 30)"
+    lasting = parser.add_mutually_exclusive_group()
+    lasting.add_argument(
+        "--days", type=_days, metavar="N", help=f"until the token ends (default {USUAL_DAYS})"
+    )
+    lasting.add_argument(
+        "--hours", type=_hours, metavar="N", help=f"the same, for a visitor: 1 to {MOST_HOURS}"
     )
     parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
@@ -75,9 +82,9 @@ def main(args: argparse.Namespace) -> int:
     if args.invite:
         return _invite(args, config, where)
     if args.tokens:
-        return _list()
+        return _list(_vault(args, config))
     if args.revoke:
-        return _revoke(args.revoke)
+        return _revoke(_vault(args, config), args.revoke)
     return _serve(args, config)
 
 
@@ -126,7 +133,6 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     import segno
 
     from acsard.web.listen import invitations, require_certificate
-    from acsard.web.tokens import Vault, place
 
     tls, listen = args.tls or config.bus.tls, _listen(args, config)
     require_certificate(listen, tls)
@@ -137,9 +143,11 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
             '"https://0.0.0.0:8443" there, or name another file by --config (or --address); and '
             "`acsard lan init` makes a certificate"
         )
-    vault = Vault(place())
-    text, token = vault.invite(args.invite, args.name or args.invite, args.days)
-    print(f"{token.name} is {token.role} until {_clock(token.ends)}; the link is shown only now:\n")
+    vault = _vault(args, config)
+    days = 0 if args.hours else args.days or USUAL_DAYS
+    text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
+    until = f"{_clock(token.ends)}, for {lasts(token.ends - token.made)}"
+    print(f"{token.name} is {token.role} until {until}; the link is shown only now:\n")
     for url in urls:
         print(f"  {url}#token={text}")
     print()
@@ -150,25 +158,43 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     return int(Exit.OK)
 
 
-def _list() -> int:
+def _vault(args: argparse.Namespace, config: Config) -> Vault:
+    """The tokens of the robot that is meant."""
+    from acsard.bus.address import address_of
     from acsard.web.tokens import Vault, place
 
-    vault = Vault(place())
-    tokens = vault.all()
+    return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)
+
+
+def _list(vault: Vault) -> int:
+    tokens, now_s = vault.all(), time.time()
     for one in tokens:
-        ended = "  (ended)" if one.ends <= time.time() else ""
-        print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}{ended}")
+        left = f"{lasts(one.ends - now_s)} left" if one.ends > now_s else "ended"
+        print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
     if not tokens:
-        print(f"no tokens in {vault.path}")
+        print(f"no tokens of {vault.robot} in {vault.path}")
+    if older := [one.name for one in tokens if not one.robot]:
+        print(
+            f"made before tokens had a robot, so they open the page of any here: {', '.join(older)}"
+            "; --revoke and --invite them anew"
+        )
     return int(Exit.OK)
 
 
-def _revoke(name: str) -> int:
-    from acsard.web.tokens import Vault, place
-
-    Vault(place()).revoke(name)
+def _revoke(vault: Vault, name: str) -> int:
+    vault.revoke(name)
     print(f"{name} counts no more")
     return int(Exit.OK)
+
+
+def lasts(seconds: float) -> str:
+    """For how long, in words, rounded."""
+    count, unit = round(seconds / 60), "minute"
+    if count >= 60:
+        count, unit = round(seconds / 3600), "hour"
+    if count >= 72 and unit == "hour":
+        count, unit = round(seconds / 86400), "day"
+    return f"{count} {unit}{'' if count == 1 else 's'}"
 
 
 def _clock(seconds: int) -> str:
@@ -182,6 +208,15 @@ def _name(text: str) -> str:
 
 
 def _days(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= MOST_DAYS:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to {MOST_DAYS}")
+    return _whole(text, MOST_DAYS, "days", "; for less than a day --hours")
+
+
+def _hours(text: str) -> int:
+    return _whole(text, MOST_HOURS, "hours", "; for more --days")
+
+
+def _whole(text: str, most: int, units: str, else_: str) -> int:
+    if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
+        words = f"{text} is no whole number of {units} from 1 to {most}{else_}"
+        raise argparse.ArgumentTypeError(words)
     return int(text)

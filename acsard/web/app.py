@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from aiohttp import web
+from msgspec.structs import replace
 
 from acsard.host import clock
 from acsard.host.threads import in_thread
@@ -26,6 +27,7 @@ from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports
 from acsard.web.requests import (
     COOKIE,
+    STATUS,
     asked_of,
     body_of,
     keep_little,
@@ -47,16 +49,6 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 OPEN = ("/", "/token", "/favicon.ico")
 """For everybody: a page has to be there before it can say who shows it."""
-
-STATUS: dict[Reason, int] = {
-    "no_token": 401,
-    "bad_token": 401,
-    "too_fast": 429,
-    "too_many": 503,
-    "path": 404,
-    "malformed": 400,
-}
-"""403 for all others."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """What aiohttp refuses by itself; anything else is malformed."""
@@ -143,20 +135,21 @@ class Page:
         asked = asked_of(request)
         spot = place(asked, self._names | {own_address(request)})
         if isinstance(spot, Refusal):
-            return self.refused(spot)
+            return self.refused(spot, asked.peer)
         acts = request.method not in ("GET", "HEAD") or request.path == "/ws"
         if acts or request.path.startswith(("/api", "/metrics", "/report")):
             strange = foreign(asked)
             if strange is not None:
-                return self.refused(strange)
+                return self.refused(strange, asked.peer)
+        here = replace(MAINTAINER, address=asked.peer)
         try:
             if request.path in OPEN or request.path.startswith("/page/"):
-                request[WHO] = MAINTAINER if spot == "here" else None
+                request[WHO] = here if spot == "here" else None
             else:
                 shown = token_shown(request)
-                who = MAINTAINER if spot == "here" else await self._known(asked.peer, shown)
+                who = here if spot == "here" else await self._known(asked.peer, shown)
                 if isinstance(who, Refusal):
-                    return self.refused(who)
+                    return self.refused(who, asked.peer)
                 request[WHO] = who
             return await handler(request)
         except TimeoutError:
@@ -166,7 +159,9 @@ class Page:
         except web.HTTPException as error:
             if error.status < 400:
                 raise
-            self._counts.refuse(REASONS.get(error.status, "malformed"))
+            known = request.get(WHO)
+            origin = asked.peer if known is None else known.origin
+            self._counts.refuse(REASONS.get(error.status, "malformed"), origin)
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     async def _known(self, peer: str, shown: str) -> Who | Refusal:
@@ -176,25 +171,27 @@ class Page:
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
         who = await in_thread(lambda: self._vault.who(shown), READ_S)
         if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
-            return who
+            return replace(who, address=peer)
         if self._tries.spent(peer, now_ns):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
         self._tries.failed(peer, now_ns)
-        return Refusal("bad_token", "this token has ended, was revoked, or never was one")
+        return Refusal(
+            "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
+        )
 
-    def refused(self, why: Refusal) -> web.Response:
-        """The answer to who may not, counted."""
-        self._counts.refuse(why.reason)
+    def refused(self, why: Refusal, origin: str) -> web.Response:
+        """The answer to who may not, counted; `origin` is for the log."""
+        self._counts.refuse(why.reason, origin)
         return problem(STATUS.get(why.reason, 403), why.text)
 
     async def _token(self, request: web.Request) -> web.StreamResponse:
         """A token becomes a cookie, which no script can read."""
-        text = await token_posted(request)
+        text, peer = await token_posted(request), peer_of(request)
         if not request.secure:
-            return self.refused(Refusal("plain", "here you need no token"))
-        who = await self._known(peer_of(request), text)
+            return self.refused(Refusal("plain", "here you need no token"), peer)
+        who = await self._known(peer, text)
         if isinstance(who, Refusal):
-            return self.refused(who)
+            return self.refused(who, peer)
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
@@ -223,7 +220,7 @@ class Page:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         who, peer = _who(request), peer_of(request)
         if full := self._seats.enter(peer, who.token):
-            answer = self.refused(Refusal("too_many", full))
+            answer = self.refused(Refusal("too_many", full), who.origin)
             answer.force_close()  # who asks again and again keeps no connection either
             return answer
         try:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from acsard.web.counts import Counts
 from acsard.web.limits import Places
+from acsard.web.who import unmapped
 
 SOCKETS, SOCKETS_OF_ONE = 256, 64
 """TCP connections: a browser opens six beside its WebSocket."""
@@ -56,10 +57,10 @@ class _Door(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer = transport.get_extra_info("peername")
-        self._peer = str(peer[0]) if peer else ""
+        self._peer = unmapped(str(peer[0])) if peer else ""
         self._transport = transport
         if not self._places.enter(self._peer):
-            self._gate.counts.refuse("crowded")
+            self._gate.counts.refuse("crowded", self._peer)
             transport.abort()  # type: ignore[attr-defined]
             return
         self._inner = self._make()
@@ -76,7 +77,7 @@ class _Door(asyncio.Protocol):
             self._timer = asyncio.get_running_loop().call_later(REQUEST_S, self._give_up)
 
     def _give_up(self) -> None:
-        self._gate.counts.refuse("slow")
+        self._gate.counts.refuse("slow", self._peer)
         self._transport.abort()  # type: ignore[attr-defined]
 
     def data_received(self, data: bytes) -> None:

@@ -70,7 +70,7 @@ class Programs:
     async def guide(self, who: Who, guide: Guide) -> web.Response:
         """What may be begun: a check of the board, a calibration."""
         if not who.may("maintainer"):
-            self._counts.refuse("role")
+            self._counts.refuse("role", who.origin)
             raise TroubleError(403, f"checks and calibrations are for maintainers, not {who.role}")
         choices = await guide.choices(simulated=self._robots.about.simulated)
         body = msgspec.json.encode(choices)
@@ -80,10 +80,10 @@ class Programs:
         """The last value of a key."""
         row = row_of(key) if openapi.PLAIN.match(key) else None
         if row is None or not openapi.asked(row):
-            self._counts.refuse("path")
+            self._counts.refuse("path", who.origin)
             raise TroubleError(404, f"{key!r} is no key to ask for; GET /api lists them")
         if not who.may(least := least_role(key)):
-            self._counts.refuse("role")
+            self._counts.refuse("role", who.origin)
             words = f"{key} is for who is {least}; you are {who.role}: {MAY[who.role]}"
             raise TroubleError(403, words)
         try:
@@ -99,12 +99,12 @@ class Programs:
         try:
             given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            self._counts.refuse("malformed")
+            self._counts.refuse("malformed", who.origin)
             raise TroubleError(400, f"the body is to be a JSON object: {error}") from None
         try:
             reply = await self._calls.call(who, verb, given)
         except RefusedError as error:
-            self._counts.refuse("role" if error.role else "path")
+            self._counts.refuse("role" if error.role else "path", who.origin)
             raise TroubleError(403 if error.role else 404, str(error)) from None
         status = 200 if reply.success else 409
         body = msgspec.json.encode(reply)
@@ -136,7 +136,7 @@ class Programs:
         self._require_operator(who)
         body = self._reports.drawn(name)
         if body is None:
-            self._counts.refuse("path")
+            self._counts.refuse("path", who.origin)
             raise TroubleError(404, f"it is not drawn: POST /api/recordings/{name}/report first")
         headers = {
             "Content-Type": "text/html; charset=utf-8",
@@ -161,13 +161,13 @@ class Programs:
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
         if found is None:
-            self._counts.refuse("path")
+            self._counts.refuse("path", who.origin)
             raise TroubleError(404, "there is no such recording; GET /api/recordings lists them")
         return found
 
     def _require_operator(self, who: Who) -> None:
         if not who.may("operator"):
-            self._counts.refuse("role")
+            self._counts.refuse("role", who.origin)
             raise TroubleError(403, f"recordings are for operators; you are {who.role}")
 
     def _place(self) -> Path:

@@ -11,7 +11,7 @@ import msgspec
 from aiohttp import web
 
 from acsard.web.files import File
-from acsard.web.who import Asked, unmapped
+from acsard.web.who import Asked, Reason, unmapped
 
 COOKIE = "__Host-acsard"
 """By its name browsers take it only with Secure, of this host, for all paths."""
@@ -23,6 +23,16 @@ PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
 """How the headers begin by which a proxy says that it hands on what another asked."""
 
 NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
+
+STATUS: dict[Reason, int] = {
+    "no_token": 401,
+    "bad_token": 401,
+    "too_fast": 429,
+    "too_many": 503,
+    "path": 404,
+    "malformed": 400,
+}
+"""403 for all others."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",

@@ -89,7 +89,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
     hand = Hand(lambda: robots.client, counts)
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
     calls, fleet = Calls(robots, guide.stop), Fleet(robots)
-    vault, gate = Vault(wanted.state), Gate(counts)
+    vault, gate = Vault(wanted.state, wanted.address.robot_id), Gate(counts)
     page = Page(robots, hand, calls, fleet, counts, vault, names, gate, guide, wanted.page)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,

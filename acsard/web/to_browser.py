@@ -45,8 +45,12 @@ class Following:
 class Outgoing:
     """To one client."""
 
-    def __init__(self, socket: web.WebSocketResponse, request: web.Request, counts: Counts) -> None:
+    def __init__(
+        self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
+    ) -> None:
+        """`origin` is who it is, for the log."""
         self._socket, self._transport, self._counts = socket, request.transport, counts
+        self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """By robot and key."""
         self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
@@ -64,7 +68,7 @@ class Outgoing:
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Counted, and told once a second for each reason."""
-        self._counts.refuse(reason)
+        self._counts.refuse(reason, self._origin)
         now_ns = clock.mono_ns()
         if now_ns - self._told.get(reason, -TELL_NS) >= TELL_NS:
             self._told[reason] = now_ns

@@ -28,9 +28,10 @@ FILE, MODE = "tokens.json", 0o600
 SERVICE = Path("/var/lib/acsard-web")
 """The state directory of the service."""
 
-DAY_S = 86400
+HOUR_S, DAY_S = 3600, 86400
 
 MOST = 200
+"""Of one robot."""
 
 
 class Token(Struct, frozen=True):
@@ -43,13 +44,17 @@ class Token(Struct, frozen=True):
     """Seconds since 1970."""
     ends: int
     """The same."""
+    robot: str = ""
+    """The id of the robot whose page it opens; "" is any: it was made before tokens had one."""
 
 
 class Vault:
-    """The tokens in a file that only its owner may read; read again when it has changed."""
+    """The tokens in a file that only its owner may read; read again when it has changed. Robots of
+    one user share the file, and each sees its own tokens alone."""
 
-    def __init__(self, directory: Path) -> None:
-        self.path = directory / FILE
+    def __init__(self, directory: Path, robot: str = "") -> None:
+        """`robot` is its id."""
+        self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
         """Its stamp and its tokens: one value, since several threads look."""
 
@@ -71,7 +76,14 @@ class Vault:
         return max(0, int(max(ends, default=0) - time.time()))
 
     def all(self) -> list[Token]:
-        """All there are, also those that have ended; none where they cannot be read."""
+        """Those of this robot, also what has ended; none where they cannot be read."""
+        return [one for one in self._shared() if self._ours(one)]
+
+    def _ours(self, token: Token) -> bool:
+        return token.robot in ("", self.robot)
+
+    def _shared(self) -> list[Token]:
+        """Those of all robots that share the file."""
         try:
             seen = self.path.stat()
             stamp = seen.st_mtime_ns, seen.st_ino
@@ -97,27 +109,31 @@ class Vault:
             "do the same with sudo"
         )
 
-    def invite(self, role: Role, name: str, days: int) -> tuple[str, Token]:
-        """A new token, to be shown once, and what is kept of it; raises `UsageError`."""
+    def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
+        """A new token, to be shown once, and what is kept of it, which ends after so many days and
+        hours; raises `UsageError`."""
         with self._changing() as tokens:
             now_s = int(time.time())
             tokens[:] = [one for one in tokens if one.ends > now_s]
-            if any(one.name == name for one in tokens):
+            ours = [one for one in tokens if self._ours(one)]
+            if any(one.name == name for one in ours):
                 raise UsageError(f"there is a token {name} already: another --name, or --revoke it")
-            if len(tokens) >= MOST:
+            if len(ours) >= MOST:
                 raise UsageError(f"there are {MOST} tokens already: --revoke some")
             text = secrets.token_urlsafe(32)
-            token = Token(name, role, _digest(text), now_s, now_s + days * DAY_S)
+            ends = now_s + days * DAY_S + hours * HOUR_S
+            token = Token(name, role, _digest(text), now_s, ends, self.robot)
             tokens.append(token)
         return text, token
 
     def revoke(self, name: str) -> None:
         """It counts no more, from now on; raises `UsageError` where there is none."""
         with self._changing() as tokens:
-            if all(one.name != name for one in tokens):
-                known = ", ".join(one.name for one in tokens) or "none"
+            ours = [one for one in tokens if self._ours(one)]
+            if all(one.name != name for one in ours):
+                known = ", ".join(one.name for one in ours) or "none"
                 raise UsageError(f"there is no token {name}; there are: {known}")
-            tokens[:] = [one for one in tokens if one.name != name]
+            tokens[:] = [one for one in tokens if one.name != name or not self._ours(one)]
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:

@@ -13,6 +13,7 @@ from aiohttp.web_protocol import RequestHandler
 
 from acsard.web.counts import Counts
 from acsard.web.requests import HEADERS, problem
+from acsard.web.who import unmapped
 
 NO_HOST = "there is no `Host` in it: which name of this robot do you ask?"
 
@@ -41,7 +42,8 @@ class Reader(RequestHandler):
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith(MISSING)
-        self._counted.refuse("host" if nameless else "malformed")
+        peer = unmapped(request.remote or "")
+        self._counted.refuse("host" if nameless else "malformed", peer)
         response = problem(status, NO_HOST if nameless else NO_REQUEST)
         response.headers.update(HEADERS)
         response.force_close()

@@ -78,7 +78,7 @@ class Viewer:
         self._fleet, self._guide, self._counts = fleet, guide, counts
         self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
         self._overruns = self._calling = 0
-        self._out = Outgoing(socket, request, counts)
+        self._out = Outgoing(socket, request, counts, who.origin)
         self._keys = Keys(self._out, robots, self._start, who.token or who.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
@@ -122,7 +122,7 @@ class Viewer:
         if self._ended:
             return True  # until the socket is closed, which one who does not read delays
         if message.type == aiohttp.WSMsgType.ERROR:
-            self._counts.refuse("too_big")
+            self._counts.refuse("too_big", self.who.origin)
             return False
         if message.type != aiohttp.WSMsgType.TEXT:
             self._out.refuse("message", "malformed", "messages are JSON as text")
@@ -218,7 +218,7 @@ class Viewer:
             reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
             ok, text = reply.success, reply.message
         except RefusedError as error:
-            self._counts.refuse("role" if error.role else "malformed")
+            self._counts.refuse("role" if error.role else "malformed", self.who.origin)
             ok, text = False, str(error)
         finally:
             if frame.call != "stop":

@@ -36,6 +36,13 @@ class Who(Struct, frozen=True):
     name: str
     token: str = ""
     """What his token is known by; "" for one at the machine."""
+    address: str = ""
+    """Where he comes from."""
+
+    @property
+    def origin(self) -> str:
+        """Address and name, as the log tells whom it refused."""
+        return f"{self.address} ({self.name})" if self.token else self.address
 
     def may(self, least: Role) -> bool:
         """Has he at least this role?"""

@@ -262,5 +262,28 @@ def test_what_is_refused_is_a_line_a_second_in_the_log_by_reason_and_never_with_
 
     run(story)
     until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all are told")
+    assert " from 127.0.0.1" in lines()[-1]["text"]
     assert len(lines()) - told <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr
+
+
+def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
+    page: Page, bus: Bus, viewer: str, operator: str
+) -> None:
+    def told(words: str) -> bool:
+        return any(words in line for line in list(page.err) if "page_refused" in line)
+
+    async def story() -> None:
+        async with hands(page, viewer) as theirs, page.client(viewer) as program:
+            await theirs.drive(0.1)
+            async with program.get(f"{page.away}/api/config") as answer:
+                assert answer.status == 403
+        async with hands(page, operator) as ours:
+            for _ in range(2):
+                await ours.say(cmd={"linear_x": 0, "angular_z": 0}, stamp=1763700000000.0)
+            await ours.find(lambda said: said.get("reason", "").startswith("stamp must"))
+
+    run(story)
+    until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")
+    assert not told(viewer)
+    assert not told(operator)

@@ -1,12 +1,16 @@
-"""`acsard web`: what it says where nobody could come."""
+"""`acsard web`: what it says where nobody could come, and of tokens."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from acsard.cli import main
+from acsard.cli.web import lasts
+from acsard.lan.authority import Authority
+from acsard.web.tokens import Vault
 
 
 def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
@@ -18,3 +22,72 @@ def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
     told = capsys.readouterr().err
     assert "acsard.toml" in told
     assert "--config" in told
+
+
+@pytest.fixture
+def told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """What a call that goes well says, with a certificate and a state directory of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    Authority.make(Path("tls"), "test", 1).issue(Path("tls"), "robot", ["localhost"], 1)
+    where = ["--tls", "tls", "--address", "https://127.0.0.1:8443"]
+
+    def called(*words: str, robot: str = "robot1") -> str:
+        capsys.readouterr()
+        assert main(["web", *where, "--id", robot, *words]) == 0
+        return capsys.readouterr().out
+
+    return called
+
+
+def test_a_visitor_is_invited_for_an_hour_which_the_link_and_the_list_say(
+    told: Callable[..., str],
+) -> None:
+    assert ", for 1 hour; the link" in told("--invite", "viewer", "--hours", "1")
+    assert ", for 30 days; the link" in told("--invite", "operator")
+    rows = told("--tokens").splitlines()
+    assert [row.rpartition(", ")[2] for row in rows] == ["1 hour left", "30 days left"]
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("--days", "0"), "--hours"),
+        (("--days", "0.0003"), "--hours"),
+        (("--hours", "0"), "1 to 72"),
+        (("--hours", "73"), "--days"),
+        (("--hours", "1", "--days", "1"), "not allowed with"),
+    ],
+)
+def test_how_long_a_token_lasts_is_whole_and_said_once(
+    words: tuple[str, ...], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["web", "--invite", "viewer", *words])
+    assert hint in capsys.readouterr().err
+
+
+def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..., str]) -> None:
+    told("--invite", "operator", "--name", "phone")
+    told("--invite", "viewer", "--name", "phone", robot="robot2")
+    assert "operator" in told("--tokens")
+    assert "operator" not in told("--tokens", robot="robot2")
+    assert "no tokens of robot3" in told("--tokens", robot="robot3")
+
+
+def test_tokens_of_before_they_had_a_robot_are_told(
+    told: Callable[..., str], tmp_path: Path
+) -> None:
+    Vault(tmp_path / "state").invite("viewer", "tv", 1)
+    told("--invite", "operator", "--name", "phone")
+    for robot in ("robot1", "robot2"):
+        assert "open the page of any here: tv; --revoke" in told("--tokens", robot=robot)
+
+
+def test_how_long_is_said_in_one_unit() -> None:
+    said = [lasts(s) for s in (20, 60, 2000, 3599.9, 71 * 3600, 3 * 86400, 30 * 86400 - 1)]
+    assert said == [
+        "0 minutes", "1 minute", "33 minutes", "1 hour", "71 hours", "3 days", "30 days",
+    ]  # fmt: skip

@@ -14,7 +14,7 @@ from acsard.web.to_browser import Following, Outgoing
 
 def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:
     async def story() -> None:
-        out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts())
+        out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
         one = Following("acsar", "state", "acsar", 0.1)
         one.stream = Stream()
         due = await out._send_due(one, 100.03)

@@ -104,5 +104,35 @@ def test_where_one_may_not_write_it_says_so(tmp_path: Path) -> None:
         Vault(tmp_path / "state").invite("viewer", "tv", 1)
 
 
+def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) -> None:
+    first, second = Vault(tmp_path, "robot1"), Vault(tmp_path, "robot2")
+    ours, _ = first.invite("operator", "phone", 1)
+    theirs, token = second.invite("viewer", "phone", 1)
+    assert first.who(ours) is not None
+    assert second.who(ours) is None
+    assert first.who(theirs) is None
+    assert [one.robot for one in second.all()] == ["robot2"]
+    assert second.counting() == {token.digest}
+    assert first.left_s(token.digest) == 0
+    first.revoke("phone")
+    assert (first.all(), [one.name for one in second.all()]) == ([], ["phone"])
+    with pytest.raises(UsageError, match="there are: none"):
+        first.revoke("phone")
+
+
+def test_tokens_of_before_they_had_a_robot_count_for_any(tmp_path: Path) -> None:
+    text, token = Vault(tmp_path).invite("operator", "phone", 1)
+    older = msgspec.to_builtins(token)
+    del older["robot"]
+    Vault(tmp_path).path.write_bytes(msgspec.json.encode([older]))
+    for robot in ("robot1", "robot2"):
+        vault = Vault(tmp_path, robot)
+        assert vault.who(text) is not None
+        with pytest.raises(UsageError, match="there is a token phone already"):
+            vault.invite("viewer", "phone", 1)
+    Vault(tmp_path, "robot1").revoke("phone")
+    assert Vault(tmp_path, "robot2").who(text) is None
+
+
 def test_what_is_kept_has_no_more_than_it_needs() -> None:
-    assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends")
+    assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends", "robot")
