@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread, Timer
 
 import pytest
 
@@ -150,6 +151,35 @@ def test_a_wrong_id_is_asked_about_before_any_list(
     assert f"acsard/robot1/{key}" in told
     assert told.index("is --id right") < told.index("role's list")
     assert "add that name" not in told
+
+
+def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
+    """What `echo` says of its certificate's end, after so many s; None when it came too late."""
+    robot.certificates.issue(own, "viewer", lasts / 86400)
+    words = acsard("echo", "state", "--connect", robot.tls, "--tls", str(own))
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as one:
+        assert one.stdout is not None
+        assert one.stderr is not None
+        if '"mode"' not in one.stdout.readline():
+            return None
+        patience = Timer(lasts + 60.0, one.kill)
+        for thread in (patience, Thread(target=one.stdout.read, daemon=True)):
+            thread.start()
+        try:
+            return next((line for line in one.stderr if "has ended" in line), "")
+        finally:
+            patience.cancel()
+            one.kill()
+
+
+@pytest.mark.slow
+def test_a_certificate_that_ends_while_one_follows_is_told(robot: Robot, tmp_path: Path) -> None:
+    told = None
+    for lasts in (7.0, 60.0):  # the longer one where a busy machine takes the shorter to start
+        if told is None:
+            told = followed_to_its_end(robot, tmp_path / f"{lasts:g}", lasts)
+    assert told
+    assert "certificate.pem" in told
 
 
 @pytest.mark.slow
