@@ -95,20 +95,22 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
     from acsard.bus.session import log_from_environment
     from acsard.host.logs import Log
     from acsard.web import server, tokens
+    from acsard.web.listen import opened_by
 
-    def announce(urls: Sequence[str]) -> None:
-        asked = [one.url for one in listen]
-        for url, wished in zip(urls, asked, strict=True):
-            taken = "" if url == wished else f"  ({wished} is taken)"
-            print(f"  page    {url}{taken}", flush=True)
+    def announce(found: Sequence[Listen]) -> None:
+        for one, wished in zip(found, listen, strict=True):
+            taken = "" if one == wished else f"  ({wished.url} is taken)"
+            for url in opened_by(one, tls):
+                print(f"  page    {url}{taken}", flush=True)
 
+    tls = args.tls or config.bus.tls
     listen = _listen(args, config)
     log_from_environment()
     wanted = server.Wanted(
         config,
         address_of(config, args.connect, args.id, args.tls),
         listen,
-        args.tls or config.bus.tls,
+        tls,
         tokens.place(),
         args.config or "",
         next_port=args.held,

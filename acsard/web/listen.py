@@ -90,6 +90,11 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
+def opened_by(one: Listen, tls: str) -> list[str]:
+    """What opens it in a browser: from elsewhere what an invitation says."""
+    return invitations([one], tls) if one.secure else [one.url]
+
+
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
     """Raises a `MendableError` where one may come by HTTPS and there is nothing to show him."""
     away = [one for one in listen if one.secure]

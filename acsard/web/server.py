@@ -74,8 +74,8 @@ class Wanted(Struct, frozen=True):
     page: Path = PAGE
 
 
-async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: Log) -> None:
-    """Until a signal; `announce` is told once where it is. Raises `MendableError`s."""
+async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
+    """Until a signal; `announce` is told once where it listens. Raises `MendableError`s."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -109,7 +109,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[str]], None], log: 
                 backlog=128,
             )
             stack.callback(server.close)
-        announce([one.url for one, _ in places])
+        announce([one for one, _ in places])
         stack.callback(asyncio.create_task(_tell(counts, log)).cancel)
         await _until(leaving, robots, hand, page, wanted)
         page.end_all("the page's server ends")

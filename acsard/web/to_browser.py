@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 import aiohttp
 import msgspec
@@ -24,6 +25,9 @@ UNREAD_BYTES = 32768
 
 UNREAD_FRAMES = 200
 """Answers that wait to go out; the oldest are dropped beyond."""
+
+CLOSES_S = 1.0
+"""For the client's answer to a close; then the connection is cut."""
 
 TELL_NS = NS_PER_S
 """A refusal of one reason is told so often at most; all are counted."""
@@ -56,6 +60,7 @@ class Outgoing:
         self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
+        self._closing = False
 
     def say(self, message: object) -> None:
         """As soon as the client reads."""
@@ -93,12 +98,27 @@ class Outgoing:
             pass  # it is closing, which `run` sees
 
     async def close(self, why: str) -> None:
-        """End the connection; `why` is at most 120 characters."""
-        await self._socket.close(code=aiohttp.WSCloseCode.POLICY_VIOLATION, message=why.encode())
+        """Tell the client to end the connection; `why` is at most 120 characters.
+
+        Cut at once, it could not answer, and many programs would take that for a network that is
+        gone, whatever was said before.
+        """
+        if self._closing:
+            return
+        self._closing = True
+        if self._transport is not None:
+            asyncio.get_running_loop().call_later(CLOSES_S, self._transport.abort)
+        said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
+        with suppress(ConnectionError):
+            await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
+
+    async def _send(self, text: bytes) -> None:
+        if not self._closing:  # nothing comes after a close
+            await self._socket.send_frame(text, aiohttp.WSMsgType.TEXT)
 
     async def _send_what_waits(self) -> None:
         while self._out:
-            await self._socket.send_frame(self._out.popleft(), aiohttp.WSMsgType.TEXT)
+            await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
         """Send it if it is time and there is news; when it is due next, by the loop's clock."""
@@ -115,7 +135,7 @@ class Outgoing:
             else:
                 one.sent, value, age = stream.value()
                 frame = b'%b%b,"age":%.1f}' % (one.head, value, age)
-                await self._socket.send_frame(frame, aiohttp.WSMsgType.TEXT)
+                await self._send(frame)
         return one.due
 
     def _unread(self) -> int:

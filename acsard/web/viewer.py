@@ -96,8 +96,7 @@ class Viewer:
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
-                if not await self._take(message):
-                    break
+                self._take(message)
         finally:
             # First of all: who drove and is gone drives no more.
             self._release()
@@ -109,7 +108,9 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Close it from outside; `why` is at most 120 characters."""
+        """Send him away; `why` is at most 120 characters."""
+        if self._ended:
+            return
         self._ended = True
         self._release()
         self._guide.leave(self)
@@ -117,34 +118,31 @@ class Viewer:
 
     # what comes
 
-    async def _take(self, message: aiohttp.WSMessage) -> bool:
-        """One message; False when the connection is over."""
+    def _take(self, message: aiohttp.WSMessage) -> None:
+        """One message."""
         if self._ended:
-            return True  # until the socket is closed, which one who does not read delays
-        if message.type == aiohttp.WSMsgType.ERROR:
+            return  # he has to answer the close, or is cut
+        if message.type == aiohttp.WSMsgType.ERROR:  # which aiohttp ends the connection for
             self._counts.refuse("too_big", self.who.origin)
-            return False
+            return
         if message.type != aiohttp.WSMsgType.TEXT:
             self._out.refuse("message", "malformed", "messages are JSON as text")
-            return True
+            return
         room = self._bucket.take(clock.mono_ns())
+        if not room:
+            self._overruns += 1
         try:
             frame = decode(message.data)
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
-            return room or await self._overrun()
-        if room or isinstance(frame, Press) or (isinstance(frame, Call) and frame.call == "stop"):
-            self._obey(frame)
         else:
-            self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
-        return room or await self._overrun()
-
-    async def _overrun(self) -> bool:
-        self._overruns += 1
-        if self._overruns < OVERRUNS:
-            return True
-        await self._out.close("too many messages")
-        return False
+            urgent = isinstance(frame, Press) or (isinstance(frame, Call) and frame.call == "stop")
+            if room or urgent:
+                self._obey(frame)
+            else:
+                self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
+        if self._overruns >= OVERRUNS:
+            self.end("too many messages")
 
     def _obey(self, frame: Frame) -> None:
         self._guide.heard(self)

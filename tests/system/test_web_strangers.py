@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import re
 import socket
+import ssl
 import time
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from typing import Any
 
 import aiohttp
 import pytest
+import websockets
 
 from acsard.web.limits import (
     CONNECTIONS_ALIKE,
@@ -287,3 +291,48 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
     until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")
     assert not told(viewer)
     assert not told(operator)
+
+
+def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page, bus: Bus) -> None:
+    """A connection that ends before the close was answered is like a radio that is gone to it."""
+    vault = Vault(page.state / "acsard-web")
+    trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
+    wishes = (json.dumps({"cmd": {"linear_x": 0}, "stamp": 1.8e12 + n}) for n in itertools.count())
+
+    async def plain(name: str) -> tuple[int | None, str | None]:
+        """Reads by one task and drives by another; code and reason."""
+        async with (
+            page.client(page.invite("operator", name)) as session,
+            session.ws_connect(f"{page.away}/ws") as ours,
+        ):
+            driving = asyncio.create_task(drive(ours.send_str))
+            vault.revoke(name)
+            while (message := await ours.receive()).type == aiohttp.WSMsgType.TEXT:
+                pass
+            await driving
+            return ours.close_code, message.extra
+
+    async def other(name: str) -> tuple[int | None, str | None]:
+        """By another library, which answers by itself."""
+        told = {"Authorization": f"Bearer {page.invite('operator', name)}"}
+        url = page.away.replace("https", "wss") + "/ws"
+        async with websockets.connect(
+            url, ssl=trusted, host="127.0.0.1", additional_headers=told
+        ) as ours:
+            driving = asyncio.create_task(drive(ours.send))
+            vault.revoke(name)
+            await ours.wait_closed()
+            await driving
+            return ours.close_code, ours.close_reason
+
+    async def drive(send: Callable[[str], Awaitable[None]]) -> None:
+        with suppress(ConnectionError, websockets.ConnectionClosed):
+            while True:
+                await send(next(wishes))
+                await asyncio.sleep(0.01)
+
+    async def story() -> None:
+        told = await asyncio.gather(plain("trusted2"), other("trusted3"))
+        assert set(told) == {(1008, "your token has ended")}
+
+    run(story)

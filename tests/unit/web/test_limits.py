@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from acsard.values import NS_PER_S
 from acsard.web.limits import (
     CONNECTIONS,
@@ -124,3 +126,14 @@ def test_the_same_thing_again_takes_no_more_room_until_all_have_let_go() -> None
     assert not shares.enter("d", "tf")
     shares.leave("b", "state")
     assert shares.enter("d", "tf")
+
+
+def test_the_page_tells_the_places_that_there_are() -> None:
+    page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
+    told = " ".join(page.read_text(encoding="utf-8").split())
+    assert (
+        f"There is room for {CONNECTIONS} from elsewhere: at most {CONNECTIONS_OF_ONE} of one "
+        f"address (whatever their tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
+        f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
+    ) in told
+    assert f"At the machine there is room for {CONNECTIONS_HERE}, " in told

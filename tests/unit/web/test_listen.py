@@ -12,7 +12,15 @@ from acsard.cli import web
 from acsard.host.addresses import own_addresses
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.lan.authority import Authority
-from acsard.web.listen import Listen, bound, invitations, listens, own_name, require_certificate
+from acsard.web.listen import (
+    Listen,
+    bound,
+    invitations,
+    listens,
+    opened_by,
+    own_name,
+    require_certificate,
+)
 
 OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
 
@@ -57,6 +65,13 @@ def test_an_invitation_has_the_own_certified_addresses_that_are_listened_at(
     older = [at for at in own_addresses() if ":" not in at]
     newer = [f"[{at}]" for at in own_addresses() if ":" in at and host == "::"]
     assert told == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
+
+
+def test_the_page_says_that_it_is_opened_by_what_is_invited_to(tls: str) -> None:
+    away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
+    assert opened_by(away, tls) == invitations([away], tls)
+    assert f"https://{own_name()}:8443/" in opened_by(away, tls)
+    assert opened_by(here, "") == ["http://127.0.0.1:8080/"]
 
 
 @pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
