@@ -157,16 +157,24 @@ class Field:
             return next((one for one in since if not one.line.startswith(STEADY)), None)
 
         at = until(slower, 5.0, "it slows down").at
-        allowed = TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
+        allowed = self.allowed(gone, at)
         self.peer.awaits(ZERO_LINE.strip(), after=at)
         return at - gone, allowed
 
-    def obeyed(self, since: float) -> int:
+    def obeyed(self, gone: float) -> int:
         """The lines that grew when the timeout of the last command was over. Before that it counts,
         also after a moment in which a busy machine kept the answers from the daemon."""
-        lines = [one.line for one in self.peer.since(since) if one.line != EMPTY]
-        speeds = [abs(wheels(line)[0]) for line in lines]
-        return sum(after > before for before, after in itertools.pairwise(speeds))
+        lines = [one for one in self.peer.since(gone) if one.line != EMPTY]
+        grown = [
+            after.at
+            for before, after in itertools.pairwise(lines)
+            if abs(wheels(after.line)[0]) > abs(wheels(before.line)[0])
+        ]
+        return sum(at - gone > self.allowed(gone, at) for at in grown)
+
+    def allowed(self, gone: float, at: float) -> float:
+        """How long it may have taken from the one to the other."""
+        return TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
 
     def lets_go(self, way: Way, number: int) -> Round:
         """Drive, let go, and look until nothing of it can come any more."""
@@ -175,7 +183,7 @@ class Field:
         with way(self, number) as gone:
             took, allowed = self.braking(gone)
         self.settle()
-        return Round(took, allowed, self.obeyed(gone + allowed))
+        return Round(took, allowed, self.obeyed(gone))
 
 
 Way = Callable[[Field, int], AbstractContextManager[float]]
