@@ -326,7 +326,7 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
     ended = tool(shared, "call", "stop", "--id", "other")
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
-    assert "robot.id" in ended.err
+    assert "there is acsar: --id acsar" in ended.err
 
 
 @pytest.mark.parametrize("robot_id", ["a/b*", "", "**", "robot 1"])
