@@ -116,10 +116,10 @@ def stands(board: Board) -> Status:
 
 
 def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
-    """The commander sends neutral for longer than its timeout, then a speed."""
+    """The commander sends zeros until they count, a second of one whom only his key tells; then a
+    speed."""
     commander.wish = ZERO
-    before = bus.count("commands")
-    until(lambda: bus.count("commands") >= before + 10, 5.0, "neutral for half a second")
+    until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "neutral")
     commander.wish = twist(linear)
 
 
