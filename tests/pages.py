@@ -307,7 +307,8 @@ COMMANDS: dict[str, How] = {
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
     "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
     "--invite operator --name phone": BY_THE_SERVICE,
-    "sudo /opt/acsard/venv/bin/acsard web --revoke phone": BY_THE_SERVICE,
+    "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
+    "--revoke phone": BY_THE_SERVICE,
     'sudo sh -c "/opt/acsard/venv/bin/acsard lan renew && systemctl restart acsard"': Elsewhere(
         OPEN, "test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count"
     ),

@@ -101,7 +101,11 @@ def drive(
 
 def _require(**numbers: object) -> None:
     for name, value in numbers.items():
-        if not isinstance(value, Real) or not math.isfinite(value):
+        try:
+            finite = isinstance(value, Real) and math.isfinite(value)
+        except OverflowError:
+            raise UsageError(f"{name}: so large a number is no speed and no time") from None
+        if not finite:
             raise UsageError(f"{name} = {value!r}: it must be a finite number")
 
 

@@ -29,6 +29,10 @@ HEAD = struct.Struct("<BQ")
 """Of a record: what it is, and its bytes after this."""
 
 
+NOTHING_BYTES = 64 << 10
+"""What is larger than a beginning and a chunk had something in it, be it unreadable here."""
+
+
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     """Make a finished file `whole` of `part`; what there is to tell of it, "" where it went well.
 
@@ -38,11 +42,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     seen = part.stat()
     try:
         if not _begins(part):
+            if seen.st_size > NOTHING_BYTES:
+                raise RecordingError(f"{part} has no beginning that can be read")
             part.unlink()
             return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
-            if recording.damaged:
+            if recording.damaged or seen.st_size > NOTHING_BYTES:
                 raise RecordingError(f"{part} has nothing whole in it")
             part.unlink()
             return ""

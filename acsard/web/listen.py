@@ -109,7 +109,7 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """A socket at each, or at one of the next ports; raises `InUseError`."""
-    older = {one.port for one in listen if one.host == EVERYWHERE_4}
+    older = {one.port for one in listen if ":" not in one.host}
     return [_bound(one, next_port, one.port not in older) for one in listen]
 
 

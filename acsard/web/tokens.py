@@ -132,7 +132,9 @@ class Vault:
             ours = [one for one in tokens if self._ours(one)]
             if all(one.name != name for one in ours):
                 known = ", ".join(one.name for one in ours) or "none"
-                raise UsageError(f"there is no token {name}; there are: {known}")
+                raise UsageError(
+                    f"there is no token {name} of {self.robot} in {self.path}; there are: {known}"
+                )
             tokens[:] = [one for one in tokens if one.name != name or not self._ours(one)]
 
     @contextmanager
@@ -193,4 +195,4 @@ def place() -> Path:
 
 
 def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()

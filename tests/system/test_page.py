@@ -217,6 +217,22 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
         assert browser.js("document.getElementById('stick').matches('.held')") is False
 
 
+@pytest.mark.parametrize("other", ["MetaLeft", "menu"])
+def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, other: str) -> None:
+    browser, bus = page.browser, page.bus
+    browser.key("Down", "KeyW", "w")
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    if other == "menu":
+        browser.js("window.dispatchEvent(new MouseEvent('contextmenu'))")
+    else:
+        browser.ask(
+            "Input.dispatchKeyEvent", type="rawKeyDown", code=other, key="Meta", modifiers=4
+        )
+    bus.at_rest()
+    assert browser.js("document.getElementById('stick').matches('.held')") is False
+    browser.key("Up", "KeyW", "w")
+
+
 def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
     page.browser.tap("tab-events")
     page.server.process.kill()

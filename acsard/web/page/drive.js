@@ -110,6 +110,7 @@ export class Drive {
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
     document.addEventListener("visibilitychange", () => document.hidden && this.release("let go: the page was hidden"));
+    addEventListener("contextmenu", () => this.#by === "keys" && this.release("let go: a menu is open"), true);
     addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("let go: the gamepad is gone"));
     setInterval(() => this.#pad(), 50);
   }
@@ -138,6 +139,9 @@ export class Drive {
   }
 
   #key(event, down) {
+    // Of a key that is let go beside one of these some systems say nothing.
+    if (down && this.#by === "keys" && (event.metaKey || event.ctrlKey || event.altKey))
+      return this.release("let go: another key is down");
     if (!(event.code in KEYS)) return;
     // A key that is let go is let go, wherever the focus is by then and whatever else is down.
     if (!down && !this.#pressed.delete(event.code)) return;

@@ -280,6 +280,8 @@ def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
             numbers[place] = given
             with pytest.raises(UsageError, match=f"^{name} = .*finite"):
                 next(drive(world, *numbers))
+    with pytest.raises(UsageError, match="linear: so large a number"):
+        next(drive(world, 10**400, 0.0, 1.0))
     assert world.sent == []
 
 

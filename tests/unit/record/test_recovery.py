@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from acsard.config.settings import Config
 from acsard.record.closing import closing
 from acsard.record.file import Recording
-from acsard.record.recovery import recover
+from acsard.record.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import World
 
@@ -91,3 +91,6 @@ def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: 
         assert told in said
         assert bool(said) == bool(told)
         assert list(tmp_path.iterdir()) == []
+    part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
+    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert list(tmp_path.iterdir()) == [whole]

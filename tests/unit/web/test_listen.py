@@ -83,9 +83,10 @@ def test_what_is_listened_at_everywhere_is_reached_by_what_is_invited_to(
         assert {at for at in ("127.0.0.1", "::1") if reached(one.port, at)} == by
 
 
-def test_both_everywheres_share_a_port() -> None:
+@pytest.mark.parametrize("first", ["0.0.0.0", "127.0.0.1"])
+def test_both_everywheres_share_a_port(first: str) -> None:
     port = free_port()
-    for one, opened in bound([Listen(True, at, port) for at in ("0.0.0.0", "::")], next_port=False):
+    for one, opened in bound([Listen(True, at, port) for at in (first, "::")], next_port=False):
         with opened:
             assert reached(one.port, "::1" if one.host == "::" else "127.0.0.1")
 

@@ -44,7 +44,7 @@ def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
     assert token.digest not in vault.counting()
 
 
-@pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0"])
+@pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
 def test_what_never_was_a_token_is_nobody(tmp_path: Path, text: str) -> None:
     vault = Vault(tmp_path)
     vault.invite("viewer", "tv", 1)
