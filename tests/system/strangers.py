@@ -122,7 +122,7 @@ for _ in range(zeros):
     put(0.0)
     time.sleep(0.05)
 lets_go = []
-signal.signal(signal.SIGUSR1, lambda *_: lets_go.extend([0.0] * 10))
+signal.signal(signal.SIGUSR1, lambda *_: lets_go.extend([0.0] * 30))
 start, step = time.monotonic(), 0
 while True:
     put(lets_go.pop() if lets_go else speed)
@@ -132,7 +132,7 @@ while True:
 )
 """So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put.
 
-SIGUSR1 makes it let go: ten zeros, longer than the timeout of its source.
+SIGUSR1 makes it let go: thirty zeros, longer than the pause of whom only his key tells.
 """
 
 CODED_FLOOD = (

@@ -276,8 +276,8 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             assert waiting.value["mode"] == "ready"
             peer.await_lines(50)
             assert _moving_since(peer, zeros_from) is None
-            commander.wish = ZERO
-            peer.await_lines(30)
+            commander.wish = ZERO  # for a second: only his key tells who he is
+            until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "neutral")
             commander.wish = twist(0.5)
             until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 
