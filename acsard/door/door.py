@@ -17,7 +17,7 @@ from acsard.bus.access import door_access
 from acsard.bus.certificates import ends_ns, require_usable
 from acsard.bus.session import MAX_SESSIONS, door_session, reachable
 from acsard.config.settings import Config
-from acsard.door.watch import DOOR_EVENTS, UNANSWERED, Look, Watch
+from acsard.door.watch import DOOR_EVENTS, Look, Watch
 from acsard.host import clock
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import DoorState
@@ -29,6 +29,10 @@ CONNECT_S = 1.0
 
 ASK_NS = NS_PER_S
 """How often the daemon is asked, and how long it may take."""
+
+LET_GO_S = 60.0
+"""When Zenoh itself ends a question, which is no answer: long after enough of them were counted,
+also by a door that is kept waiting for a core between its looks."""
 
 
 class Door:
@@ -105,5 +109,5 @@ class Question:
         self._asked_ns = now_ns
         self._ended.clear()
         handler: Any = Callback(lambda reply: None, self._ended.set, indirect=False)
-        session.get(self._key, handler=handler, timeout=2 * UNANSWERED * ASK_NS / NS_PER_S)
+        session.get(self._key, handler=handler, timeout=LET_GO_S)
         return self._unanswered

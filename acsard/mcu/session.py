@@ -111,8 +111,9 @@ class McuSession:
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
                 self._link.excuse()
-            heard = self._hearing.now
-            heard.late_s = max(heard.late_s, self.lateness.step_s)
+            if self.lateness.step_s:
+                heard = self._hearing.now
+                heard.late_s = max(heard.late_s, self.lateness.step_s)
             self._judge(now.mono_ns)
         self._announce()
         return feedback
