@@ -189,7 +189,7 @@ def test_what_makes_it_brake_goes_in_the_period_whose_line_went_ahead(world: Wor
     assert sent_after(world, at_ns) == [4 * MS]
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(12)
 @pytest.mark.parametrize("phase_ms", [0.0, 1.7, 3.1, 4.9, 6.3, 8.8, 9.6])
 @pytest.mark.parametrize("apart_ms", [0.6, 2.2, 5.1, 9.4])
 def test_when_two_commanders_die_together_braking_starts_a_tick_after_the_timeout(

@@ -387,6 +387,7 @@ def waits_for(world: World, source: str = "nav") -> str:
     return {s.name: s.waits_for for s in world.state.sources}[source]
 
 
+@pytest.mark.variations(2)
 @by_each_way
 def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
     world: World, via: Via
@@ -478,6 +479,7 @@ def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
     assert world.state.counters["command_stale"] > 0
 
 
+@pytest.mark.variations(3)
 @by_each_way
 def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
     world: World, via: Via

@@ -122,6 +122,7 @@ def test_a_gyro_that_dies_is_told_and_the_wheels_go_on() -> None:
     assert told == ["waiting for rest", "used", "silent", "used"]
 
 
+@pytest.mark.slow
 def test_wheels_that_lose_their_grip_are_told() -> None:
     made = world()
     wandering(made, 5, seconds=20.0)

@@ -69,12 +69,14 @@ class Drive:
 REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "reporting"])
 
 
+@pytest.mark.variations(4)
 @REPORTS
 @pytest.mark.parametrize("stall", [0.09, 0.25])
 def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> None:
     assert Drive(World(Config(sim=FINE)), reports).error(stall) < 0.005
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(("every", "stall"), [(0.7, 0.05), (2.0, 0.09), (0.7, 0.15)])
 def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
     every: float, stall: float
@@ -84,6 +86,7 @@ def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
     assert drive.error() <= 1.05 * drive.floor + 0.0005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1.0, 2.0])
 def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(every: float) -> None:
     drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)

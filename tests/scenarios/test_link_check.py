@@ -128,6 +128,7 @@ def test_auto_drives_old_firmware_plainly_and_unharmed(
     assert not [name for name in world.state.counters if name.startswith("line_")]
 
 
+@pytest.mark.slow
 def test_auto_drives_a_sketch_that_reports_by_its_own_clock() -> None:
     world = World(config(reply_period=0.1, trailing_comma=True))
     with world.mcu.comma_latched(), world.mcu.unprompted(0.1):
@@ -452,6 +453,7 @@ def test_when_samples_stop_the_speeds_go_on_without_a_jump() -> None:
     assert off_by(world) < 0.01
 
 
+@pytest.mark.slow
 def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
     world = started(config("require", 3200))
     world.drive(0.5, seconds=1.0)

@@ -144,6 +144,7 @@ def counted(events: list[Event]) -> int:
     return sum(event.count for event in events)
 
 
+@pytest.mark.slow
 def test_refused_commands_are_a_line_a_second_by_reason_and_none_is_missing(world: World) -> None:
     for step in range(500):
         world.put("cmd/app" if step % 5 else "cmd/nobody", b'{"linear": {"x": 0.5}}')

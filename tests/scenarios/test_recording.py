@@ -46,6 +46,7 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert tally.poses == tally.poses_same >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

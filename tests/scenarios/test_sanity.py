@@ -27,7 +27,7 @@ def stopped(world: World) -> bool:
     return world.mcu.vehicle.set_points == [0.0] * 4
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(6)
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("kind", ["stuck", "reversed", "runaway"])
 def test_a_lying_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
@@ -186,7 +186,7 @@ def test_wheels_turned_by_hand_are_told_at_most_once_a_second_and_counted(
 ONE_OF_EACH = {(0.2, "zero"), (0.4, "stop"), (0.6, "silence")}
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lag", "way"),
     [
@@ -258,6 +258,7 @@ def test_a_runaway_that_is_cleared_while_it_lasts_is_found_again(world: World) -
         assert world.state.mode == "fault"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.05, 0.2])
 def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost(
     lag: float,

@@ -140,6 +140,7 @@ def test_the_wheels_limit_waits_until_the_robot_stands_and_the_guard_goes_by_it(
     assert world.state.linear == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_braking_set_softer_behind_a_lowered_limit_waits_until_the_robot_is_that_slow(
     world: World,
 ) -> None:

@@ -434,6 +434,7 @@ def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
     return ticks, missed, trace, world.state.counters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [30, long(5_000, 1800)])
 def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count: int) -> None:
     undisturbed, disturbed = walk(count, jumps=False), walk(count, jumps=True)
@@ -487,7 +488,7 @@ def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows
     assert kept == count
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_that_is_behind(
     way: Way,
@@ -580,7 +581,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
     assert not +wrong
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.92, slow(1.08)])
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(

@@ -91,6 +91,7 @@ def odometry(robot: Drive) -> Drive:
     )  # fmt: skip
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
 def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
     log = odometry(DRIVE).csv(gyro=gyro, places=places)

@@ -21,6 +21,7 @@ def begun(drive: Drive, base: Base = BASE) -> Begin:
     return search(spots(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.9])
 @pytest.mark.parametrize("radius", [0.02, 0.05, 0.2])
 def test_it_begins_near_the_truth(separation: float, radius: float) -> None:

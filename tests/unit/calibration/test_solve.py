@@ -55,6 +55,7 @@ def off(seen: Drive, values: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
+@pytest.mark.variations(3)
 @so_many
 @each_way
 def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:

@@ -87,6 +87,7 @@ def test_silences_are_told_for_what_they_are() -> None:
     assert "USB" in found.mend
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors"])
 def test_a_link_that_loses_lines_proposes_no_counts(fault: str) -> None:
     checked = check(fault)

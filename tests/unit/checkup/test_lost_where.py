@@ -18,6 +18,7 @@ def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
     return lost_where.finding(board, Nobody(), motors)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("firmware", ["no_sample", "plain_only", "comma_latched"])
 @pytest.mark.parametrize(
     ("command", "reply", "figure", "mend"),

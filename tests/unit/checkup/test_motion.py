@@ -25,6 +25,7 @@ def course(
     return found
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 64, 96, 3200])
 @pytest.mark.parametrize("period_ms", [10, 20, 100])

@@ -83,6 +83,7 @@ def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_tur
     assert checked["damaged lines"].verdict == "PASS"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [slow(0.8), 1.0])
 @pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
 def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
@@ -92,6 +93,7 @@ def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: floa
     assert "mcu.trailing_comma" not in checked.changes
 
 
+@pytest.mark.slow
 def test_a_heavy_last_wheel_that_does_need_its_comma_is_found() -> None:
     config = Config(sim=SimConfig(motor_time_constant=0.5))
     checked = check("comma_latched", config=config)
@@ -403,6 +405,7 @@ class Regulates(Robot):
         return got
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "most_s"), [("stuck_encoder=b", 0.8), ("reversed_encoder=b", 0.9)]
 )

@@ -69,7 +69,7 @@ def test_a_board_that_starts_anew_fails_by_that_and_nothing_else_is_blamed(
     assert not checked.left_turning
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(9)
 @DIALECTS
 @pytest.mark.parametrize(("at_s", "when"), MOMENTS)
 def test_all_else_is_found_as_if_it_had_not_started_anew(

@@ -16,6 +16,7 @@ def four(*columns: Floats) -> Floats:
     return np.column_stack(columns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ripple", [0.0, 0.03])
 def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
     """A steady wheel errs the same way all the time, one that trembles ever anew."""

@@ -118,6 +118,7 @@ def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
     return tape
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("set_to", "hour"),
     [(None, "00:00"), ((14, 3, 0.0, 20), "14:03"), ((6, 0, 0.0, -3), "06:00")],

@@ -41,6 +41,7 @@ def ends_at() -> tuple[float, float]:
     return poses[-1][0] / MICRO, poses[-1][1] / MICRO
 
 
+@pytest.mark.slow
 def test_the_numbers_of_the_file_are_those_of_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -118,6 +118,7 @@ def test_before_it_has_stood_the_wheels_alone_tell() -> None:
     assert bench.does == ["waiting for rest"]
 
 
+@pytest.mark.slow
 def test_at_rest_nothing_turns_whatever_its_bias_and_noise() -> None:
     bench = Bench(bias=-0.03, noise=0.01)
     bench.run(REST_FIRST)
@@ -267,6 +268,7 @@ def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
 # how certain
 
 
+@pytest.mark.slow
 def test_its_variance_is_that_of_its_errors() -> None:
     """Heading errors after a straight drive over their claimed deviation: about normal."""
     squares = []

@@ -83,6 +83,7 @@ def corner(_: np.random.Generator) -> Legs:
     return [(0.8, 0.0, 5.0), (0.0, 1.2, 1.3), (0.8, 0.0, 5.0)]
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("model", ["default", "wheels, parameters"])
 @pytest.mark.parametrize("legs", [lap, corner])
 def test_the_covariance_of_a_short_drive_tells_the_truth(legs: Scenario, model: str) -> None:
@@ -120,6 +121,7 @@ def test_bridged_bursts_get_the_covariance_they_deserve(model: str) -> None:
     check(values, f"bursts, {model}")
 
 
+@pytest.mark.slow
 def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
     """50 gaps of 150 ms that the pose stands through."""
     rng = np.random.default_rng(5)

@@ -153,6 +153,7 @@ def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
     return [(10**12 + at, whole) for at, whole in reads if whole]
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("size", [30, 33, 34, 36])
 @given(phase=st.floats(0.0, 16.0))
 def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(

@@ -108,7 +108,7 @@ def test_no_line_is_dropped_of_a_firmware_that_divides_by_the_time_it_measured(
     assert (host.dropped, host.why) == (0, "")
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(9)
 @pytest.mark.parametrize("counts", [16, 20, 40, 96])
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7, 0.9])
 def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float) -> None:

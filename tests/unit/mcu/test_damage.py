@@ -137,6 +137,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
     return wrong, believed[0], believed[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [50, 1000])
 def test_what_is_learned_of_fine_encoders_lets_hardly_more_damage_pass(every: int) -> None:
     lines = drive(random.Random(6), 20_000)

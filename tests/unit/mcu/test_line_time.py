@@ -40,7 +40,7 @@ def link(prompted: bool) -> str:
     return "prompted" if prompted else "reporting"
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(9)
 @EFFORT
 @pytest.mark.parametrize("stall", [0.05, 0.09, 0.15, 0.25])
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
@@ -86,6 +86,7 @@ def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, 
     assert found[FOUND, 0] <= 0.45
 
 
+@pytest.mark.slow
 @EFFORT
 def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, seeds: int) -> None:
     """What the host cannot tell from its own delays is left: arrival times have that too."""
@@ -114,6 +115,7 @@ def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
     assert np.all(found[FOUND] <= found[ARRIVAL])
 
 
+@pytest.mark.slow
 def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
     """Else a stall is spread over lines that were made before it: 0.44 m of this drive."""
     host = drive(Case("ftdi", prompted=True, lost=0.01, stall=0.15), 0, 60.0)

@@ -255,6 +255,7 @@ def test_no_single_line_has_to_wait_for_the_search(counts: int) -> None:
     assert max(each) < 3000
 
 
+@pytest.mark.slow
 def test_counts_are_found_whenever_the_wheels_begin_to_turn() -> None:
     whole_block = LOOK * LONG
     toggling = np.array([[0.0] * 4, [31.42] * 4] * 150)

@@ -150,6 +150,7 @@ def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path:
     assert len(listed(tmp_path)) > 20
 
 
+@pytest.mark.slow
 def test_room_is_made_among_many_files_in_a_time_that_grows_as_they_do(tmp_path: Path) -> None:
     first = record(ring(tmp_path / "first"))
 

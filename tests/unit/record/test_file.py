@@ -107,7 +107,7 @@ def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> N
     assert whole.stat().st_mode & 0o777 == MODE == 0o640
 
 
-@pytest.mark.parametrize("cuts", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
     whole: Path, tmp_path: Path, cuts: int
 ) -> None:
@@ -126,7 +126,7 @@ def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
         assert len(got) >= kept * BATCH or got == every
 
 
-@pytest.mark.parametrize("files", [40, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
 def test_of_a_file_with_damaged_chunks_all_others_are_read(
     whole: Path, tmp_path: Path, files: int
 ) -> None:

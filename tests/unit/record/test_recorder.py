@@ -199,6 +199,7 @@ def die(bench: Bench) -> None:
     disk._ring.close()
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("after_s", [5.0, 300.0])
 def test_the_minute_before_and_after_a_crash_is_kept(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

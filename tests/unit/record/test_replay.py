@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from acsard.config.settings import Config
 from acsard.record.batch import decode, encode
 from acsard.record.replay import Replay
@@ -9,6 +11,7 @@ from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
+@pytest.mark.slow
 def test_it_counts_lines_poses_and_modes_and_knows_the_end() -> None:
     tape = Tape()
     world = World(recorder=tape)

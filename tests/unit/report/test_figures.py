@@ -31,6 +31,7 @@ def known(values: Iterable[float]) -> list[float | None]:
     return [None if math.isnan(value) else value for value in values]
 
 
+@pytest.mark.slow
 def test_the_library_knows_every_word_of_them(figures: dict[str, Figure]) -> None:
     for figure in figures.values():
         made = library.Figure(data=figure.data, layout=figure.layout)
