@@ -48,6 +48,7 @@ def side_by_side(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("message", samples(), ids=lambda message: type(message).__name__)
 def test_a_message_takes_the_time_printed_here(message: Message) -> None:
     codec, name = Cdr(type(message)), ROS_NAMES[type(message)]

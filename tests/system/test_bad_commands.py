@@ -228,6 +228,7 @@ def test_nothing_of_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
     until(lambda: bus.state()["mode"] == "ready", 5.0, "nobody commands any more")
 
 
+@pytest.mark.slow
 def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once(
     tmp_path: Path,
 ) -> None:

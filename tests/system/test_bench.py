@@ -118,6 +118,7 @@ def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str
         assert bench.err == [f"acsard: {who} was ended by signal 9"]
 
 
+@pytest.mark.slow
 def test_a_port_that_a_daemon_has_is_75_and_says_whose(tmp_path: Path, peer: Peer) -> None:
     with Daemon(tmp_path, peer.path) as daemon:
         done = finish(acsard("bench", "--port", str(peer.path)), tmp_path)

@@ -313,6 +313,7 @@ def test_set_pose_with_a_bad_payload_changes_nothing_and_says_what_to_send(
     assert '{"x": 0, "y": 0, "yaw": 0}' in answer["message"]
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("payload", [b"", b"now!", b"\xff" * 5000])
 def test_a_put_of_anything_on_stop_latches(bus: Bus, payload: bytes) -> None:
     with restored(bus), bus.follow("state") as states:
@@ -566,6 +567,7 @@ def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) 
     assert bus.get("info")["id"] == "acsar"
 
 
+@pytest.mark.slow
 def test_a_stop_query_behind_more_queries_than_are_held_stops(bus: Bus, shared: Daemon) -> None:
     # A get on every key is dozens of queries. What is let go unanswered: `test_inbox.py`.
     unanswered = 0

@@ -713,6 +713,7 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
     assert all(frame.count("\n") < 24 for frame in frames)
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
     shared: Daemon, bus: Bus
 ) -> None:

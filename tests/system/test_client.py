@@ -488,6 +488,7 @@ def run_async(shared: Daemon, work: Any, **how: Any) -> Any:
     return asyncio.run(main())
 
 
+@pytest.mark.slow
 def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: Bus) -> None:
     async def work(robot: AsyncClient) -> list[schema.Odometry]:
         driving = asyncio.create_task(robot.drive(0.5, seconds=0.6))

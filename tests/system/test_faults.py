@@ -252,6 +252,7 @@ def taken_over(
     return sent, peer.since(sent, reached.at)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("successor", ["second", pytest.param("third", marks=pytest.mark.slow)])
 def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command(
     tmp_path: Path, successor: str
@@ -556,6 +557,7 @@ def no_burst(lines: list[Heard]) -> float:
     return min(gaps(lines), default=0.0)
 
 
+@pytest.mark.slow
 def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_has_gone(
     far: tuple[FarPeer, Daemon],
 ) -> None:

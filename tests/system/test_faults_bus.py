@@ -311,6 +311,7 @@ def told(found: list[Hole]) -> None:
         )
 
 
+@pytest.mark.slow
 def test_after_a_partition_heals_fast_or_slowly_no_stale_command_is_obeyed(
     tmp_path: Path,
 ) -> None:

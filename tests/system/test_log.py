@@ -8,6 +8,8 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from acsard import __version__
 from acsard.client import connect
 from acsard.host.own_name import own_name
@@ -48,6 +50,7 @@ def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(tmp_path: Path) 
     assert line["by"] == f"ann (native, session {stamp.get_id()})"
 
 
+@pytest.mark.slow
 def test_a_day_is_told_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
     with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()

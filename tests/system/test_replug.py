@@ -16,6 +16,7 @@ SLACK_S = 0.5
 """What a noisy two-core machine may add to a bound before a test calls it broken."""
 
 
+@pytest.mark.slow
 def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_old(
     tmp_path: Path, peer: Peer
 ) -> None:

@@ -44,6 +44,7 @@ def test_the_truth_is_another_than_odometry_by_what_the_robot_truly_is(skidding:
     assert yaw(skidding.get("sim/pose")["pose"]) == pytest.approx(believed / 1.6, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_truth_comes_a_hundred_times_a_second_with_the_time_of_each_look(
     skidding: Bus,
 ) -> None:
@@ -111,6 +112,7 @@ def test_who_sends_beside_the_simulated_gyro_is_refused_counted_and_told(tmp_pat
 TURNING = {"angular_velocity": {"z": 0.0}}
 
 
+@pytest.mark.slow
 def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
     tmp_path: Path, peer: Peer
 ) -> None:

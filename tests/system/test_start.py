@@ -92,6 +92,7 @@ def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appea
         assert len(daemon.events("port_waiting")) == 1  # once, not at every attempt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("often", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
     tmp_path: Path, often: int
