@@ -11,6 +11,7 @@ from collections import Counter
 
 from acsard.config.motion_rules import LONGEST_REPLY_S
 from acsard.config.settings import FeedbackConfig, McuConfig
+from acsard.mcu import link_words
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.feedback import Feedback, Timeline
@@ -146,40 +147,14 @@ class McuSession:
         """How the link is, for people; `port_trouble` is why the port is closed."""
         if self.link == "down" and port_trouble:
             return port_trouble
-        if self.link in ("booting", "stale"):
-            heard = self._hearing.heard
-            if self.negotiation.trouble:
-                return MENDS[self.negotiation.trouble]
-            if heard is not None and not heard.good:
-                return heard.words
-            if self._damaged:
-                return "the microcontroller's replies come damaged; asking it for the check again"
-            if self._link.sparse_s:
-                return self._sparse()
-            if heard is not None:
-                return heard.words
-        return self.lateness.words(self.link)
-
-    def _sparse(self) -> str:
-        apart = f"{self._link.sparse_s:.2f}"
-        told = f"the microcontroller's lines come {apart} s apart"
-        if float(apart) > self._longest_reply:
-            return (
-                f"{told}: too seldom for a link by any setting; firmware that reports by its own "
-                f"clock must do so every {self._longest_reply:g} s or sooner"
-            )
-        return f"{told}; if it reports by its own clock, set mcu.reply_period = {apart}"
+        heard, late = self._hearing, self.lateness
+        return link_words.words(self._link, self.negotiation, heard, late, self._longest_reply)
 
     @property
     def note(self) -> str:
         """Which check is in force, to go behind a reason; "" where none is wanted."""
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
-
-    @property
-    def _damaged(self) -> bool:
-        """The check is asked for because replies came damaged."""
-        return self._link.damaged and self.negotiation.asking
 
     # sessions
 
@@ -236,17 +211,12 @@ class McuSession:
         if self._announced == before:
             return
         if link != before[0]:
-            text = self.words() if self._damaged else self.lateness.words(link)
+            damaged = link_words.damaged(self._link, check)
+            text = self.words() if damaged else self.lateness.words(link)
             good = link in ("up", "booting")
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
-            fallen = check.state == "plain" or (self._wants_samples and check.state == "checked")
-            text = f"the serial lines are {check.in_force}"
-            if check.state == "plain":
-                text += ": the microcontroller answers without a check"
-            elif fallen:
-                text += ": the microcontroller sends no counts"
-            self.events.append(Event("link_check", text, "warning" if fallen else "info"))
+            self.events.append(link_words.check_event(check, self._wants_samples))
         if check.trouble and not before[2]:
             self.events.append(Event("link_check", MENDS[check.trouble], "error"))
 

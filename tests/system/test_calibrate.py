@@ -128,7 +128,7 @@ def found_with_a_gyro(daemon: Daemon, bus: Bus) -> dict[str, Any]:
     return cast(dict[str, Any], json.loads(program.stdout))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
