@@ -594,7 +594,7 @@ def names(checked: Checked) -> set[str]:
     return {f.name for f in checked.findings if f.figure == "not judged"}
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(
     ("computer", "fault", "late_s", "every"),
     [
@@ -629,6 +629,7 @@ def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
     assert not checked.left_turning
 
 
+@pytest.mark.slow
 def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
     for computer in (Busy, Starved):
         quiet = check("no_sample")
@@ -637,6 +638,7 @@ def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
         assert [f.verdict for f in checked.findings] == [f.verdict for f in quiet.findings]
 
 
+@pytest.mark.slow
 def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> None:
     robot = Busy("plain_only", late_s=0.45, every=30)
     asked: list[str] = []
@@ -652,6 +654,7 @@ def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> Non
     assert len(which) == len(set(which))
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("fault", "name"),
     [
@@ -678,6 +681,7 @@ def test_a_board_that_falls_silent_is_not_excused() -> None:
     assert checked.failed == ["link"]
 
 
+@pytest.mark.slow
 def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))
     assert "motor b (front left)" in names(checked)
