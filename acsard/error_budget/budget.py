@@ -18,15 +18,15 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.checkup.drive_log import Line, Motion, motion
-from acsard.checkup.error_steps import Driving, Step, mirrored
-from acsard.checkup.rounding import rounding
 from acsard.config.settings import Config, OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.noise import columns
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import DECIMAL, TwistUncertainty
 from acsard.drive.uncertainty import PoseUncertainty
+from acsard.error_budget.drive_log import Line, Motion, motion
+from acsard.error_budget.rounding import rounding
+from acsard.error_budget.steps import Driving, Step, mirrored
 from acsard.values import REST
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from acsard.checkup.budget import Heard
-from acsard.checkup.drive_log import Line
 from acsard.config.settings import Config
+from acsard.error_budget.budget import Heard
+from acsard.error_budget.drive_log import Line
 from acsard.messages.schema import (
     DiagnosticArray,
     JointState,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 
-from acsard.checkup.budget import Basis, Budget, Cause, Share
 from acsard.drive.uncertainty import COARSE_COUNTS
+from acsard.error_budget.budget import Basis, Budget, Cause, Share
 
 WIDTH = 100
 

@@ -7,8 +7,8 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup.budget_feed import Feed
 from acsard.config.settings import Config, McuConfig, RatesConfig
+from acsard.error_budget.feed import Feed
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,

@@ -9,11 +9,11 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup.budget import Budget, Cause, Heard, Share, budget
-from acsard.checkup.drive_log import Line
 from acsard.config.settings import Config, McuConfig, OdometryConfig
-from tests.unit.checkup import drives
-from tests.unit.checkup.drives import Told
+from acsard.error_budget.budget import Budget, Cause, Heard, Share, budget
+from acsard.error_budget.drive_log import Line
+from tests.unit.error_budget import drives
+from tests.unit.error_budget.drives import Told
 
 CONFIG = Config()
 
