@@ -83,6 +83,8 @@ class Run(Struct):
     """Of the files that ended in it."""
     cut: dict[str, Kind] = field(default_factory=dict)
     """The files that the disk has cut in it, by name. What else is cut, a crash has cut before."""
+    given: int = 0
+    """bytes of recordings that went for a disk that refused, and has taken nothing since."""
     clock: Steady = field(default_factory=Steady)
 
 
@@ -215,7 +217,10 @@ class Ring:
         oldest_s = (
             now.wall_ns / NS_PER_S - self._days * S_PER_DAY if now and believed else -math.inf
         )
-        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, refused)
+        given = self._run.given if refused else None
+        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, given)
+        if refused:
+            self._run.given += sum(one.size for one in ended if one.name in gone)
         for name in gone:
             with suppress(OSError):  # somebody else's: to record comes first
                 (self._directory / name).unlink()

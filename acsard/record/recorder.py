@@ -264,6 +264,7 @@ class _Disk:
         if self._writing is None:
             return
         self._writing.flush()
+        self._run.given = 0
         ring.tend(self._last)
         if self.trouble or not self._told:
             self.trouble, self._told = "", True

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, RecordConfig
 from acsard.record import recorder as module
 from acsard.record.closing import closing
-from acsard.record.directory import KEPT, listed
+from acsard.record.directory import KEPT, Ring, listed
 from acsard.record.export import export
 from acsard.record.file import About, Recording, Writing
 from acsard.record.recorder import MOST, Recorder
@@ -338,6 +338,28 @@ def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
     part.write_bytes(part.read_bytes()[:-40])  # what was not synced never came there
     rounds(eager)
     assert cuts(eager.end()) == [("mcap", "disk"), ("mcap", "")]
+
+
+def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For want of inodes, say, which others take as soon as one is there."""
+    die(eager)
+    ring = Ring(config(eager.where).record)
+    before = [
+        ring.end(ring.begin(About("acsar", "0.1.0", "3.11.0", 1, number)), "kept")
+        for number in range(4)
+    ]
+    ring.close()
+    again = Bench(eager.where, monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(again, 10)
+    assert again.recorder.status.trouble.endswith("No space left on device")
+    assert all(path.exists() for path in before), "the oldest, of the crash, was worth a try"
+    rounds(again)
+    assert again.recorder.status.trouble == ""
+    assert len(again.end()) == 5
 
 
 def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
