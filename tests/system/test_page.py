@@ -307,6 +307,42 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     page.shows("age", "no connection")
     page.shows("mode", "NO CONNECTION")
     assert page.browser.text("speed") == "–"
+    assert "waiting for a command" not in page.browser.text("reason")
+
+
+def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_measured(
+    page: Phone,
+) -> None:
+    """Its server has a state of before still."""
+    browser = page.browser
+    page.daemon.signal(signal.SIGSTOP)
+    try:
+        page.shows("reason", "nothing is heard of the daemon")
+        browser.open(page.server.here)
+        page.shows("reason", "nothing is heard of the daemon")
+        browser.js("new Promise(done => setTimeout(done, 500))")  # more than one look
+        said = [browser.text(one) for one in ("mode", "age", "speed", "turn", "who")]
+        assert said == ["WAITING", "waiting", "–", "–", "–"]
+        assert not browser.js("document.body.classList.contains('stale')")
+    finally:
+        page.daemon.signal(signal.SIGCONT)
+    page.shows("age", "live")
+    page.shows("mode", "READY")
+    page.shows("speed", "0.00 of 0.00 m/s")
+
+
+def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser) -> None:
+    with (
+        Daemon(tmp_path, tmp_path / "none") as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as server,
+    ):
+        page = Phone(daemon, bus, server, browser)
+        browser.open(server.here)
+        page.shows("age", "live")
+        page.shows("mode", "WAITING")
+        page.shows("speed", "– of ")
+        assert "– of " in browser.text("turn")
 
 
 def test_somebody_else_who_drives_is_named(page: Phone) -> None:
