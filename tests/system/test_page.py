@@ -112,7 +112,8 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.tap("tab-drive")
     page.hold()
     bus.get("srv/stop")  # by somebody else
-    page.shows("told", "press Clear")
+    page.shows("told", "why stands above")
+    assert browser.js("document.body.innerText").count("press Clear") == 1
     bus.get("srv/clear")
     page.shows("mode", "READY")
     # The finger is still down.
@@ -122,6 +123,17 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     page.shows("mode", "READY")
     assert bus.count("commands") == sent
     browser.touch("End")
+
+
+def test_what_a_button_could_not_is_said_once(page: Phone) -> None:
+    page.browser.tap("tab-set")
+    page.browser.js("document.getElementById('reset').click()")
+    page.shows("set-told", "pose is x 0")
+    page.server.process.kill()
+    page.shows("age", "no connection")
+    page.browser.js("document.getElementById('reset').click()")
+    page.shows("alarm", "no connection to the robot")
+    assert page.browser.js("document.body.innerText").count("no connection to the robot") == 1
 
 
 def test_keys_drive_while_they_are_held(page: Phone) -> None:

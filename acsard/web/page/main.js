@@ -22,7 +22,7 @@ const LATCHED = ["stopped", "fault"];
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
-const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const drive = new Drive(link, $("stick"), $("knob"), told);
 const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
@@ -85,13 +85,18 @@ async function posted() {
 
 async function asked(verb) {
   const told = await link.call(verb);
-  views.alarm(told.ok ? "" : words(told.text));
-  said(told);
+  views.alarm(told.ok ? "" : words(told.text)); // which is seen in every view
+  said(told.ok ? told : { ok: true, text: "" });
 }
 
 async function set(payload) {
   said(await link.call("set", payload));
   configured();
+}
+
+/** At the stick; what the banner says is not said twice. */
+function told(why) {
+  views.text("told", why && why === state?.reason ? "not driving: why stands above" : words(why));
 }
 
 function said(told) {
@@ -236,8 +241,7 @@ link.addEventListener("fleet", ({ detail }) => {
 });
 link.addEventListener("refused", ({ detail }) => {
   if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
-  const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
-  views.text("told", why || detail.reason);
+  told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
 });
 link.addEventListener("gone", ({ detail }) => OTHER || views.text("reason", detail.gone));
 link.addEventListener("up", () => {
