@@ -641,6 +641,11 @@ def test_what_strangers_write_is_text(page: Phone) -> None:
     assert page.browser.js("document.title") == "acsar"
 
 
+WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
+    .map(name => document.getElementById(name).textContent).join(' ') ?? ''"""
+"""What describes an element to who does not see it."""
+
+
 def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
     Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [NAME], 1)
     settings = {"record": {"directory": str(tmp_path / "record")}}
@@ -657,6 +662,8 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             told = browser.js(f"[...document.querySelectorAll('[data-least]')].map({off})")
             assert len(told) >= 6
             assert {tuple(one) for one in told} == {(True, "for who is operator; you are viewer")}
+            described = browser.js(f"[...document.querySelectorAll('[data-least]')].map({WORDS})")
+            assert all("for who is operator; you are viewer" in one for one in described)
             page.shows("barred", "for who is operator; you are viewer")
             page.shows("hint", "You may watch and stop, not drive")
             browser.tap("tab-events")

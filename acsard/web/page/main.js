@@ -191,7 +191,6 @@ function greeted({ detail }) {
   $("limit").max = String(hello.limits.linear);
   limited();
   views.text("hint", hint(hello.role, OTHER));
-  views.text("barred", barred(hello.role, "operator"));
   if (uninvited) views.text("told", uninvited); // let in all the same, by an earlier one
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
