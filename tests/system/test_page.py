@@ -204,6 +204,46 @@ def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
     page.bus.at_rest()
 
 
+def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Phone) -> None:
+    """The browser tells no pointerup until the last of them is up."""
+    browser, bus = page.browser, page.bus
+    browser.size(*DESKTOP, touch=False)
+    x, y = browser.middle("stick")
+
+    def mouse(kind: str, dy: float = 0.0, button: str = "none", buttons: int = 1) -> None:
+        told = {"type": f"mouse{kind}", "button": button, "buttons": buttons, "clickCount": 1}
+        browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **told)
+
+    mouse("Pressed", button="left")
+    mouse("Moved", 90)
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    mouse("Pressed", 90, "right", 3)
+    mouse("Released", 90, "left", 2)
+    try:
+        bus.at_rest()
+    finally:
+        mouse("Released", 90, "right", 0)
+    page.shows("told", "another button is down")
+
+
+JAM = """(() => {
+    const send = WebSocket.prototype.send;
+    window.sent = [];
+    WebSocket.prototype.send = function (text) { window.sent.push(text); send.call(this, text); };
+    Object.defineProperty(WebSocket.prototype, 'bufferedAmount', {get: () => 1e6});
+})();1"""
+"""A network that takes nothing for now; what the page hands to it is written down."""
+
+
+def test_the_zero_of_a_finger_that_leaves_goes_also_where_much_waits(page: Phone) -> None:
+    page.hold()
+    page.browser.js(JAM)
+    page.browser.touch("End")
+    page.bus.at_rest()
+    sent = [json.loads(one) for one in page.browser.js("window.sent")]
+    assert [one["cmd"]["linear_x"] for one in sent if "cmd" in one] == [0]
+
+
 def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
     """A phone freezes what it has put away; it hides it before, so here is the event alone."""
     page.hold()
