@@ -646,6 +646,12 @@ def test_a_hand_that_is_not_followed_lets_go_and_says_why(
     assert all(one[1] is None for one in told[:-1])
 
 
+def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
+    for linear, turn in ((1, -0.8), (0, -0.4)):
+        script = f"out.push(...twist(1, 0, 0.2, {{linear: {linear}, angular: 4}}))"
+        assert by_hand(page, script)[1] == pytest.approx(turn)
+
+
 READ = """import('/page/settings.js').then(({read}) => [
     read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2), read('info', 'debug'),
     read('1,2.5, 3', [0, 0, 0]), read('1,,x', [0, 0, 0])])"""
