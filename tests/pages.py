@@ -128,6 +128,7 @@ VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_nee
 AUTHORITY = Elsewhere(
     HERE, "test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs"
 )
+TEN = Elsewhere(HERE, "test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page")
 LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
 MANY = Elsewhere(
     "tests/system/test_many.py",
@@ -408,8 +409,8 @@ COMMANDS: dict[str, How] = {
     "python3 -m venv .venv && .venv/bin/pip install '.[lan]'": AUTHORITY,
     "acsard lan init --directory fleet": Run("^Wrote "),
     "acsard lan add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
-    "acsard lan add robot1 --directory fleet": Run("robot1"),
-    "acsard lan add robot2 --directory fleet": Run("robot2"),
+    "for n in {1..10}; do acsard lan add robot$n --directory fleet; done": TEN,
+    "acsard lan router robot{1..10} --operator laptop-anna > router.json5": TEN,
     "acsard lan add laptop-anna --role operator --directory fleet": Run("operators = "),
     "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": PLACES,
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,

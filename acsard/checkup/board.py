@@ -12,6 +12,7 @@ from math import ceil
 
 from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
+from acsard.checkup.lateness import Lateness
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.outside import Wire
 from acsard.checkup.restarts import RestartedError, Restarts
@@ -27,6 +28,9 @@ from acsard.values import NS_PER_S, WheelSpeeds
 
 LEAST_S = 0.001
 """No line goes out for less than this."""
+
+BEAT_NS = int(limits.PERIOD_S * NS_PER_S)
+"""So often it is looked whether this computer is late, however long is listened."""
 
 FAREWELL = 5
 """How many times the last zeros go out, in each form."""
@@ -65,14 +69,15 @@ class Board:
         """Share of the lines that get lost or damaged, of either way."""
         self.sent_lines = 0
         self.sent_s = 0.0
-        self.paused = False
-        """This host paused while driving, for so long that the watchdog may have struck."""
-
-        self._fled = False
+        self.lateness = Lateness()
+        """Of this computer; of the board, too, where it is one of its programs."""
+        self.fled = False
         """Zeros do not stop a motor, or make it run: silence, and the MCU's watchdog, may."""
+
         self._commanded = ZERO
         self._unanswered_s = 0.0
         """For how long `drive` has had no reply; what this host paused does not count."""
+        self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
         self.restarts = Restarts()
@@ -86,7 +91,7 @@ class Board:
 
     def forget(self) -> None:
         """What was heard says nothing of the board that is there now; how it speaks, it does."""
-        self.restarts, self._unanswered_s, self.paused = Restarts(), 0.0, False
+        self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
 
@@ -112,11 +117,11 @@ class Board:
         self.armed, self.restarts.watched = False, False
         try:
             for _ in range(FAREWELL):
-                if self._fled:
+                if self.fled:
                     break
                 self.zeros()
                 self.listen(2 * self.period_s)
-                self._fled = motion.fastest(self.replies, limits.RUNAWAY) is not None
+                self.fled = motion.fastest(self.replies, limits.RUNAWAY) is not None
         except WireLostError:
             pass  # nothing reaches the motors any more; the MCU's own watchdog has to
 
@@ -124,6 +129,15 @@ class Board:
     def now_s(self) -> float:
         """The time."""
         return self.wire.now_ns() / NS_PER_S
+
+    @property
+    def language(self) -> tuple[bool, bool, bool, bool]:
+        """What a step may have found out of it, to be what it was when that is tried again."""
+        return self.comma, self.latched, self.sealed, self.sampled
+
+    @language.setter
+    def language(self, known: tuple[bool, bool, bool, bool]) -> None:
+        self.comma, self.latched, self.sealed, self.sampled = known
 
     @property
     def line_s(self) -> float:
@@ -148,10 +162,12 @@ class Board:
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
         """One command, now."""
-        self._commanded = motors
+        turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
         self.sent_s = self.now_s
+        if turned:
+            self.lateness.look(self.sent_s - self._listened_s, self.sent_s)
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
@@ -160,6 +176,16 @@ class Board:
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
         self.restarts.sent(ZERO, self.now_s)
+
+    def wakes(self, seconds: float) -> bool:
+        """Zeros until it answers; False when it does not for so long."""
+        before, end_s = len(self.replies), self.now_s + seconds
+        while len(self.replies) == before:
+            if self.now_s >= end_s:
+                return False
+            self.zeros()
+            self.listen(self.period_s)
+        return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """Zeros once, and their answer waited for, a period at the least."""
@@ -190,7 +216,6 @@ class Board:
             self.send(motors)
             answers = self.listen(min(period_s, end_s - began_s))
             took_s = self.now_s - began_s
-            self.paused |= took_s >= max(limits.WATCHDOG_LEAST_S, 2 * period_s)
             self._unanswered_s += 0.0 if answers else min(took_s, period_s)
             if self.armed and self._unanswered_s > WATCHDOG_S + 4 * self.gap_s:
                 self.zeros()
@@ -209,8 +234,24 @@ class Board:
 
     def listen(self, seconds: float) -> list[Reply]:
         """What the MCU answers in the next so many seconds; a runaway or new start in it raises."""
+        end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
+        if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
+            self.wire.late_ns()  # that was while nothing was measured
+        got: list[Reply] = []
+        while True:
+            until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
+            got += self._hear(until_ns)
+            now_ns = self.wire.now_ns()
+            self._listened_s = now_ns / NS_PER_S
+            late_ns = max(now_ns - until_ns, self.wire.late_ns())
+            self.lateness.look(late_ns / NS_PER_S, self._listened_s)
+            if now_ns >= end_ns:
+                return got
+
+    def _hear(self, until_ns: int) -> list[Reply]:
+        """One beat of it."""
         got = []
-        for at_ns, data in self.wire.listen(self.wire.now_ns() + ceil(seconds * NS_PER_S)):
+        for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
             for line, following in self._lines.feed(data):
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
@@ -241,7 +282,7 @@ class Board:
     @property
     def silent_s(self) -> float:
         """Since the last reply, 0 where none has come or may be asked for."""
-        return self.now_s - self.replies[-1].at_s if self.replies and not self._fled else 0.0
+        return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
         fastest = motion.fastest(self.replies, limits.RUNAWAY)
@@ -257,7 +298,7 @@ class Board:
 
     def _flee(self) -> None:
         """Zeros once, and none after them."""
-        self._fled = True
+        self.fled = True
         self.zeros()
 
     # standing

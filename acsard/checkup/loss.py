@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from statistics import median
+from statistics import fmean, median
 
 from msgspec import Struct
 
@@ -56,10 +56,9 @@ def finding(board: Board) -> Finding:
     damaged one can tell a motor any speed.
     """
     board.listen(limits.GLANCE_S)  # what comes later answers what goes out now
-    board.paused = False
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
-    silent_s = 0.0 if board.paused else _silence_s(board, motion.since(board.replies, began_s))
+    silent_s = _silence_s(board, motion.since(board.replies, began_s))
     while True:
         board.listen(limits.GLANCE_S)
         count = _counted(board, began_s, board.sent_lines - sent, others)
@@ -111,10 +110,12 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 
 
 def _left_out(replies: Sequence[Reply]) -> int:
-    """How many are missing between others that come evenly."""
+    """How many are missing among others that come evenly: in all of the time, since one that is
+    heard late makes one gap longer and the next one shorter."""
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
-    return sum(max(0, round(gap / usual) - 1) for gap in gaps) if usual > 0 else 0
+    alike = [gap for gap in gaps if abs(gap - usual) < usual / 2]
+    return max(0, round(sum(gaps) / fmean(alike)) - len(gaps)) if alike else 0
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:

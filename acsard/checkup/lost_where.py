@@ -27,8 +27,9 @@ TOLD, PULSES_S = 8, 20.0
 OWN_CLOCK_S = 10.0
 """How long where nothing answers a line: there, nothing has said yet that any is lost."""
 
-SPREAD = 13
-"""So many different times lie between the pulses: what is lost at intervals would miss them all."""
+SPREAD, STRIDE = 12, 5
+"""So many different times lie between the pulses, and not in their order: what is lost at intervals
+would miss them all."""
 
 OBEYED = 0.5
 """Of the angle that a pulse turns the motors by: it has arrived."""
@@ -76,7 +77,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
         board.listen(limits.GLANCE_S / 4)  # an answer to an earlier line is none to this one
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
-        board.drive(ZERO, 2 * board.gap_s + (4 + count % SPREAD) * board.period_s)
+        board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
         if not _stand(board):
             return None
         count += 1
@@ -88,6 +89,8 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
             unanswered.append(every[-1])
     usual = median(every) if every else 0.0
     if usual < max(SEEN, GRAINS * _grain(board, motors)):
+        return None
+    if board.own_clock and len(every) < TOLD:
         return None
     if board.own_clock:
         return Ways(len(every), sum(angle < OBEYED * usual for angle in every), 0)

@@ -14,10 +14,15 @@ from acsard.checkup.findings import Finding, Verdict
 from acsard.checkup.outcomes import OUTCOMES
 
 
+class Unsure(Finding, frozen=True):
+    """A finding that a computer which is late can make, whatever the board does."""
+
+
 class Outcome(Struct, frozen=True):
     """One entry: `figure`, `text` and `mend` take what was seen in braces."""
 
     verdict: Verdict
+    unsure: bool
     figure: str
     text: str
     mend: str
@@ -30,8 +35,8 @@ def _read(manual: str) -> dict[str, Outcome]:
         verdict, _, head = head.partition(" ")
         outcome, _, figure = head.partition(" | ")
         text, _, mend = " ".join(line.strip() for line in rest).partition("-> ")
-        parts = {"verdict": verdict, "figure": figure, "text": text.strip(), "mend": mend}
-        found[outcome] = convert(parts, Outcome)
+        parts = {"verdict": verdict.rstrip("?"), "unsure": verdict.endswith("?"), "figure": figure}
+        found[outcome] = convert(parts | {"text": text.strip(), "mend": mend}, Outcome)
     return found
 
 
@@ -43,4 +48,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
     figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
-    return Finding(name, entry.verdict, figure, text, mend, keys or {})
+    kind = Unsure if entry.unsure else Finding
+    return kind(name, entry.verdict, figure, text, mend, keys or {})

@@ -21,6 +21,10 @@ class Wire(Protocol):
     def send(self, data: bytes) -> None:
         """Put bytes on the line now; raises `WireLostError`."""
 
+    def late_ns(self) -> int:
+        """For how long the board, where it is a program of this computer, has waited for a
+        processor since this was asked last; else 0."""
+
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
         """Wait until then; what came, in pieces with their times. Raises `WireLostError`."""
 

@@ -28,7 +28,9 @@ TRIPS = 10
 def rate(board: Board) -> Finding:
     """How often it answers at the host's pace, and whether by itself."""
     board.listen(GLANCE_S / 4)
-    board.own_clock = len(board.listen(CUT_S)) >= 2
+    unasked = board.listen(CUT_S)
+    # What had been held up, here or at the board, comes all at once.
+    board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
     got = board.drive(ZERO, 0.5, period_s)

@@ -11,7 +11,6 @@ from msgspec import structs
 
 from acsard.checkup import limits, motion
 from acsard.checkup.board import Board
-from acsard.checkup.findings import motor_name
 from acsard.checkup.motion import ZERO, moving
 from acsard.checkup.outside import Operator
 from acsard.checkup.wheels import OFF, TOLERANCE, Channel
@@ -37,15 +36,11 @@ def one(motor: int, speed: float) -> Motors:
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
-    """Bring a motor to speed, once more if this host has paused.
+    """Bring a motor to speed.
 
     Each encoder's speed by then, and by which share this motor's may err: whole counts tell it.
     """
-    board.paused = False
     means = run_up(board, one(motor, speed))
-    if board.paused:
-        board.rest()
-        means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
         # Weak, or a heavy one that is not there yet: a longer look tells.
@@ -93,13 +88,12 @@ def _patience_s(board: Board, told: list[int]) -> float:
     return limits.PATIENCE_S if rises else limits.MOTOR_S
 
 
-def channel(board: Board, operator: Operator, motor: int) -> Channel:
-    """Turn one, and ask what was seen."""
-    operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
+def channel(board: Board, motor: int) -> Channel:
+    """Turn one forth and back."""
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
         found = _with_other_comma(board, found)
-    return _seen(board, operator, found)
+    return found
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
@@ -176,7 +170,7 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
     return channel
 
 
-def _seen(board: Board, operator: Operator, channel: Channel) -> Channel:
+def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     """Ask the person which wheel it was; the wheels stand by now."""
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "

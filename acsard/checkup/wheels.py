@@ -24,7 +24,7 @@ TOLERANCE = 0.25
 OFF = 0.05
 """By which share it may differ on a sound robot."""
 
-Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off"]
+Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 
 class Channel(Struct, frozen=True):
@@ -41,6 +41,8 @@ class Channel(Struct, frozen=True):
     """Its own encoder did not follow a short probe: it was not turned further, and not back."""
     unsure: float = 0.0
     """By which share the speeds may err: counts of a coarse encoder."""
+    judged: bool = True
+    """This computer was in time; else nothing here is the motor's doing for certain."""
 
     @property
     def moved(self) -> list[int]:
@@ -52,6 +54,8 @@ class Channel(Struct, frozen=True):
     @property
     def kind(self) -> Kind:
         """What the encoders say."""
+        if not self.judged:
+            return "late"
         moved, own = self.moved, self.motor
         if not moved:
             return "dead"

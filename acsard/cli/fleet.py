@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
@@ -16,9 +17,13 @@ from acsard.host.extras import install
 if TYPE_CHECKING:
     from acsard.client import Client
     from acsard.top.fleet import Fleet
+    from acsard.top.roster import Row
 
 GATHER_S = 1.5
 """All who are there have said so by then."""
+
+NOBODY_S = 3.0
+"""Before it is said that nobody is there: on a busy computer the first is heard late."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -63,16 +68,21 @@ def _once(fleet: Fleet, asked: Client | None) -> int:
     """One table; exit 69 when nobody is there: who is `asked` then, whether we may see any."""
     from acsard.top.roster import table
 
-    end = time.monotonic() + GATHER_S
-    while time.monotonic() < end:
-        fleet.rows()
-        time.sleep(0.1)
+    began, rows = time.monotonic(), fleet.rows()
+    while not fleet.whole and time.monotonic() - began < (GATHER_S if _any(rows) else NOBODY_S):
+        time.sleep(0.05)
+        rows = fleet.rows()
     rows = fleet.rows()
-    if not any(row.here or row.state for row in rows):
+    if not _any(rows):
         silence = "" if asked is None else asked.whoami().silence
         raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
     width = shutil.get_terminal_size((160, 24)).columns
-    print("\n".join(table(rows, width)))
+    # Now, not when we end: nothing on our way down can keep it back.
+    print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):
         print(f"acsard: {told}", file=sys.stderr)
     return int(Exit.OK)
+
+
+def _any(rows: Sequence[Row]) -> bool:
+    return any(row.here or row.state for row in rows)

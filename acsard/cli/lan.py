@@ -1,4 +1,4 @@
-"""`acsard lan init | add | renew`: certificates for a bus that leaves the machine."""
+"""`acsard lan init | add | renew | router`: certificates for a bus that leaves the machine."""
 
 from __future__ import annotations
 
@@ -69,6 +69,27 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
         _add_common(action)
+    _add_router(actions)
+
+
+def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    router = actions.add_parser(
+        "router",
+        help="print the configuration of a fleet's router",
+        description="Print router.json5 for `acsard router` or zenohd: what each robot, and each "
+        "person's certificate, may do. deploy/zenoh/README.md has the steps.",
+    )
+    router.add_argument("robots", nargs="+", metavar="ROBOT", help="the robots' ids")
+    for role in ROLES:
+        router.add_argument(
+            f"--{role}",
+            action="append",
+            type=_name,
+            default=[],
+            metavar="NAME",
+            help=f"a certificate that is {role}, beside the one of that name; repeat it",
+        )
+    router.set_defaults(main=main_router)
 
 
 def _add_common(action: argparse.ArgumentParser) -> None:
@@ -156,6 +177,20 @@ def main_renew(args: argparse.Namespace) -> int:
     names = identities.renew(args.directory, args.address, args.days)
     print(_certified(names))
     print(f"{args.directory / CERTIFICATE} is new; systemctl restart acsard takes it into use")
+    return 0
+
+
+def main_router(args: argparse.Namespace) -> int:
+    """Print what the router is to let through."""
+    from acsard.bus.address import require_id
+    from acsard.host.service import source
+    from acsard.lan.router_file import router_file
+
+    for robot in args.robots:
+        require_id(robot)
+    template = (source() / "zenoh" / "router.json5").read_text()
+    people = {role: getattr(args, role) for role in ROLES}
+    print(router_file(template, args.robots, people), end="")
     return 0
 
 

@@ -85,6 +85,15 @@ def name_of(pid: int) -> str:
         return ""
 
 
+def waited_ns(pid: int) -> int:
+    """For how long the first thread of a process has waited for a processor since it started; 0
+    where the kernel does not tell."""
+    try:
+        return int((PROC / str(pid) / "schedstat").read_text().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
 def running(name: str) -> bool:
     """A process of this name runs."""
     for process in _processes():

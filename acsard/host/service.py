@@ -56,10 +56,10 @@ def files() -> list[File]:
     reference = _reference().read_text(encoding="utf-8")
     return [
         *(_unit(name) for name in ALL),
-        File(Path("/opt/acsard/bin") / STOP, (_source() / "systemd" / STOP).read_bytes(), 0o755),
+        File(Path("/opt/acsard/bin") / STOP, (source() / "systemd" / STOP).read_bytes(), 0o755),
         File(
             Path("/etc/udev/rules.d/70-acsar.rules"),
-            (_source() / "udev" / "70-acsar.rules").read_bytes(),
+            (source() / "udev" / "70-acsar.rules").read_bytes(),
         ),
         File(
             ETC / "acsard.toml",
@@ -70,13 +70,13 @@ def files() -> list[File]:
 
 
 def _unit(name: str) -> File:
-    text = (_source() / "systemd" / name).read_text(encoding="utf-8")
+    text = (source() / "systemd" / name).read_text(encoding="utf-8")
     return File(UNITS / name, text.replace(HOME, sys.prefix).encode())
 
 
 def lan_drop_in(unit: str) -> File:
     """What lets a unit onto the local network and gives it its certificates."""
-    return File(UNITS / f"{unit}.d" / LAN, (_source() / "systemd" / LAN).read_bytes())
+    return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
 
 
 def admitting(directory: Path) -> Write | Keep | None:
@@ -191,7 +191,7 @@ def state(unit: str) -> str:
     return done.stdout.strip() or done.stderr.strip()
 
 
-def _source() -> Path:
+def source() -> Path:
     """The files of `deploy/`: inside the package, or beside it in a clone."""
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
@@ -205,5 +205,5 @@ def _source() -> Path:
 
 def _reference() -> Path:
     """The reference configuration, which lies beside `deploy/` in a clone."""
-    inside = _source() / "acsard.toml"
-    return inside if inside.is_file() else _source().parent / "acsard.toml"
+    inside = source() / "acsard.toml"
+    return inside if inside.is_file() else source().parent / "acsard.toml"

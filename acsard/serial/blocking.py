@@ -11,6 +11,7 @@ import serial
 
 from acsard.checkup.findings import WireLostError
 from acsard.host import clock
+from acsard.host.processes import Holder, master_of, waited_ns
 from acsard.serial.device import close, draining, open_raw, refusal
 from acsard.values import NS_PER_S
 
@@ -30,6 +31,9 @@ class BlockingPort:
     def __init__(self, path: str) -> None:
         self._path = path
         self._device: serial.Serial | None = None
+        self._program: Holder | None = None
+        """At the other end, where that is a pty."""
+        self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
         """Open and lock the port, or go on at another rate."""
@@ -38,6 +42,8 @@ class BlockingPort:
                 self._device = open_raw(self._path, baud_rate)
             except OSError as error:
                 raise refusal(self._path, error) from error
+            self._program = master_of(self._path)
+            self.late_ns()
             return
         fd = self._device.fileno()
         try:
@@ -61,6 +67,14 @@ class BlockingPort:
     def now_ns(self) -> int:
         """The monotonic clock."""
         return clock.mono_ns()
+
+    def late_ns(self) -> int:
+        """What the program at the other end of a pty has waited for a processor since last asked;
+        0 for a real device."""
+        if self._program is None:
+            return 0
+        before_ns, self._waited_ns = self._waited_ns, waited_ns(self._program.pid)
+        return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
         """Hand all of it to the driver; raises `WireLostError` when that takes none."""

@@ -33,6 +33,10 @@ class VirtualWire:
         """The time here."""
         return self._now_ns
 
+    def late_ns(self) -> int:
+        """Nothing waits for a processor."""
+        return 0
+
     def send(self, data: bytes) -> None:
         """Put bytes on the line now."""
         assert self.is_open, "a closed line carries nothing"

@@ -69,6 +69,15 @@ class Fleet:
         return rows
 
     @property
+    def whole(self) -> bool:
+        """All who were named are here and have said what a line holds; never so for all there are,
+        as nobody knows how many these are."""
+        with self._lock:
+            known = list(self._known.values())
+        named = ALL not in self._ids
+        return named and all(one.here and one.version and one.said[0] for one in known)
+
+    @property
     def seen(self) -> str:
         """How many robots are all there are, and where; "" where they were named."""
         with self._lock:

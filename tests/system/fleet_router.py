@@ -10,11 +10,14 @@ import pytest
 import zenoh
 
 from acsard.lan.authority import Authority
+from acsard.lan.router_file import router_file
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words
 
 FILES = ROOT / "deploy" / "zenoh"
 ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
+
+ROBOTS = ("robot1", "robot2")
 
 ITS_NAME = "router.local"
 
@@ -67,9 +70,16 @@ def tls_settings(own: Path) -> dict[str, object]:
     }
 
 
-def _changes(where: Path, endpoint: str) -> dict[str, object]:
-    """What differs from router.json5 here: the address, the files, no plugins."""
-    config = zenoh.Config.from_file(str(ROUTER_FILE))
+def for_two(where: Path) -> Path:
+    """The file that `acsard lan router` makes of router.json5 for both robots."""
+    file = where / "router.json5"
+    file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
+    return file
+
+
+def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
+    """What differs from a router's file here: the address, the files, no plugins."""
+    config = zenoh.Config.from_file(str(file))
     tls = json.loads(config.get_json("transport/link/tls"))
     for key, value in tls.items():
         if isinstance(value, str):
@@ -81,14 +91,25 @@ def _changes(where: Path, endpoint: str) -> dict[str, object]:
     }
 
 
+def here(file: Path, where: Path, endpoint: str) -> Path:
+    """A router's file with this address and the certificates below `where`, without plugins."""
+    config = zenoh.Config.from_file(str(file))
+    for key, value in _changes(file, where, endpoint).items():
+        config.insert_json5(key, json.dumps(value))
+    changed = file.with_suffix(".json")
+    changed.write_text(str(config))
+    return changed
+
+
 def router(where: Path, endpoint: str) -> Program:
     """Python's Zenoh as the router; says "routing"."""
-    return Program(words(_ROUTER, ROUTER_FILE, json.dumps(_changes(where, endpoint))), where)
+    file = for_two(where)
+    return Program(words(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
 def watched_router(where: Path, endpoint: str) -> Program:
     """`acsard router` with the file; its log says when it listens."""
-    return Program(acsard("router", str(_file(where, endpoint))), where)
+    return Program(acsard("router", str(here(for_two(where), where, endpoint))), where)
 
 
 def zenohd(where: Path, endpoint: str) -> Program:
@@ -96,13 +117,4 @@ def zenohd(where: Path, endpoint: str) -> Program:
     program = shutil.which("zenohd")
     if program is None:
         pytest.skip("needs zenohd")
-    return Program([program, "-c", str(_file(where, endpoint))], where)
-
-
-def _file(where: Path, endpoint: str) -> Path:
-    config = zenoh.Config.from_file(str(ROUTER_FILE))
-    for key, value in _changes(where, endpoint).items():
-        config.insert_json5(key, json.dumps(value))
-    file = where / "router.json"
-    file.write_text(str(config))
-    return file
+    return Program([program, "-c", str(here(for_two(where), where, endpoint))], where)

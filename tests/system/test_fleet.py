@@ -31,8 +31,9 @@ from acsard.values import ROLES
 from tests.system.fleet_router import (
     ITS_NAME,
     ROBOT_FILE,
-    ROUTER_FILE,
+    ROBOTS,
     certified,
+    for_two,
     router,
     tls_settings,
 )
@@ -509,8 +510,11 @@ def test_the_lines_for_a_robot_are_a_configuration_without_surprises() -> None:
     assert config.access.maintainers == (router,)  # `lan add NAME` makes it valid for that name
 
 
-def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() -> None:
-    access = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("access_control"))
+def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
+    tmp_path: Path,
+) -> None:
+    config = zenoh.Config.from_file(str(for_two(tmp_path)))
+    access = json.loads(config.get_json("access_control"))
     keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
     published = set(VALUES)
     assert keys["hear"] == {f"acsard/*/{key}" for key in published}
@@ -520,7 +524,7 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
     least: dict[str, str] = {role: whoami_key(role) for role in ROLES}
     services = {f"srv/{verb}" for verb in SERVICES}
     commands = {f"{kind}/{source}" for kind in ("cmd", "wheel_cmd") for source in SOURCES}
-    for robot in ("robot1", "robot2"):
+    for robot in ROBOTS:
         found = {
             kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
             for kind in ("see", "stop", "drive", "keep", "sense")
@@ -535,8 +539,9 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources() 
         assert not found["see"] & (commands | services - {"srv/stop"})
 
 
-def test_no_rule_of_the_router_compares_a_wildcard_with_what_people_send() -> None:
-    access = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("access_control"))
+def test_no_rule_of_the_router_compares_a_wildcard_with_what_people_send(tmp_path: Path) -> None:
+    config = zenoh.Config.from_file(str(for_two(tmp_path)))
+    access = json.loads(config.get_json("access_control"))
     rules = {rule["id"]: rule for rule in access["rules"]}
     people = {"viewers", "operators", "maintainers"}
     names = {

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ import pytest
 import zenoh
 
 from acsard.bus.fleet import ALL, stop
+from acsard.cli import main
+from acsard.client import connecting
 from tests.pages import blocks
 from tests.system.fleet_router import ROBOT_FILE, certified, router
 from tests.system.harness import (
@@ -159,6 +162,31 @@ def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots
     for row in rows:
         waits = "waiting for a command"
         assert re.search(rf"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +{waits}", row), row
+
+
+def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near, far = os.pipe()
+    os.set_blocking(near, False)
+    told = [b""]
+    really = connecting._close
+
+    def close(session: zenoh.Session) -> None:
+        with suppress(BlockingIOError):
+            told.append(os.read(near, 65536))
+        really(session)
+
+    monkeypatch.setattr(connecting, "_close", close)
+    with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
+        main(robots.words("fleet", "--once", who=f"{ONE},{TWO}")[3:])
+    assert b"ready" in told[-1]
+
+
+def test_named_robots_are_not_waited_for_once_each_is_told(robots: Robots) -> None:
+    both, missing = (robots.tool("fleet", "--once", who=f"{ONE},{o}") for o in (TWO, "robot9"))
+    assert 1.5 * both.seconds < missing.seconds
+    assert len(re.findall(r"^robot\d +ready .* waiting for a command", both.out, re.M)) == 2
 
 
 @pytest.mark.slow

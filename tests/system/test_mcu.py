@@ -137,7 +137,7 @@ FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
 }
 
 
-def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
+def checked(where: Path, name: str, within: float = CHECK_S) -> tuple[int, dict[str, Any], str]:
     """Exit code, answer and what the simulator heard last, of a check of one faulty robot."""
     fault = FAULTS[name][0]
     place = where / name
@@ -148,7 +148,7 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
     with Program(acsard("sim", *words), place) as sim:
         port = sim.says("acsard run --port").split()[-1]
         check = acsard("mcu", "check", "--port", port, "--yes", "--json", "--write")
-        ended = finish(check, place, CHECK_S)
+        ended = finish(check, place, within)
     assert ended.err == ""
     return ended.code, json.loads(ended.out), config.read_text()
 
@@ -173,6 +173,34 @@ def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: 
         assert sorted(re.split(" =", line)[0] for line in differing) == sorted(
             key.rpartition(".")[2] for key in found["changes"]
         )
+
+
+BUSY = "while True: pass"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("loops", [0, 4])
+def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: int) -> None:
+    """Five checks beside each other, or one beside loops of the same priority."""
+    spinning = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(loops)]
+    places = [tmp_path / str(n) for n in range(1 if loops else 5)]
+    for place in places:
+        place.mkdir()
+    try:
+        with ThreadPoolExecutor(len(places)) as pool:
+            results = list(pool.map(lambda place: checked(place, "good", 300.0), places))
+    finally:
+        for one in spinning:
+            one.kill()
+            one.wait()
+    for code, found, _ in results:
+        told = [one for one in found["findings"] if one["verdict"] in ("FAIL", "WARN")]
+        print(*told, sep="\n")
+        assert code == 0, found
+        assert all("this computer was late" in one["text"] for one in told), found
+        assert found["changes"].keys() <= {"mcu.port", "mcu.link_check", "mcu.encoder_counts"}
+        assert found["changes"].get("mcu.encoder_counts", 3200) == 3200
 
 
 @pytest.mark.network

@@ -12,24 +12,30 @@ import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.pages import COMMANDS, Block, Run, blocks, promises
+from tests.system.fleet_router import ROBOT_FILE, here
 from tests.system.harness import (
     ROOT,
     Bus,
     Daemon,
     Finished,
     Program,
+    acsard,
     environment,
     finish,
     free_endpoint,
+    until,
     write_config,
 )
+from tests.system.identities import free_tls_endpoint
 from tests.system.test_fleet import Fleet
+from tests.system.typed import typed
 
 MARKS = {"README.md": pytest.mark.slow, "deploy/zenoh/README.md": pytest.mark.network}
 """Of pages whose commands take their time."""
@@ -165,6 +171,35 @@ def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> No
         assert (done.code, says in done.out) == (code, True), f"{command}\n{done}"
 
 
+@pytest.mark.network
+def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_path: Path) -> None:
+    page, place = "deploy/zenoh/README.md", with_acsard(tmp_path)
+    for words in ("lan init", "lan add router", "lan add robot$n", "lan add laptop", "lan router"):
+        done = shell(place, find(page, words).replace("192.168.1.10", "127.0.0.1"))
+        assert done.code == 0, done
+    clients, endpoint = place / "fleet/clients", free_tls_endpoint()
+    authority = (place / "fleet/ca.pem").read_bytes()
+    for n in range(1, 11):
+        made = {file.name: file.read_bytes() for file in (clients / f"robot{n}").iterdir()}
+        assert made.keys() == {"ca.pem", "certificate.pem", "key.pem"}
+        assert made["ca.pem"] == authority
+    own = tomllib.loads(ROBOT_FILE.read_text())
+    own["robot"]["id"] = "robot10"
+    own["bus"] |= {"connect": [endpoint], "tls": str(clients / "robot10")}
+    file = here(place / "router.json5", clients, endpoint)
+    with Program(acsard("router", str(file)), place) as program:
+        until(lambda: "router_open" in program.stderr, 20.0, "the router")
+        with Daemon(place, config=own, name="robot10", ready=False):
+
+            def code(name: str, *words: str) -> int:
+                by = ("--id", "robot10", "--connect", endpoint, "--tls", str(clients / name))
+                return typed(*words, *by).code
+
+            until(lambda: code("laptop-anna", "call", "stop") == 0, 30.0, "the tenth robot")
+            assert code("robot1", "call", "clear") != 0
+            assert code("laptop-anna", "call", "clear") == 0
+
+
 # what installs from an index
 
 
@@ -220,6 +255,8 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
         assert done.code == 0, done
     files = finish([str(venv / "bin/acsard"), "service", "install", "--dry-run"], clone.parent)
     assert "acsard.service" in files.out
+    router = finish([str(venv / "bin/acsard"), "lan", "router", "robot7"], clone.parent)
+    assert '"acsard/robot7/srv/stop"' in router.out
 
 
 @pytest.mark.network

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -66,6 +67,61 @@ class Robot(VirtualWire):
         """What the motors are told to do once all that was sent has arrived."""
         self.mcu.advance(self.now_ns() + 1000 * MS)
         return [abs(speed) for speed in self.mcu.vehicle.set_points]
+
+
+class Busy(Robot):
+    """On a computer with more to do than it can: of every so many waits the last ends `late_s` too
+    late, and what came meanwhile lay in the kernel. So it is until `until_s` of the check."""
+
+    def __init__(
+        self, *faults: str, late_s: float, every: int, until_s: float = math.inf, **how: Any
+    ) -> None:
+        super().__init__(*faults, **how)
+        self._late_ns, self._every, self._until_ns = int(late_s * 1e9), every, until_s * 1e9
+        self._waits = 0
+
+    def wakes_late(self) -> bool:
+        """Out of the wait that begins now."""
+        self._waits += 1
+        return self._waits % self._every == 0 and self.now_ns() < self._until_ns
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        if not self.wakes_late():
+            return super().listen(until_ns)
+        got = super().listen(until_ns + self._late_ns)
+        return [(self.now_ns(), b"".join(data for _, data in got))] if got else []
+
+
+class Starved(Busy):
+    """The same computer, and the board is a program of it: that one reads and writes too late, and
+    the kernel tells for how long it has waited."""
+
+    def __init__(self, *faults: str, **how: Any) -> None:
+        super().__init__(*faults, **how)
+        self._runs_ns = self._waited_ns = 0
+        self._held: list[bytes] = []
+
+    def send(self, data: bytes) -> None:
+        if self.now_ns() < self._runs_ns:
+            self._held.append(data)
+        else:
+            super().send(data)
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        if self.now_ns() >= self._runs_ns and self.wakes_late():
+            self._runs_ns = self.now_ns() + self._late_ns
+        if self.now_ns() < self._runs_ns:
+            self._now_ns = min(until_ns, self._runs_ns)
+            if until_ns < self._runs_ns:
+                return []
+            self._waited_ns, held, self._held = self._late_ns, self._held, []
+            for data in held:
+                super().send(data)
+        return VirtualWire.listen(self, until_ns)
+
+    def late_ns(self) -> int:
+        waited_ns, self._waited_ns = self._waited_ns, 0
+        return waited_ns
 
 
 def configured(config: Config, **mcu: Any) -> Config:

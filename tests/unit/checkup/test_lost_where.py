@@ -51,6 +51,19 @@ def test_commands_lost_to_a_board_that_reports_by_its_own_clock_are_seen(
     assert check("unprompted", fault, reply_period=0.1)["lost where"].verdict == verdict
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("earlier", range(1, 5))
+def test_it_does_not_matter_which_of_the_lines_is_the_first_that_is_lost(earlier: int) -> None:
+    class Spoken(Robot):
+        def open(self, baud_rate: int) -> None:
+            super().open(baud_rate)
+            for _ in range(earlier):
+                self.mcu.receive(self.now_ns(), b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
+
+    checked = Checked(Spoken("unprompted", "lost_commands", reply_period=0.1))
+    assert checked["lost where"].verdict == "FAIL"
+
+
 @pytest.mark.parametrize(
     ("lag", "per_turn"), [(0.0, 3200), (0.3, 3200), (1.0, 3200), (2.0, 3200), (0.05, 16)]
 )

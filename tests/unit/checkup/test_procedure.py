@@ -17,7 +17,17 @@ from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.codec import Codec
 from acsard.sim import protocol
 from acsard.values import WHEELS
-from tests.unit.checkup.robots import MS, Checked, Nobody, Robot, check, configured
+from tests.unit.checkup.robots import (
+    MS,
+    Busy,
+    Checked,
+    Nobody,
+    Person,
+    Robot,
+    Starved,
+    check,
+    configured,
+)
 
 MOTORS = "abcd"
 
@@ -528,6 +538,8 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
     procedure.run(robot, Listener(), robot.config, lambda finding: said.append(finding.name))
     told = [n for n, text in enumerate(said) if text in ("baud rate", "lost lines", "watchdog")]
     assert all(said[n - 1] not in procedure.STEPS for n in told)
+    turned = [text.split()[1] for text in said if " turns: a moment first" in text]
+    assert turned == list(MOTORS)
 
 
 @pytest.mark.variations(3)
@@ -572,3 +584,101 @@ def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_tu
     assert (finding.verdict, finding.figure) == ("FAIL", "needed")
     assert "still turns after zeros" in finding.text
     assert checked.changes["mcu.trailing_comma"] is True
+
+
+# a computer that is late
+
+
+def names(checked: Checked) -> set[str]:
+    """What was not judged."""
+    return {f.name for f in checked.findings if f.figure == "not judged"}
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(
+    ("computer", "fault", "late_s", "every"),
+    [
+        (Busy, "no_sample", 0.04, 2),
+        (Busy, "plain_only", 0.15, 5),
+        (Starved, "no_sample", 0.4, 40),
+        (Busy, "unprompted", 0.06, 3),
+        (Busy, "no_sample", 0.4, 11),
+        (Starved, "unprompted", 0.15, 9),
+        (Starved, "plain_only", 0.06, 3),
+        (Starved, "plain_only", 0.4, 11),
+        (Busy, "no_sample", 0.03, 1),
+        (Starved, "no_sample", 0.15, 9),
+    ],
+)
+def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
+    computer: type[Busy], fault: str, late_s: float, every: int
+) -> None:
+    period = 0.1 if fault == "unprompted" else 0.0
+    robot = computer(fault, late_s=late_s, every=every, reply_period=period, link_check="auto")
+    checked = Checked(robot)
+    assert checked.failed == []
+    assert set(checked.named("WARN")) <= names(checked) | {"reply form"}
+    assert set(checked.changes) <= {"mcu.link_check", "mcu.encoder_counts"}
+    for finding in checked.findings:
+        if finding.figure == "not judged":
+            assert (
+                finding.text
+                == f"this computer was late by up to {1000 * late_s:.0f} ms: not judged"
+            )
+            assert "real-time rights" in finding.mend
+    assert not checked.left_turning
+
+
+def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
+    for computer in (Busy, Starved):
+        quiet = check("no_sample")
+        checked = Checked(computer("no_sample", late_s=0.45, every=9, until_s=2.5))
+        assert names(checked) == set()
+        assert [f.verdict for f in checked.findings] == [f.verdict for f in quiet.findings]
+
+
+def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> None:
+    robot = Busy("plain_only", late_s=0.45, every=30)
+    asked: list[str] = []
+
+    class Counts(Person):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            asked.append(question.partition("?")[0])
+            return super().ask(question, answers)
+
+    findings: list[Finding] = []
+    procedure.run(robot, Counts(robot), robot.config, findings.append)
+    which = [question for question in asked if question.startswith("which wheel")]
+    assert len(which) == len(set(which))
+
+
+@pytest.mark.parametrize(
+    ("fault", "name"),
+    [
+        ("reversed_encoder=b", "motor b (front left)"),
+        ("swapped_motors=a:b", "motor a (front right)"),
+        ("comma_latched", "trailing comma"),
+        ("other_baud=57600", "baud rate"),
+        ("no_watchdog", "watchdog"),
+    ],
+)
+def test_what_no_lateness_makes_is_told_all_the_same(fault: str, name: str) -> None:
+    checked = Checked(Busy(fault, late_s=0.03, every=3))
+    assert checked[name].verdict == "FAIL"
+
+
+def test_a_board_that_falls_silent_is_not_excused() -> None:
+    class Pulled(Busy):
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            got = super().listen(until_ns)
+            return [] if self.turned else got
+
+    robot = Pulled("plain_only", late_s=0.03, every=5)
+    checked = Checked(robot)
+    assert checked.failed == ["link"]
+
+
+def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
+    checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))
+    assert "motor b (front left)" in names(checked)
+    assert checked["watchdog"].verdict in ("SKIPPED", "WARN")

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.host.processes import holder_of, holders, master_of, name_of, running
+from acsard.host.processes import holder_of, holders, master_of, name_of, running, waited_ns
+from tests.system.harness import until
 
 HOLD = """\
 import fcntl, os, sys
@@ -98,3 +99,15 @@ def test_a_process_that_is_not_there_has_no_name() -> None:
     ended.wait()
     assert name_of(os.getpid()) != ""
     assert name_of(ended.pid) == ""
+
+
+def test_who_has_to_wait_for_a_processor_is_seen_to() -> None:
+    spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
+    two = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
+    try:
+        until(lambda: all(waited_ns(one.pid) > 20_000_000 for one in two), 20.0, "both have waited")
+    finally:
+        for one in two:
+            one.kill()
+            one.wait()
+    assert waited_ns(two[0].pid) == 0  # it has ended

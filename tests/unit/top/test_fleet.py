@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
 
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Info, Message
 from acsard.top import fleet as fleets
 from acsard.top.fleet import Fleet
+from tests.unit.top.screens import STATE
 
 
 class Session:
@@ -36,10 +40,26 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     return Session()
 
 
-def fleet_of(session: Session) -> Fleet:
+def fleet_of(
+    session: Session, ids: Sequence[str] = ("*",), answering: Collection[str] = ()
+) -> Fleet:
+    """Of robots of which some answer what they are asked."""
     robot: Any = SimpleNamespace(session=session)
-    robot.like = lambda name: SimpleNamespace(ask=lambda key, take: None)
-    return Fleet(robot, ("*",), "tcp/127.0.0.1:7448")
+    robot.like = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
+
+    def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
+        if name in answering:
+            payload = SimpleNamespace(to_bytes=lambda: encode(SAID[key], "json"))
+            full = f"acsard/{name}/{key}"
+            take(SimpleNamespace(key_expr=full, payload=payload, encoding="application/json"))
+
+    return Fleet(robot, ids, "tcp/127.0.0.1:7448")
+
+
+SAID: dict[str, Message] = {
+    "state": STATE,
+    "info": Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[]),
+}
 
 
 def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) -> None:
@@ -60,3 +80,24 @@ def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
     session.comes("robot1", zenoh.SampleKind.DELETE)
     assert [row.here for row in fleet.rows()] == [False]
     assert fleet.more == ""
+
+
+@pytest.mark.parametrize(
+    ("ids", "answering", "here", "whole"),
+    [
+        (("robot1", "robot2"), ("robot1", "robot2"), ("robot1", "robot2"), True),
+        (("robot1", "robot2"), ("robot1",), ("robot1", "robot2"), False),
+        (("robot1", "robot2"), ("robot1", "robot2"), ("robot1",), False),
+        (("*",), ("robot1",), ("robot1",), False),  # another may come yet
+    ],
+)
+def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
+    session: Session, ids: tuple[str, ...], answering: tuple[str, ...], here: Sequence[str],
+    whole: bool,
+) -> None:  # fmt: skip
+    fleet = fleet_of(session, ids, answering)
+    assert not fleet.whole
+    for name in here:
+        session.comes(name)
+    fleet.rows()  # asks
+    assert fleet.whole is whole

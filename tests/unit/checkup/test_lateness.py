@@ -1,0 +1,71 @@
+"""What is worth nothing, since this computer was late."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.checkup.lateness import LEAST_S, PAUSE_S, SPOILS_S, Lateness, finding, judged, spoilt
+from acsard.checkup.limits import PERIOD_S
+from acsard.checkup.manual import Unsure, find
+from tests.unit.checkup.robots import Busy, Robot, Starved
+
+
+def test_the_most_since_a_moment_is_told() -> None:
+    lateness = Lateness()
+    for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (LEAST_S / 2, 4.0)):
+        lateness.look(late_s, now_s)
+    assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "late_s", "doubted"),
+    [
+        ("watchdog: late", SPOILS_S, True),
+        ("watchdog: late", 0.9 * SPOILS_S, False),
+        ("watchdog: right", SPOILS_S, False),
+        ("watchdog: right", PAUSE_S, True),
+        ("watchdog: none", 10.0, False),
+        ("reply rate: slow", SPOILS_S, True),
+        ("lost lines: none", 10.0, False),
+        ("motor: reversed, not seen", 10.0, False),
+    ],
+)
+def test_only_what_a_late_computer_can_make_is_doubted(
+    outcome: str, late_s: float, doubted: bool
+) -> None:
+    seen: dict[str, Any] = dict.fromkeys(
+        ("figure", "seconds", "rate", "way", "gap", "quiet", "period", "lines", "here"), 1.0
+    )
+    found = find(outcome, **seen)
+    assert (isinstance(found, Unsure) and spoilt(found, late_s)) is doubted
+
+
+def test_what_is_not_judged_is_no_fault_and_has_no_keys() -> None:
+    found = finding("watchdog", 0.085)
+    assert (found.name, found.verdict, found.keys) == ("watchdog", "WARN", {})
+    assert found.text == "this computer was late by up to 85 ms: not judged"
+    assert not judged(found)
+    assert judged(find("baud rate: right", rate=9600))
+
+
+def test_a_board_is_seen_to_be_waited_for_too_long_however_long_is_listened() -> None:
+    for seconds in (PERIOD_S, 0.5):
+        with Busy(late_s=0.08, every=7).board(rest=False) as board:
+            for _ in range(7):
+                board.listen(seconds)
+            assert board.lateness.since(0.0) == pytest.approx(0.08)
+    with Starved(late_s=0.08, every=7).board(rest=False) as board:
+        board.listen(0.5)
+        assert board.lateness.since(0.0) == pytest.approx(0.08)
+
+
+def test_what_it_takes_to_ask_a_person_is_no_lateness() -> None:
+    robot = Robot()
+    with robot.board() as board:
+        board.drive((0.0, 0.0, 0.0, 3.0), 0.3)
+        board.rest()
+        robot.listen(robot.now_ns() + 20_000_000_000)
+        board.drive((0.0, 0.0, 0.0, 3.0), 0.3)
+        assert board.lateness.since(0.0) == 0.0

@@ -1,0 +1,91 @@
+"""The router's file for any robots and people: each may in its own tree what one robot may."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from acsard.host.errors import UsageError
+from acsard.lan.router_file import router_file
+from acsard.values import ROLES, Role
+
+TEMPLATE = (Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5").read_text()
+
+TEN = tuple(f"robot{n}" for n in range(1, 11))
+
+
+def read(text: str) -> Any:
+    """What Zenoh reads in it: access, and the storages."""
+    config = zenoh.Config.from_json5(text)
+    access = json.loads(config.get_json("access_control"))
+    return access | {"storages": json.loads(config.get_json("plugins/storage_manager/storages"))}
+
+
+def made(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = None) -> Any:
+    return read(router_file(TEMPLATE, robots, people or {}))
+
+
+def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
+    assert made(["robot1"]) == read(TEMPLATE)
+
+
+def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
+    one, ten = made(["robot1"]), made(TEN)
+    own = [rule for rule in one["rules"] if "robot1" in rule["id"]]
+    assert len(ten["rules"]) == len(one["rules"]) + 9 * len(own)
+    rules = {rule["id"]: rule for rule in ten["rules"]}
+    for robot in TEN:
+        for rule in own:
+            there = rules[rule["id"].replace("robot1", robot)]
+            assert there["key_exprs"] == [
+                key.replace("acsard/robot1/", f"acsard/{robot}/") for key in rule["key_exprs"]
+            ]
+        (policy,) = [p for p in ten["policies"] if p["subjects"] == [robot]]
+        assert policy["rules"] == [robot]
+        (subject,) = [s for s in ten["subjects"] if s["id"] == robot]
+        assert subject["cert_common_names"] == [robot]
+        assert {f"{robot}-state", f"{robot}-odom", f"{robot}-tf_static"} <= ten["storages"].keys()
+    for role in ("viewers", "operators", "maintainers"):
+        before, after = (
+            next(p["rules"] for p in each["policies"] if p["subjects"] == [role])
+            for each in (one, ten)
+        )
+        named = [rule for rule in before if "robot1" in rule]
+        assert sorted(after) == sorted(
+            {rule.replace("robot1", robot) for rule in named for robot in TEN}
+            | set(before) - set(named)
+        )
+
+
+def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> None:
+    who: dict[Role, list[str]] = {"operator": ["laptop-anna", 'b"c'], "viewer": ["wall"]}
+    names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], who)["subjects"]}
+    assert names == {
+        "viewers": ["viewer", "wall"],
+        "operators": ["operator", "laptop-anna", 'b"c'],
+        "maintainers": ["maintainer"],
+        "a-1": ["a-1"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("robots", "people"),
+    [
+        (["robot1", "robot1"], {}),
+        (["robot1"], {"viewer": ["robot1"]}),
+        (["robot1"], {"viewer": ["anna"], "operator": ["anna"]}),
+        (["operator"], {}),
+    ],
+)
+def test_a_name_has_one_place(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
+    with pytest.raises(UsageError, match="there twice"):
+        router_file(TEMPLATE, robots, people)
+
+
+def test_every_role_has_its_list() -> None:
+    assert all(f'cert_common_names: ["{role}"]' in TEMPLATE for role in ROLES)
