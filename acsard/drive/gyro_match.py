@@ -58,6 +58,8 @@ class Match:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
         """The prior: the ratio is 1, by and large."""
         self._wd, self._dg, self._dd = NO_DELAY
+        self._rr = 1.0
+        """What was not foreseen of each block, squared."""
         self._lag = LAG_S
         self.blocks = 0.0
         """How many blocks of turning are remembered."""
@@ -67,6 +69,11 @@ class Match:
         """The wheels' rate now, and when the block began."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
+
+    @property
+    def spread(self) -> float:
+        """By how much the ratio differs from block to block: what the next one may be off."""
+        return math.sqrt(self._rr / self._ww)
 
     def delay(self) -> float | None:
         """s by which the gyro is later than assumed, once that is certain; then it is assumed."""
@@ -122,6 +129,8 @@ class Match:
         if abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE:
             return
         weight = 1.0 / (BLOCK_NOISE + BLOCK_SHARE * abs(wheels)) ** 2
+        off = gyro - self.ratio * wheels - self._slope * change
+        self._rr = MEMORY * self._rr + weight * off * off
         self._ww = MEMORY * self._ww + weight * wheels * wheels
         self._wg = MEMORY * self._wg + weight * wheels * gyro
         self._wd = MEMORY * self._wd + weight * wheels * change

@@ -114,3 +114,19 @@ def test_a_delay_that_is_put_right_is_in_the_ratio_at_once() -> None:
     before = match.ratio
     assert match.delay() is not None
     assert match.ratio != before
+
+
+def test_the_spread_is_what_the_ratio_differs_by_from_block_to_block() -> None:
+    def uneven(t: float) -> float:
+        return 0.6 * (1.1 if int(t) % 2 else 0.9)
+
+    steady, mixed = matched(60.0), Match()
+    for n in range(6000):
+        t = n * DT
+        mixed.add(stirring(t) * DT, uneven(t) * stirring(t) * DT, DT, slips=False)
+    assert steady.spread < 0.01
+    assert mixed.spread == pytest.approx(0.06, rel=0.3)
+
+
+def test_before_anything_is_learned_the_spread_is_the_deviation_of_what_is_assumed() -> None:
+    assert Match().spread == ROUGH
