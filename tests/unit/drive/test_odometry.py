@@ -725,3 +725,20 @@ def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> Non
             would.twist,
             would.covariance,
         )
+
+
+def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
+    """A front left wheel is dead, and the track becomes another one before that is seen."""
+    asked = OdometryConfig(learned_track=True)
+    liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
+    told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
+    dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
+    for n in range(60):
+        honest.fold(Feedback(AT, told, 0.01), told=told)
+        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), told=told)
+        if n == 51:
+            assert not liar.doubt.left_out
+            for robot in (liar, honest):
+                robot.turn_by(Track(1.6, 0.02))
+    assert liar.doubt.left_out == ("front_left",)
+    assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
