@@ -212,7 +212,7 @@ def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
     made.bus.wanted = set()
-    wandering(made, 13, seconds=15.0)
+    wandering(made, 13, seconds=25.0)
     assert " in use, configured" in made.state.track
     made.gyro_dead = True
     made.drive(0.3, 0.8, 1.0)
