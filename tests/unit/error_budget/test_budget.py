@@ -105,10 +105,18 @@ def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
     assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
+def test_a_learned_track_that_is_in_use_errs_by_its_own_deviation() -> None:
+    heard = Heard(driven().lines, [], learned=1.1, deviation=0.02, used=True)
+    found = share(budget(heard, CONFIG), "parameters")
+    assert found.basis == "measured"
+    assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
+
+
 def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
-    found = budget(Heard(driven().lines, [], learned=1.1), config)
+    found = budget(Heard(driven().lines, [], learned=1.1, deviation=0.02), config)
     assert found.multiplier == 1.5
+    assert found.learned_std == pytest.approx(0.033)
     assert found.learned == pytest.approx(1.65)
     assert budget(Heard(driven().lines, []), config).learned is None
 
