@@ -28,6 +28,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     robot.py       P  the order; guard.py: the last look at every outgoing line
     sim/           P  the vehicle, the fake microcontroller, its faults
     checkup/       P  what `acsard mcu check` does: one module a question to the board
+    error_budget/  P  what `acsard odom` does: drive_log (what the bus told), steps, budget (each
+                      cause's share), text
     calibration/   P  what `acsard calibrate` does: table and runs (a log), heading and places (what
                       it shows), fit, solve (the order), report; calibration/guided/ is the
                       drive without a log: the ways, the legs, what a person reads off

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from msgspec.structs import replace
+
 from acsard.config.live import changed
 from acsard.config.motion_rules import longest_reply
 from acsard.config.parsing import ConfigError
@@ -19,6 +21,7 @@ from acsard.drive.arbiter import Arbiter, Choice
 from acsard.drive.dropped import Dropped
 from acsard.drive.gyro import Gyro
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import LearnedTrack
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
 from acsard.drive.modes import Mode, RefusedError, Trigger
@@ -81,6 +84,8 @@ class Robot:
             self.session.quiet_ns / NS_PER_S,
         )
         self._gyro = Gyro() if config.odometry.gyro else None
+        multiplier = config.drive.wheel_separation_multiplier
+        self._track = LearnedTrack(multiplier) if config.odometry.learned_track else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
@@ -118,6 +123,9 @@ class Robot:
         counters = {"lines": session.good_lines}
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         counters |= self._odometry.missed()
+        gyro = GyroStatus() if self._gyro is None else self._gyro.status
+        if self._track is not None:
+            gyro = replace(gyro, track_use=self._track.use)
         return Snapshot(
             pose=self._odometry.pose,
             measured=self._odometry.twist,
@@ -126,7 +134,7 @@ class Robot:
             counters=counters | self.counters,
             refused=self._refused,
             refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
-            gyro=GyroStatus() if self._gyro is None else self._gyro.status,
+            gyro=gyro,
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
             encoders=session.snapping.counts,
@@ -258,10 +266,19 @@ class Robot:
         estimate = self._odometry.fold(line, self._gyro, self._speeds)
         if self._gyro is not None:
             events += self._gyro.events
+            self._learn(self._gyro, events)
         if self._odometry.events:
             self.counters["wheels_doubted"] += len(self._odometry.events)
             events += self._odometry.events
         return estimate
+
+    def _learn(self, gyro: Gyro, events: list[Event]) -> None:
+        """Turn by the track that the gyro has taught, where that is asked for and known."""
+        if self._track is not None:
+            self._track.look(gyro.learned)
+            self._odometry.turn_by(self._track.used)
+            if self._track.event is not None:
+                events.append(self._track.event)
 
     # requests
 

@@ -167,7 +167,7 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_dropped", "lines_lost", "wheels_turned", "wheels_doubted",
-    "gyro", "imu_refused",
+    "gyro", "track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "no_router",
     "missed_periods", "recording",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
@@ -285,6 +285,10 @@ GyroDoes = Literal[
 """Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
 
 
+TrackUse = Literal["shown", "uncertain", "too far off", "used"]
+"""Of the effective track that a gyro implies; the configured one is in use unless it is `used`."""
+
+
 class GyroStatus(Struct, frozen=True):
     """What the gyro does for odometry, and what is known of it; None is not known yet."""
 
@@ -294,7 +298,9 @@ class GyroStatus(Struct, frozen=True):
     delay: float = 0.0
     """s by which it tells later than the wheels."""
     track: float | None = None
-    """The effective track it implies, as a share of the configured one."""
+    track_deviation: float = 0.0
+    """The effective track it implies, as a share of the configured one; its deviation of that."""
+    track_use: TrackUse = "shown"
 
 
 class Inputs(Struct, frozen=True):

@@ -279,7 +279,7 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
 LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
 """Three published keys in one file."""
 
-READS_KEYS = {"checkup/budget_feed.py", "web/page/main.js"}
+READS_KEYS = {"error_budget/feed.py", "web/page/main.js"}
 """Files that only follow some of them."""
 
 

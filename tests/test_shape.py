@@ -20,7 +20,7 @@ UNIT = Path(__file__).parent / "unit"
 
 PURE_ROOMS = (
     "values", "config", "mcu", "drive", "messages", "ros", "incoming", "robot", "guard", "sim",
-    "checkup", "calibration", "report",
+    "checkup", "calibration", "error_budget", "report",
 )  # fmt: skip
 """No clock, no I/O, no asyncio, no logging, no randomness."""
 

@@ -1,6 +1,6 @@
 """`acsard odom`: what makes odometry wrong now, and what to do about it.
 
-How that is found is `checkup/budget.py`'s.
+How that is found is `error_budget/budget.py`'s.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from acsard.cli.common import add_bus, load, robot_address
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.checkup.budget import Budget
-    from acsard.checkup.budget_feed import Feed
     from acsard.client import Client, Subscription
     from acsard.config.settings import Config
+    from acsard.error_budget.budget import Budget
+    from acsard.error_budget.feed import Feed
 
 DESCRIPTION = """\
 Follow the robot while somebody drives it, and tell how much each cause alone makes its odometry
@@ -54,9 +54,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Look and tell."""
-    from acsard.checkup.budget import budget
-    from acsard.checkup.budget_feed import KEYS, Feed
     from acsard.client import connect
+    from acsard.error_budget.budget import budget
+    from acsard.error_budget.feed import KEYS, Feed
 
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -138,7 +138,7 @@ def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None
 def _print(found: Budget, as_json: bool) -> None:
     import msgspec
 
-    from acsard.checkup.budget_text import advice, text
+    from acsard.error_budget.text import advice, text
 
     if not as_json:
         print(text(found), flush=True)

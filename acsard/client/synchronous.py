@@ -27,11 +27,15 @@ from acsard.host.errors import (
     UsageError,
 )
 from acsard.host.own_name import own_name
+from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
 from acsard.messages.topics import by_key, full_key, key_hint, service_key, unknown
 from acsard.values import Plain, Pose
+
+AGAIN_S = 0.03
+"""Between a daemon that says it is asked too much and the next try."""
 
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
@@ -192,6 +196,24 @@ class Client:
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """The first answer: a stranger may give any number of others."""
+        end_s = time.monotonic() + REPLY_TIMEOUT_S
+        while True:
+            reply = self._first(name, payload)
+            if reply is None:
+                raise self._unanswered(name)
+            if reply.ok is not None:
+                return encoded(reply.ok)
+            said = reply.err.payload.to_string() if reply.err is not None else ""
+            if said == TIMED_OUT:
+                raise NoAnswerError(
+                    f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
+                    "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
+                )
+            if said != BUSY or time.monotonic() > end_s:
+                raise ReplyError(f"{name}: {said}")
+            time.sleep(AGAIN_S)  # others ask more than is answered: nothing was done
+
+    def _first(self, name: str, payload: bytes | None) -> zenoh.Reply | None:
         try:
             replies = self.session.get(
                 self.key(name),
@@ -201,17 +223,7 @@ class Client:
             )
         except zenoh.ZError:
             raise _no_key(name) from None
-        for reply in replies:
-            if reply.ok is not None:
-                return encoded(reply.ok)
-            if reply.err is not None and reply.err.payload.to_string() == TIMED_OUT:
-                raise NoAnswerError(
-                    f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
-                    "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
-                )
-            if reply.err is not None:
-                raise ReplyError(f"{name}: {reply.err.payload.to_string()}")
-        raise self._unanswered(name)
+        return next(iter(replies), None)
 
     def _unanswered(self, name: str) -> MendableError:
         """Why nobody answers: one reason where one can be seen."""

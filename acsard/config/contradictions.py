@@ -159,6 +159,15 @@ def _frame_problems(config: Config) -> list[str]:
     return _repeated("frame", frames)
 
 
+def _gyro_problems(config: Config) -> list[str]:
+    if not config.odometry.learned_track or config.odometry.gyro:
+        return []
+    return [
+        "odometry.learned_track = true: a gyro teaches it, and odometry.gyro = false; write "
+        "odometry.gyro = true or odometry.learned_track = false"
+    ]
+
+
 def _repeated(noun: str, names: dict[str, str]) -> list[str]:
     first: dict[str, str] = {}
     found = []
@@ -280,6 +289,7 @@ RULES: tuple[Rule, ...] = (
     _joint_problems,
     _source_name_problems,
     _frame_problems,
+    _gyro_problems,
     *motion_rules.RULES,
     _source_problems,
     _way_problems,

@@ -116,6 +116,8 @@ class Step(Struct, frozen=True, gc=False):
     """rad that the heading turned,"""
     on_trial: bool
     """which a gyro on trial will put right once it is proved."""
+    share: float = 1.0
+    """The track that its wheels turned it by, of the configured one."""
 
 
 def count_of(line: Feedback) -> float:

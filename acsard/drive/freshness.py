@@ -47,8 +47,10 @@ jitter, but a clock that was slewed, and goes evenly again."""
 GAP_NS = 2 * NS_PER_S
 """Who is silent for longer begins the proof again."""
 
-MAX_CLOCKS = 1024
-"""Clocks remembered at once; the one heard of longest ago goes first."""
+MOST_KNOWN, MOST_NEW = 32, 96
+"""Clocks remembered at once, those believed once and those not yet; of each the one heard of
+longest ago goes first. So no flood of names makes anybody a stranger who is not, and what a
+recording begins with stays small: it is written in a step of the loop."""
 
 State = Literal["new", "known", "stepped"]
 Sign = Literal["usual", "wavering", "steady", "proven"]
@@ -130,6 +132,11 @@ class _Clock:
         self._heard_ns, self._delay = at_ns, 0
         self._proof = _Proof()
 
+    @property
+    def new(self) -> bool:
+        """Its delays have not been believed yet, or not for long."""
+        return self._state == "new"
+
     def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
         """What to do with a command that took so long by the two clocks."""
         silence, self._heard_ns = at_ns - self._heard_ns, at_ns
@@ -165,14 +172,17 @@ class Freshness:
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
+        self._newcomers: dict[str, _Clock] = {}
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """What to do with a command; without a stamp it is as old as its arrival."""
         if command.stamp_ns is None:
             return "fresh"
         name, at_ns = command.clock or command.source, command.arrived_ns
-        clock = self._clocks.pop(name, None) or _Clock(at_ns)
-        self._clocks[name] = clock
-        if len(self._clocks) > MAX_CLOCKS:
-            del self._clocks[next(iter(self._clocks))]
-        return clock.judge(at_ns - command.stamp_ns, at_ns, timeout_ns)
+        clock = self._clocks.pop(name, None) or self._newcomers.pop(name, None) or _Clock(at_ns)
+        verdict = clock.judge(at_ns - command.stamp_ns, at_ns, timeout_ns)
+        held, most = (self._newcomers, MOST_NEW) if clock.new else (self._clocks, MOST_KNOWN)
+        held[name] = clock
+        if len(held) > most:
+            del held[next(iter(held))]
+        return verdict

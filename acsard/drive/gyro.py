@@ -22,6 +22,7 @@ from msgspec import Struct
 from acsard.drive.gyro_bias import KNOWN_S, Bias
 from acsard.drive.gyro_match import WINDOW_S, Match
 from acsard.drive.gyro_trial import PROPORTIONS, Trial
+from acsard.drive.learned_track import LEAST, Track
 from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
@@ -126,10 +127,17 @@ class Gyro:
     @property
     def status(self) -> GyroStatus:
         """What it does now."""
-        match, bias = self._match, self._bias
-        track = 1.0 / match.ratio if match.blocks >= ENOUGH_BLOCKS and match.ratio > 0.0 else None
-        known = bias.value if bias.known else None
-        return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track)
+        known, learned = self._bias.value if self._bias.known else None, self.learned
+        track, deviation = (None, 0.0) if learned is None else (learned.share, learned.deviation)
+        return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track, deviation)
+
+    @property
+    def learned(self) -> Track | None:
+        """The effective track it implies; None until it has turned with the wheels for a while."""
+        match = self._match
+        if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
+            return None
+        return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
         """What came since the last step, in order."""

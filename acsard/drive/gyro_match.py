@@ -26,6 +26,12 @@ MEMORY = 0.995
 ROUGH, FINE = 0.5, 0.1
 """Deviation of the ratio before anything is known, and at best: it differs with floor and rate."""
 
+STRETCH = 1.0
+"""rad to one side over which is seen how far the ratio is off: a moment's lag is little of it."""
+
+KEPT, PRIOR = 0.9, 0.1
+"""What is left of a stretch after the next, and the stretches that what is assumed counts for."""
+
 DELAY_S = 0.2
 """Deviation of the delay before anything is known."""
 
@@ -58,6 +64,11 @@ class Match:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
         """The prior: the ratio is 1, by and large."""
         self._wd, self._dg, self._dd = NO_DELAY
+        self._off = self._way = 0.0
+        """rad of this stretch that the ratio did not foresee, and that the wheels say,"""
+        self._ways = PRIOR * STRETCH**2
+        self._offs = ROUGH**2 * self._ways
+        """and the squares of both, of the stretches before."""
         self._lag = LAG_S
         self.blocks = 0.0
         """How many blocks of turning are remembered."""
@@ -67,6 +78,11 @@ class Match:
         """The wheels' rate now, and when the block began."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
+
+    @property
+    def spread(self) -> float:
+        """By how much the ratio is another one from stretch to stretch, as a standard deviation."""
+        return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
         """s by which the gyro is later than assumed, once that is certain; then it is assumed."""
@@ -122,6 +138,12 @@ class Match:
         if abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE:
             return
         weight = 1.0 / (BLOCK_NOISE + BLOCK_SHARE * abs(wheels)) ** 2
+        self._way += wheels * self._time
+        self._off += (gyro - self.ratio * wheels - self._slope * change) * self._time
+        if abs(self._way) >= STRETCH:
+            self._offs = KEPT * self._offs + self._off * self._off
+            self._ways = KEPT * self._ways + self._way * self._way
+            self._off = self._way = 0.0
         self._ww = MEMORY * self._ww + weight * wheels * wheels
         self._wg = MEMORY * self._wg + weight * wheels * gyro
         self._wd = MEMORY * self._wd + weight * wheels * change

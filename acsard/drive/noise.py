@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import CONFIGURED, Track
 
 Column = tuple[float, float, float, float]
 """m per m, m per rad, rad per m, rad per rad: what a parameter adds to distance and turn, of
@@ -61,12 +62,22 @@ class Noise:
         )
 
 
-def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, ...]:
+def in_use(odometry: OdometryConfig) -> Track | None:
+    """The track to begin with; None where no other one is to be learned."""
+    return CONFIGURED if odometry.learned_track else None
+
+
+def columns(
+    odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
+) -> tuple[Column, ...]:
     """What one standard deviation of each uncertain parameter does; certain ones are left out.
 
     In dl = r m_l phi_l, dr = r m_r phi_r and dyaw = (dr - dl) / (m_L b), with the multipliers m.
+    Where a track is to be `learned` its error has the last column, being none of the configured
+    one's, and does nothing as long as that is the one in use.
     """
-    track = kinematics.track
+    used = learned or CONFIGURED
+    track = kinematics.track * used.share
     left, right, separation = kinematics.multipliers
     rows = []
     if odometry.left_wheel_radius_multiplier_std:
@@ -76,8 +87,11 @@ def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, .
         share = odometry.right_wheel_radius_multiplier_std / right
         rows.append((share / 2, share * track / 4, share / track, share / 2))
     if odometry.wheel_separation_multiplier_std:
-        rows.append((0.0, 0.0, 0.0, -odometry.wheel_separation_multiplier_std / separation))
+        share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
+        rows.append((0.0, 0.0, 0.0, -share))
     if odometry.distance_scale_std:
         # Radii and track alike: every turn stays what it was.
         rows.append((odometry.distance_scale_std, 0.0, 0.0, 0.0))
+    if learned is not None:
+        rows.append((0.0, 0.0, 0.0, -learned.deviation))
     return tuple(rows)

@@ -23,7 +23,9 @@ from acsard.drive.bridging import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.drive.gap_variance import Gaps
 from acsard.drive.gyro import Heading, Turn
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import Track
 from acsard.drive.lying_wheels.verdict import Witness
+from acsard.drive.noise import columns, in_use
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import TwistUncertainty
 from acsard.drive.uncertainty import COARSE_COUNTS, PoseUncertainty
@@ -61,7 +63,9 @@ class Odometry:
     ) -> None:
         """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel;
         `quiet` s of silence, after which the wheels are told to stand."""
-        self._kinematics = kinematics
+        self._kinematics, self._declared = kinematics, odometry
+        self._track, self._share = in_use(odometry), 1.0
+        """The track in use where one is learned; and what it is of the configured one."""
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
@@ -94,6 +98,14 @@ class Odometry:
         """With these variances from now on."""
         self._uncertainty.use(odometry)
         self._twist_uncertainty.use(odometry)
+
+    def turn_by(self, track: Track) -> None:
+        """With this effective track from now on, where the wheels tell the turn."""
+        if track != self._track:
+            self._track, self._share = track, track.share
+            parameters = columns(self._declared, self._kinematics, track)
+            self._uncertainty.bent_by(parameters)
+            self._twist_uncertainty.bent_by(parameters)
 
     def set_pose(self, pose: Pose) -> None:
         """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
@@ -157,6 +169,8 @@ class Odometry:
             self._take_back(gyro)
         believed = self._witness.believed(speeds)
         twist = self._kinematics.twist(believed)
+        if self._share != 1.0:
+            twist = Twist(twist.linear, twist.angular / self._share)
         self._still = self._still + dt if believed == STILL else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
@@ -220,7 +234,7 @@ class Odometry:
         self._path.set(lies[-1].pose)
         on_trial = 0.0
         for step in reversed(lies):
-            arcs = self._arcs(step.pieces, step.gyro)
+            arcs = self._arcs(step.pieces, step.gyro, step.share)
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             if step.on_trial:
@@ -229,16 +243,18 @@ class Odometry:
         if gyro is not None and on_trial:
             self._path.turn(-gyro.taken_back(on_trial))
 
-    def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
+    def _arcs(
+        self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
+    ) -> list[tuple[float, float]]:
         """m and rad for each of so many wheel angles: (4) to (7) are linear.
 
-        A gyro tells one turn for all of them.
+        A gyro tells one turn for all of them, else a track of this share of the configured one.
         """
         rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces]
         moved = [self._kinematics.twist(one) for one in rolled]
         if gyro is not None:
             return [(math.fsum([one.linear for one in moved]), gyro.angle)]
-        return [(one.linear, one.angular) for one in moved]
+        return [(one.linear, one.angular / share) for one in moved]
 
     def _move(
         self,
@@ -251,11 +267,11 @@ class Odometry:
         pose, turned = self._path.pose, 0.0
         for piece in pieces:
             self._positions = plus(self._positions, piece)
-        for distance, angle in self._arcs(pieces, turn):
+        for distance, angle in self._arcs(pieces, turn, self._share):
             turned += angle
             self._advance(distance, angle, turn)
         on_trial = gyro is not None and gyro.owes
-        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial))
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:

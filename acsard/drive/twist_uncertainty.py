@@ -18,7 +18,7 @@ import math
 
 from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.noise import SLIPPING, Noise, columns
+from acsard.drive.noise import SLIPPING, Column, Noise, columns, in_use
 from acsard.values import Twist, TwistVariances
 
 DECIMAL = 0.01
@@ -44,7 +44,7 @@ class TwistUncertainty:
         """`counts` of the encoders per wheel turn, 0 if unknown."""
         self._kinematics = kinematics
         self.use(odometry)
-        self._effects = columns(odometry, kinematics)
+        self._effects = columns(odometry, kinematics, in_use(odometry))
         self._count = math.tau / counts if counts else 0.0
         # Of four independent wheels' errors: each side is the mean of two.
         self._to_linear = kinematics.radius**2 / 4 / 12
@@ -55,6 +55,10 @@ class TwistUncertainty:
         """With this noise from now on."""
         self._lateral = odometry.twist_covariance_diagonal[1]
         self._noise = Noise(odometry, self._kinematics)
+
+    def bent_by(self, parameters: tuple[Column, ...]) -> None:
+        """By these columns from now on."""
+        self._effects = parameters
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
         """Of a report that came `dt` s after the one before; 0 if that is unknown.

@@ -22,7 +22,7 @@ import math
 
 from acsard.config.settings import OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.noise import SLIPPING, Column, Noise, columns
+from acsard.drive.noise import SLIPPING, Column, Noise, columns, in_use
 from acsard.drive.se2 import (
     ORIGIN,
     Vector,
@@ -61,7 +61,7 @@ class PoseUncertainty:
         self._kinematics = kinematics
         self._half = kinematics.track / 2
         self.use(odometry)
-        self._parameters = columns(odometry, kinematics)
+        self._parameters = self._effects = columns(odometry, kinematics, in_use(odometry))
         self._radius, self._track = kinematics.radius, kinematics.track
         self._configured = self._counted = counts > 0
         self._count = 0.0
@@ -75,6 +75,12 @@ class PoseUncertainty:
         how certain they are stay."""
         self._start = odometry.pose_covariance_diagonal
         self._noise = Noise(odometry, self._kinematics)
+
+    def bent_by(self, parameters: tuple[Column, ...]) -> None:
+        """By these columns from now on, as many as before; what they did until now stays."""
+        of_gaps = self._effects[len(self._parameters) :]
+        self._effects = (*parameters, *of_gaps)
+        self._parameters = parameters
 
     def _stand_within(self, angle: float) -> None:
         """A side is the mean of two wheels, each of which may stand anywhere within that, rad."""

@@ -12,6 +12,7 @@ from msgspec import Struct
 from acsard.config.settings import Config
 from acsard.config.wire_time import wire_use
 from acsard.drive.gyro import WORDS
+from acsard.drive.learned_track import tracks
 from acsard.drive.words import waiting
 from acsard.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.values import (
@@ -137,15 +138,19 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
     """The row of the gyro, none without one."""
     if gyro.does == "off":
         return []
-    values = {"delay_s": f"{gyro.delay:.3f}"}
+    values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
     if gyro.bias is not None:
         values["bias_rad_s"] = f"{gyro.bias:.5f}"
     if gyro.track is not None:
         configured = config.drive.wheel_separation_multiplier
+        learned = configured * gyro.track
         values["wheel_separation_multiplier"] = f"{configured:.3f}"
-        values["learned_multiplier"] = f"{configured * gyro.track:.3f}"
+        values["learned_multiplier"] = f"{learned:.3f}"
+        values["learned_multiplier_std"] = f"{learned * gyro.track_deviation:.3f}"
+        values["multiplier_in_use"] = f"{learned if gyro.track_use == 'used' else configured:.3f}"
+        track = f"; effective track: {tracks(gyro, configured)}"
     level = OK if gyro.does in ("used", "waiting for rest") else WARN
-    return [Row("gyro", level, WORDS[gyro.does], values)]
+    return [Row("gyro", level, WORDS[gyro.does] + track, values)]
 
 
 def _routers(routers: RoutersStatus) -> list[Row]:

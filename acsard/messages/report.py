@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator
 from msgspec.structs import asdict
 
 from acsard.config.settings import Config
+from acsard.drive.learned_track import tracks
 from acsard.drive.words import waiting
 from acsard.messages.covariances import Covariances
 from acsard.messages.diagnostics import diagnostics
@@ -220,6 +221,7 @@ class Report:
                 for name, one in snapshot.figures.items()
             },
             gyro=snapshot.gyro.does,
+            track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),
             encoders=list(snapshot.encoders),
             doubt=snapshot.doubt.text,
             sender=snapshot.sender,

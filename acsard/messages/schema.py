@@ -231,6 +231,9 @@ class RobotState(Message, frozen=True):
     """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
     sender: str = ""
     """Which of the senders of `source` is followed, by the name it gives itself."""
+    track: str = ""
+    """The effective track over the wheel separation, as the gyro teaches it and as configured, and
+    which is in use, in words; empty until one is learned."""
     recording: str = ""
     """Why nothing is recorded just now, though it is asked for, in words; empty else."""
 

@@ -83,6 +83,7 @@ class State(Struct, frozen=True):
     sources: list[Source]
     refused: str
     gyro: str
+    track: str
     doubt: str
     recording: str
     certificate: str
@@ -110,6 +111,7 @@ def state(message: RobotState) -> State:
         ],
         refused=message.refused,
         gyro=message.gyro,
+        track=message.track,
         doubt=message.doubt,
         recording=message.recording,
         certificate=message.certificate,

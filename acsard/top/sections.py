@@ -151,6 +151,8 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
         lines[-1].append("  ").append_text(lost)
     if state.gyro != "off":
         lines.append(_gyro(state.gyro))
+    if state.track:
+        lines.append(row("track", clean(state.track)))
     lines += _refusals(state, before)
     return lines
 

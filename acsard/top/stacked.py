@@ -90,6 +90,8 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
     lines += flow([one for one in told if one], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)
+    if state.track:
+        lines += folded(f"track {clean(state.track)}", width, 2)
     kinds = refused(state, before)
     for kind, parts in kinds:
         lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
@@ -127,7 +129,7 @@ def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
     """A sentence broken between words, all but a sentence's label set in."""
-    first = "" if text.startswith(("gyro ", "last one ")) else " " * inset
+    first = "" if text.startswith(("gyro ", "track ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a sign may take two cells
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset
     return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

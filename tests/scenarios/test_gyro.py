@@ -9,6 +9,8 @@ import pytest
 
 from acsard.config.settings import Config, OdometryConfig, SimConfig
 from acsard.messages.schema import DiagnosticArray
+from acsard.record.steps import BlackBox
+from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import World
 
 SKIDDING = SimConfig(
@@ -16,9 +18,15 @@ SKIDDING = SimConfig(
 )
 
 
-def world(sim: SimConfig = SKIDDING, gyro: bool = True) -> World:
+def world(
+    sim: SimConfig = SKIDDING,
+    gyro: bool = True,
+    learned_track: bool = False,
+    recorder: BlackBox | None = None,
+) -> World:
     """A robot that has stood for a while."""
-    made = World(Config(odometry=OdometryConfig(gyro=True), sim=sim))
+    odometry = OdometryConfig(gyro=True, learned_track=learned_track)
+    made = World(Config(odometry=odometry, sim=sim), recorder=recorder)
     made.gyro_dead = not gyro
     made.run(1.5)
     return made
@@ -105,6 +113,7 @@ def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
     assert values["delay_s"] == pytest.approx(0.036, abs=0.01)
     assert values["wheel_separation_multiplier"] == 1.0
     assert values["learned_multiplier"] == pytest.approx(1.6, rel=0.02)
+    assert values["multiplier_in_use"] == 1.0
 
 
 def test_a_gyro_that_dies_is_told_and_the_wheels_go_on() -> None:
@@ -154,3 +163,66 @@ def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
     message = made.loop.report.current("diagnostics", made.loop._look)
     assert isinstance(message, DiagnosticArray)
     assert not [status for status in message.status if "gyro" in status.name]
+
+
+# a track that was learned
+
+
+def gone_silent(made: World, seed: int) -> Drive:
+    """The gyro teaches for a while and dies; then the wheels are alone."""
+    made.bus.wanted = {"odom"}
+    wandering(made, seed, seconds=30.0)
+    made.gyro_dead = True
+    made.hold(0.0, 0.0, 1.0)
+    assert made.state.gyro == "silent"
+    return wandering(made, seed + 1, seconds=30.0)
+
+
+@pytest.mark.slow
+def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> None:
+    plain, asked = gone_silent(world(), 11), gone_silent(world(learned_track=True), 11)
+    print(f"the gyro is silent: by the configured track {plain.error:.0%} of {plain.all:.1f} rad, "
+          f"by the learned one {asked.error:.1%}; {asked.world.state.track}")  # fmt: skip
+    assert asked.error < 0.1 * plain.error
+    assert " in use, configured 1.000" in asked.world.state.track
+    assert plain.world.state.track.endswith("(only shown), configured 1.000 in use")
+    (told,) = [event for event in asked.world.events if event.name == "track"]
+    assert told.text.endswith(" in use, configured 1.000")
+    assert not [event for event in plain.world.events if event.name == "track"]
+
+
+@pytest.mark.slow
+def test_the_covariance_knows_how_well_the_track_is_known() -> None:
+    """All to one side, where no error of the track is made up for."""
+    made = world(learned_track=True)
+    wandering(made, 12, seconds=30.0)
+    made.gyro_dead = True
+    made.hold(0.0, 0.0, 1.0)
+    drive, before = Drive(made), made.odom.pose.covariance[35]
+    drive.hold(0.0, 1.0, 30.0)
+    grown = math.sqrt(made.odom.pose.covariance[35] - before)
+    off = drive.error * drive.all
+    print(f"off by {off:.2f} rad of {drive.all:.1f}, held for {grown:.2f}")
+    assert off < 2 * grown
+    assert grown < 0.1 * drive.all
+
+
+@pytest.mark.slow
+def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
+    tape = Tape()
+    made = world(learned_track=True, recorder=tape)
+    made.bus.wanted = set()
+    wandering(made, 13, seconds=25.0)
+    assert " in use, configured" in made.state.track
+    made.gyro_dead = True
+    made.drive(0.3, 0.8, 1.0)
+    tape.cut = True
+    made.hold(0.3, 0.8, 1.0)
+    (first,) = tape.states
+    for begun in (0, first):
+        tally = replayed(tape, made.config, begun).tally
+        assert tally.same
+        assert tally.exact
+        assert tally.steps == len(tape.taken) - begun
+    without = Config(odometry=OdometryConfig(gyro=True), sim=made.config.sim)
+    assert not replayed(tape, without).tally.same

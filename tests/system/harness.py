@@ -28,6 +28,8 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zenoh
 
+from acsard.incoming.queries import BUSY
+
 T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -667,8 +669,12 @@ class Bus:
         return found
 
     def get(self, key: str, payload: object = None) -> Any:
-        """The one JSON reply to a query."""
+        """The one JSON reply to a query; a daemon that says it is asked too much is asked again."""
+        deadline = time.monotonic() + 5.0
         answers = self.ask(key, payload)
+        while [one.payload for one in answers] == [BUSY.encode()] and time.monotonic() < deadline:
+            time.sleep(0.02)
+            answers = self.ask(key, payload)
         assert len(answers) == 1, f"{key}: {answers}"
         assert answers[0].ok, f"{key}: {answers[0]}"
         return json.loads(answers[0].payload)

@@ -53,7 +53,7 @@ FIELDS = {
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
-        "encoders", "doubt", "sender", "recording",
+        "track", "encoders", "doubt", "sender", "recording",
     },
     "diagnostics": {"header", "status"},
     "events": {"stamp", "total", "events"},

@@ -26,6 +26,7 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
+from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -575,6 +576,26 @@ def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fresh: Bu
 
     # To a tenth of a millimetre: wheels that come to rest creep.
     assert run_async(shared, work) == (True, pytest.approx(4.0, abs=1e-4))
+
+
+def test_a_daemon_that_is_asked_too_much_is_asked_again() -> None:
+    endpoint, asked = free_endpoint(), []
+
+    def answer(query: zenoh.Query) -> None:
+        asked.append(query.key_expr)
+        if len(asked) < 4:
+            query.reply_err(BUSY)
+        else:
+            query.reply(query.key_expr, '{"success": true, "message": "cleared"}')
+
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as busy:
+        busy.declare_queryable("acsard/acsar/srv/clear", answer)
+        with connect(endpoint) as robot:
+            assert robot.call("clear").message == "cleared"
+    assert len(asked) == 4
 
 
 def test_nothing_of_this_was_an_exception_in_the_daemon(shared: Daemon) -> None:

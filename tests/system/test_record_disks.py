@@ -16,6 +16,11 @@ from pathlib import Path
 
 import pytest
 
+from acsard.config.settings import RecordConfig
+from acsard.record.directory import Ring, Run
+from acsard.record.file import About, Recording, Writing
+from acsard.record.recovery import recover
+from acsard.web.recordings import rows
 from tests.system import bystander
 from tests.system.harness import Bus, Daemon, Periods, environment, until
 from tests.system.test_record import files, replayed
@@ -26,6 +31,9 @@ pytestmark = [
 ]
 
 SPAN_S = 5.0
+
+PAGE, EDGE = 4096, 50
+"""bytes: of what a disk gives at once, and left of that behind a recording's last chunk."""
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 
@@ -169,6 +177,53 @@ def test_a_ring_larger_than_its_disk_loses_the_oldest_and_records_on(tmp_path: P
         assert whole.name[:6] == cut.name[:6] < new.name[:6]
         assert replayed(tmp_path, whole) == lines
         assert replayed(tmp_path, new) > 0
+
+
+def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every_chunk(
+    tmp_path: Path,
+) -> None:
+    with disk(tmp_path, "size=64k") as path:
+        part = path / "000001-20260101T000000Z.mcap.part"
+        whole = part.with_suffix("")
+        writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+        for size in (1000, 2000):
+            before = writing.size
+            writing.add("steps", 2, os.urandom(size))
+            writing.flush()
+        more = writing.size - before - size  # than the bytes themselves
+        writing.add("steps", 2, os.urandom(PAGE + (-writing.size - more - EDGE) % PAGE))
+        writing.flush()
+        writing.close()
+        assert 0 < -part.stat().st_size % PAGE < 2 * EDGE
+        fill(path, bytes(PAGE), (f"{number}" for number in range(100)))
+        before_it = list(Recording(part).messages())
+        assert "for want of room" in recover(part, whole, "crash", room=False)
+        assert list(Recording(whole).messages()) == before_it
+        assert len(before_it) == 3
+        assert [row.events for row in rows(path)] == ["no end: cut"]
+
+
+def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_help(
+    tmp_path: Path,
+) -> None:
+    with disk(tmp_path, "size=1m", "nr_inodes=20") as path:
+        settings = RecordConfig(str(path / "record"))
+        about = About("acsar", "0.1.0", "3.11.0", 1, 2)
+        run = Run()
+        ring = Ring(settings, run=run)
+        kept = [ring.end(ring.begin(about), "kept") for _ in range(4)]
+        fill(path, b"", (f"{number}" for number in range(100)))
+        for more in ("more", "most"):  # others take what is given
+            with pytest.raises(OSError, match="No space left on device"):
+                ring.begin(about)
+            ring.close()
+            ring = Ring(settings, run=run, refused=True)
+            assert [one.exists() for one in kept] == [False, True, True, True]
+            with suppress(OSError):
+                (path / more).touch()
+        (path / "more").unlink()
+        ring.end(ring.begin(about), "plain")
+        ring.close()
 
 
 def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:

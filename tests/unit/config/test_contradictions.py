@@ -13,6 +13,7 @@ from acsard.config.settings import (
     ControlConfig,
     FeedbackConfig,
     McuConfig,
+    OdometryConfig,
     RosConfig,
     SimConfig,
 )
@@ -176,3 +177,10 @@ def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_n
     assert problems(mcu=McuConfig(encoder_counts=12_868), control=control) != []
     slower = FeedbackConfig(wheel_speed=50.0)
     assert problems(mcu=McuConfig(encoder_counts=20_000), control=control, feedback=slower) == []
+
+
+def test_a_track_is_learned_only_where_there_is_a_gyro() -> None:
+    (line,) = problems(odometry=OdometryConfig(learned_track=True))
+    assert line.startswith("odometry.learned_track = true: ")
+    assert "odometry.gyro = true" in line
+    assert problems(odometry=OdometryConfig(learned_track=True, gyro=True)) == []

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.config.settings import Source
-from acsard.drive.freshness import NEXT, Freshness, Sign, State, Verdict
+from acsard.drive.freshness import MOST_KNOWN, MOST_NEW, NEXT, Freshness, Sign, State, Verdict
 from acsard.values import NS_PER_S, REST, Command
 from tests.unit.drive.commanders import GO, HIGH, HOUR_NS, LOW, MS, SLOW, Bench
 
@@ -186,14 +186,38 @@ def test_after_so_long_a_silence_that_drift_is_a_delay_a_clock_is_as_good_as_new
     assert clock.steadily(0.0, 250)[-1] == "fresh"
 
 
-def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
+def test_no_flood_of_names_makes_a_stranger_of_one_who_is_known() -> None:
     clock = Clock()
-    for number in range(1023):
-        clock.sends(0.0, 0.0, f"sender {number}")
+    for number in range(5000):
+        clock.sends(0.0, 1.0, f"stranger {number}")
     assert clock.sends(0.0) == "fresh"
-    for number in range(1024):
-        clock.sends(0.0, 0.0, f"another {number}")
-    assert clock.sends(0.0) == "first"
+
+
+def test_one_who_is_new_is_heard_between_nearly_two_thousand_names_a_second() -> None:
+    clock = Clock(known=False)
+    verdicts = []
+    for number in range(800):
+        if number % 80 == 0:
+            verdicts.append(clock.sends(0.0, 0.6))
+        else:
+            clock.sends(0.0, 0.6, f"stranger {number}")
+    assert verdicts[-1] == "fresh"
+
+
+def test_of_those_who_are_new_the_longest_unheard_is_forgotten_first() -> None:
+    clock = Clock(known=False)
+    for number in range(MOST_NEW + 1):
+        clock.sends(0.0, 1.0, f"stranger {number}")
+    assert clock.sends(0.0, 1.0, "stranger 1") == "unproven"
+    assert clock.sends(0.0, 1.0, "stranger 0") == "first"
+
+
+def test_of_those_who_are_known_the_longest_unheard_is_forgotten_first() -> None:
+    clock = Clock(known=False)
+    for number in range(MOST_KNOWN + 1):
+        assert [clock.sends(0.0, 200.0, f"sender {number}") for _ in range(3)][-1] == "fresh"
+    assert clock.sends(0.0, 1.0, "sender 1") == "fresh"
+    assert clock.sends(0.0, 1.0, "sender 0") == "first"
 
 
 @given(

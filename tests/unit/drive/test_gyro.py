@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.drive.gyro import SILENT_NS, WORDS, Gyro
+from acsard.drive.learned_track import LEAST
 from acsard.sim.noise import gauss
 from acsard.values import NS_PER_S, GyroDoes, GyroSample
 
@@ -261,8 +262,23 @@ def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
     bench = Bench(skid=1.7)
     bench.run(REST_FIRST)
     assert bench.gyro.status.track is None
+    assert bench.gyro.learned is None
     bench.run(20.0, stirring)
     assert bench.gyro.status.track == pytest.approx(1.7, rel=0.02)
+
+
+def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
+    even, uneven = Bench(skid=1.7), Bench(skid=1.7)
+    for bench in (even, uneven):
+        bench.run(REST_FIRST)
+        for n in range(12):
+            bench.run(5.0, 0.8, skid=None if bench is even else 1.5 if n % 2 else 1.9)
+    one, other = even.gyro.learned, uneven.gyro.learned
+    assert one is not None
+    assert other is not None
+    assert one.deviation == LEAST
+    assert other.share == pytest.approx(1.7, rel=0.05)
+    assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
 
 
 # how certain

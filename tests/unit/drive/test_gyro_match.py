@@ -114,3 +114,27 @@ def test_a_delay_that_is_put_right_is_in_the_ratio_at_once() -> None:
     before = match.ratio
     assert match.delay() is not None
     assert match.ratio != before
+
+
+def test_the_spread_is_what_the_ratio_differs_by_from_one_turn_to_the_next() -> None:
+    mixed = Match()
+    for n in range(12000):
+        ratio = 0.66 if int(n * DT / 5.0) % 2 else 0.54
+        mixed.add(0.8 * DT, ratio * 0.8 * DT, DT, slips=False)
+    assert matched(60.0, rate=lambda t: 0.8).spread < 0.01
+    assert mixed.spread == pytest.approx(0.06, rel=0.3)
+
+
+def test_a_gyro_that_comes_by_fits_and_starts_makes_the_ratio_no_less_certain() -> None:
+    """Up to 50 ms late, and never twice the same."""
+    match, told, true = Match(), 0.0, 0.0
+    for n in range(6000):
+        late = (n * 7 % 11) * 0.005
+        true = 0.6 * (math.cos(0.0) - math.cos(0.4 * (n * DT - late))) / 0.4
+        match.add(math.sin(0.4 * n * DT) * DT, true - told, DT, slips=False)
+        told = true
+    assert match.spread < 0.05 * match.ratio
+
+
+def test_before_anything_is_learned_the_spread_is_the_deviation_of_what_is_assumed() -> None:
+    assert Match().spread == ROUGH

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import CONFIGURED, Track
 from acsard.drive.noise import Noise, columns
 from tests.vectors.drive import CALIBRATED
 
@@ -98,3 +99,30 @@ def test_what_is_certain_has_no_column() -> None:
 def test_a_scale_that_is_off_bends_no_turn() -> None:
     config = OdometryConfig(distance_scale_std=0.01)
     assert columns(config, Kinematics(DriveConfig())) == ((0.01, 0.0, 0.0, 0.0),)
+
+
+# a track that is learned
+
+ALL = OdometryConfig(
+    wheel_separation_multiplier_std=0.05,
+    left_wheel_radius_multiplier_std=0.004,
+    distance_scale_std=0.01,
+)
+
+
+def test_the_column_of_a_track_to_be_learned_is_the_last_and_does_nothing_at_first() -> None:
+    kinematics = Kinematics(CALIBRATED)
+    *declared, learned = columns(ALL, kinematics, CONFIGURED)
+    assert tuple(declared) == columns(ALL, kinematics)
+    assert learned == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_error_of_a_learned_track_takes_the_place_of_the_configured_ones() -> None:
+    kinematics = Kinematics(CALIBRATED)
+    left, separation, _, learned = columns(ALL, kinematics, Track(1.25, 0.03))
+    assert separation == (0.0, 0.0, 0.0, 0.0)
+    assert learned == (0.0, 0.0, 0.0, -0.03)
+    wider = replace(
+        CALIBRATED, wheel_separation_multiplier=1.25 * CALIBRATED.wheel_separation_multiplier
+    )
+    assert left == pytest.approx(columns(ALL, Kinematics(wider))[0])

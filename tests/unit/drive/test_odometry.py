@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.gyro import Turn
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import Track
 from acsard.drive.odometry import Odometry
 from acsard.drive.path import arc
 from acsard.drive.uncertainty import MAX_VARIANCE, NOWHERE
@@ -694,3 +695,50 @@ def test_rounding_made_good_to_one_wheel_is_no_lie_and_no_slip() -> None:
         robot.fold(line, None, speeds)
         assert robot.doubt.text == ""
         assert robot.events == []
+
+
+# a track that was learned
+
+
+@pytest.mark.parametrize("share", [0.7, 1.6])
+def test_by_another_track_only_the_turns_to_come_are_others(share: float) -> None:
+    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
+    for robot in (asked, plain):
+        robot.fold(feedback(4.0, 9.0, 1.0))
+    pose = asked.pose
+    asked.turn_by(Track(share, 0.02))
+    assert asked.pose == pose == plain.pose
+    came, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
+    assert came.twist.linear == would.twist.linear
+    assert came.twist.angular == pytest.approx(would.twist.angular / share)
+    assert came.pose.yaw - pose.yaw == pytest.approx((would.pose.yaw - pose.yaw) / share)
+    assert asked.travelled == plain.travelled
+
+
+def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> None:
+    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
+    for n in range(200):
+        line = feedback(math.sin(n), 9.0 + math.cos(n), 0.01)
+        came, would = asked.fold(line), plain.fold(line)
+        assert (came.pose, came.twist, came.covariance) == (
+            would.pose,
+            would.twist,
+            would.covariance,
+        )
+
+
+def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
+    """A front left wheel is dead, and the track becomes another one before that is seen."""
+    asked = OdometryConfig(learned_track=True)
+    liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
+    told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
+    dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
+    for n in range(60):
+        honest.fold(Feedback(AT, told, 0.01), told=told)
+        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), told=told)
+        if n == 51:
+            assert not liar.doubt.left_out
+            for robot in (liar, honest):
+                robot.turn_by(Track(1.6, 0.02))
+    assert liar.doubt.left_out == ("front_left",)
+    assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)

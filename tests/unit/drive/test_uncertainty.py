@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from acsard.config.settings import DriveConfig, McuConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.learned_track import CONFIGURED, Track
 from acsard.drive.odometry import Odometry
 from acsard.drive.uncertainty import PoseUncertainty
 from acsard.mcu.feedback import Feedback
@@ -297,3 +298,22 @@ def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_the
     leap = max(b - a for a, b in zip(before, after, strict=True))
     assert session.snapping.counts == (counts,) * 4
     assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"
+
+
+def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
+    none = replace(Model(0.0, 0.0, 0.0, track_std=0.05).config(), learned_track=True)
+    robot = Odometry(replace(none, pose_covariance_diagonal=(0.0,) * 6), Kinematics(DriveConfig()))
+
+    def turned(rad: float) -> tuple[float, float]:
+        before = robot.pose.yaw
+        speed = rad * TRACK / 2 / RADIUS
+        line = Feedback(AT, WheelSpeeds(speed, -speed, -speed, speed), 1.0)
+        covariance = robot.fold(line).covariance
+        return robot.pose.yaw - before, covariance.yawyaw
+
+    assert turned(1.0) == pytest.approx((1.0, 0.05**2))
+    robot.turn_by(Track(1.6, 0.02))
+    assert turned(1.0) == pytest.approx((1 / 1.6, 0.05**2 + (0.02 / 1.6) ** 2))
+    assert turned(0.5)[1] == pytest.approx(0.05**2 + (0.02 * 1.5 / 1.6) ** 2)
+    robot.turn_by(CONFIGURED)
+    assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)

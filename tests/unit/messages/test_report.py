@@ -637,13 +637,22 @@ def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: i
 
 
 def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> None:
-    _, (row,) = with_gyro(GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2))
-    assert {pair.key: pair.value for pair in row.values} == {
+    learned = GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2, track_deviation=0.05)
+    state, (row,) = with_gyro(learned)
+    shown = {
         "delay_s": "0.020",
         "bias_rad_s": "-0.01230",
         "wheel_separation_multiplier": "1.500",
         "learned_multiplier": "1.800",
+        "learned_multiplier_std": "0.090",
     }
+    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
+    assert state.track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
+    assert row.message == f"{WORDS['used']}; effective track: {state.track}"
+    state, (row,) = with_gyro(replace(learned, track_use="used"))
+    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
+    assert state.track == "learned 1.800 ± 0.090 in use, configured 1.500"
+    assert with_gyro(GyroStatus("used"))[0].track == ""
 
 
 # wheels that are doubted

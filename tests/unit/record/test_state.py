@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard.config.settings import Config
+from acsard.drive.freshness import Freshness
 from acsard.host.errors import RecordingError
 from acsard.mcu.lattice import Search
 from acsard.record.export import export
@@ -18,7 +19,7 @@ from acsard.record.replayed import Onlooker, live
 from acsard.record.state import MOVED, StateError, freeze, thaw
 from acsard.report.course import Course
 from acsard.robot import Robot
-from acsard.values import Instant
+from acsard.values import NS_PER_S, REST, Command, Instant
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 from tests.unit.record.attacks import text
@@ -32,6 +33,16 @@ def test_it_comes_back_as_it_was() -> None:
     assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
     again = freeze(state.robot, b"")
     assert freeze(thaw(again).robot, b"") == again
+
+
+def test_however_many_names_were_heard_it_stays_small() -> None:
+    """It is made in a step of the loop, whenever a file begins."""
+    freshness = Freshness()
+    for number in range(5000):
+        stamp_ns = number * NS_PER_S // 1000
+        command = Command("app", REST, stamp_ns, stamp_ns, f"sender {number}")
+        freshness.judge(command, NS_PER_S // 4)
+    assert len(pickle.dumps(freshness)) < 3 * len(freeze(Robot(Config()), b""))
 
 
 def test_a_robot_of_parts_that_have_moved_since_comes_back_as_it_was() -> None:

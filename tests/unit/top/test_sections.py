@@ -109,6 +109,12 @@ def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
     assert not any("gyro" in line for line in lines_of(SEEN))
 
 
+def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
+    told = "learned 1.603 ± 0.032 (only shown), configured 1.000 in use"
+    assert line_with("track", of(gyro="used", track=told)).split(maxsplit=1)[1] == told
+    assert not any("track" in line for line in lines_of(of(gyro="used")))
+
+
 def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
     seen = of(counters={"imu_second_sender": 1200, "imu_absurd": 3})
     assert "gyro second sender 1,200, absurd 3" in line_with("rejected", seen)

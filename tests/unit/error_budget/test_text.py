@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup.budget import Basis, Budget, Cause, Share
-from acsard.checkup.budget_text import WIDTH, advice, text
+from acsard.error_budget.budget import Basis, Budget, Cause, Share
+from acsard.error_budget.text import WIDTH, advice, text
 
 DRIVEN = Budget(
     10.0, 4.0, 400.0, 1000, 3, 0.25, 0.004, 0.01, 0, gyro=False, still=False,
@@ -80,9 +80,14 @@ def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() ->
 
 @pytest.mark.parametrize("still", [False, True])
 def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: bool) -> None:
-    told = " ".join(text(of(KNOWN, learned=1.7, multiplier=1.5, still=still)).split())
-    assert "wheel_separation_multiplier would be 1.700; configured is 1.500" in told
+    found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
+    told = " ".join(text(found).split())
+    assert "multiplier would be 1.700 (standard deviation 0.050); configured, and in" in told
+    assert "in use, is 1.500. Where both differ" in told
     assert "would be" not in text(of(KNOWN, still=still))
+    told = " ".join(text(replace(found, learned_used=True)).split())
+    assert "multiplier is 1.700 (standard deviation 0.050), which is in use" in told
+    assert "configured is 1.500." in told
 
 
 def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:

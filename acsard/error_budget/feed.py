@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from acsard.checkup.budget import Heard
-from acsard.checkup.drive_log import Line
 from acsard.config.settings import Config
+from acsard.error_budget.budget import Heard
+from acsard.error_budget.drive_log import Line
 from acsard.messages.schema import (
     DiagnosticArray,
     JointState,
@@ -58,13 +58,16 @@ class Feed:
     def heard(self, last: RobotState, diagnostics: DiagnosticArray) -> Heard:
         """All so far; both are of now."""
         lines, zero = [line for _, line in self._lines], self._start_ns
+        learned, deviation, used = _learned(diagnostics)
         return Heard(
             lines,
             [(at - zero) / NS_PER_S for at in self._sent],
             whole=self._whole(last),
             counted=self._config.mcu.wants_samples and _value(diagnostics, "check") == SAMPLED,
             gyro=last.gyro in ("used", "disagrees"),
-            learned=_learned(diagnostics),
+            learned=learned,
+            deviation=deviation,
+            used=used,
         )
 
     def _join(self, stamp_ns: int) -> None:
@@ -102,11 +105,12 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
     return next((value.value for value in rows if value.key == key), "")
 
 
-def _learned(diagnostics: DiagnosticArray) -> float | None:
-    """The track that a gyro implies, as a share of the configured one."""
-    learned = _value(diagnostics, "learned_multiplier")
-    configured = _value(diagnostics, "wheel_separation_multiplier")
+def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
+    """The track that a gyro implies, as a share of the configured one, its deviation, its use."""
+    names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
+    learned, configured, std = (_value(diagnostics, name) for name in names)
+    used = _value(diagnostics, "multiplier_in_use") == learned != configured
     try:
-        return float(learned) / float(configured)
+        return float(learned) / float(configured), float(std) / float(learned), used
     except (ValueError, ZeroDivisionError):
-        return None
+        return None, 0.0, False

@@ -7,8 +7,8 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup.budget_feed import Feed
 from acsard.config.settings import Config, McuConfig, RatesConfig
+from acsard.error_budget.feed import Feed
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -114,6 +114,11 @@ def test_the_heading_is_the_gyros_where_it_is_used(does: str, used: bool) -> Non
 
 
 def test_the_track_that_a_gyro_learned_is_a_share_of_the_configured_one() -> None:
-    learned = diagnostics(wheel_separation_multiplier="1.500", learned_multiplier="1.650")
-    assert Feed(Config(), state(0)).heard(state(0), learned).learned == pytest.approx(1.1)
+    both = {"wheel_separation_multiplier": "1.500", "learned_multiplier": "1.650"}
+    both["learned_multiplier_std"] = "0.033"
+    for in_use, used in (("1.500", False), ("1.650", True)):
+        learned = diagnostics(**both, multiplier_in_use=in_use)
+        heard = Feed(Config(), state(0)).heard(state(0), learned)
+        assert (heard.learned, heard.deviation) == pytest.approx((1.1, 0.02))
+        assert heard.used is used
     assert Feed(Config(), state(0)).heard(state(0), diagnostics()).learned is None

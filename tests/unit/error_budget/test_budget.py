@@ -9,11 +9,11 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup.budget import Budget, Cause, Heard, Share, budget
-from acsard.checkup.drive_log import Line
 from acsard.config.settings import Config, McuConfig, OdometryConfig
-from tests.unit.checkup import drives
-from tests.unit.checkup.drives import Told
+from acsard.error_budget.budget import Budget, Cause, Heard, Share, budget
+from acsard.error_budget.drive_log import Line
+from tests.unit.error_budget import drives
+from tests.unit.error_budget.drives import Told
 
 CONFIG = Config()
 
@@ -105,10 +105,18 @@ def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
     assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
+def test_a_learned_track_that_is_in_use_errs_by_its_own_deviation() -> None:
+    heard = Heard(driven().lines, [], learned=1.1, deviation=0.02, used=True)
+    found = share(budget(heard, CONFIG), "parameters")
+    assert found.basis == "measured"
+    assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
+
+
 def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
-    found = budget(Heard(driven().lines, [], learned=1.1), config)
+    found = budget(Heard(driven().lines, [], learned=1.1, deviation=0.02), config)
     assert found.multiplier == 1.5
+    assert found.learned_std == pytest.approx(0.033)
     assert found.learned == pytest.approx(1.65)
     assert budget(Heard(driven().lines, []), config).learned is None
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from acsard.checkup.drive_log import Stood, motion
-from acsard.checkup.error_steps import Driving, Step, mirrored
-from acsard.checkup.rounding import rounding
 from acsard.config.settings import DriveConfig
 from acsard.drive.kinematics import Kinematics
-from tests.unit.checkup.drives import Told, late, rounded
+from acsard.error_budget.drive_log import Stood, motion
+from acsard.error_budget.rounding import rounding
+from acsard.error_budget.steps import Driving, Step, mirrored
+from tests.unit.error_budget.drives import Told, late, rounded
 
 KINEMATICS = Kinematics(DriveConfig())
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 
-from acsard.checkup.budget import Basis, Budget, Cause, Share
 from acsard.drive.uncertainty import COARSE_COUNTS
+from acsard.error_budget.budget import Basis, Budget, Cause, Share
 
 WIDTH = 100
 
@@ -73,7 +73,7 @@ def _lines(budget: Budget) -> Iterator[str]:
         yield from _table(budget)
     if budget.learned is not None:
         yield ""
-        yield from _wrapped(_track(budget.learned, budget.multiplier))
+        yield from _wrapped(_track(budget, budget.learned))
     yield ""
     sentence = advice(budget)
     yield from _wrapped(f"{sentence[0].upper()}{sentence[1:]}.")
@@ -102,11 +102,18 @@ def _table(budget: Budget) -> Iterator[str]:
     yield f"{'all':<14}{figures}   the root of their squares"
 
 
-def _track(learned: float, configured: float) -> str:
+def _track(budget: Budget, learned: float) -> str:
+    implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
+    if budget.learned_used:
+        return (
+            f"By the gyro drive.wheel_separation_multiplier is {implied}, which is in use where "
+            f"the wheels alone tell the turn; configured is {budget.multiplier:.3f}."
+        )
     return (
-        f"By the gyro drive.wheel_separation_multiplier would be {learned:.3f}; configured is "
-        f"{configured:.3f}. That is only shown, and nothing uses it: where both differ on the "
-        "ground that matters, `acsard calibrate` measures it, with its standard deviation."
+        f"By the gyro drive.wheel_separation_multiplier would be {implied}; configured, and in "
+        f"use, is {budget.multiplier:.3f}. Where both differ on the ground that matters, `acsard "
+        "calibrate` measures it; [odometry] learned_track uses what is learned while the gyro is "
+        "silent."
     )
 
 

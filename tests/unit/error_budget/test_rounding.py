@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from acsard.checkup.rounding import Floats, rounding
+from acsard.error_budget.rounding import Floats, rounding
 
 PERIOD, COUNT = 0.01, 4000
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.checkup.drive_log import Line, motion
 from acsard.config.settings import DriveConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.error_budget.drive_log import Line, motion
 
 KINEMATICS = Kinematics(DriveConfig())
 SPEED, PERIOD = 10.0, 0.01

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.checkup.drive_log import BLOCK_S, Line, Motion, Stood
-from acsard.checkup.rounding import Rounding
 from acsard.drive.kinematics import Kinematics
+from acsard.error_budget.drive_log import BLOCK_S, Line, Motion, Stood
+from acsard.error_budget.rounding import Rounding
 from acsard.values import WheelSpeeds
 
 Floats = npt.NDArray[np.float64]

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.checkup.line_times import Places, places
 from acsard.drive.gap_variance import Gaps
 from acsard.drive.kinematics import Kinematics
+from acsard.error_budget.line_times import Places, places
 from acsard.values import Twist, WheelSpeeds
 
 Floats = npt.NDArray[np.float64]

@@ -18,15 +18,15 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.checkup.drive_log import Line, Motion, motion
-from acsard.checkup.error_steps import Driving, Step, mirrored
-from acsard.checkup.rounding import rounding
 from acsard.config.settings import Config, OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.noise import columns
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import DECIMAL, TwistUncertainty
 from acsard.drive.uncertainty import PoseUncertainty
+from acsard.error_budget.drive_log import Line, Motion, motion
+from acsard.error_budget.rounding import rounding
+from acsard.error_budget.steps import Driving, Step, mirrored
 from acsard.values import REST
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
@@ -90,7 +90,11 @@ class Budget(Struct, frozen=True):
     multiplier: float = 1.0
     """Configured: effective track over wheel separation."""
     learned: float | None = None
-    """The same as the gyro implies it, on the way; shown and never used. None is not known."""
+    """The same as the gyro implies it, on the way; None is not known."""
+    learned_std: float = 0.0
+    """Its standard deviation."""
+    learned_used: bool = False
+    """Where the wheels alone tell the turn, it is by that."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Of what is told so, the largest of the place, else of the heading."""
@@ -121,7 +125,11 @@ class Heard(Struct, frozen=True):
     gyro: bool = False
     """The heading is a gyro's."""
     learned: float | None = None
-    """The effective track that a gyro implies, as a share of the configured one."""
+    """The effective track that a gyro implies, as a share of the configured one,"""
+    deviation: float = 0.0
+    """its standard deviation, as a share of itself,"""
+    used: bool = False
+    """and whether it is in use where the wheels alone tell the turn."""
 
 
 def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
@@ -151,7 +159,8 @@ def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: floa
         counts, heard.gyro, still=True,
         at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=tuple(shares),
         multiplier=(configured := kinematics.multipliers[2]),
-        learned=None if heard.learned is None else heard.learned * configured,
+        learned=(learned := None if heard.learned is None else heard.learned * configured),
+        learned_std=(learned or 0.0) * heard.deviation, learned_used=heard.used,
     )  # fmt: skip
 
 
@@ -208,7 +217,8 @@ class _Driven:
         basis: Basis = "settings" if known else "unknown"
         kind = _only(odometry, parameters=True)
         if heard.learned is not None:
-            off = abs(heard.learned - 1.0) * self._kinematics.multipliers[2]
+            share = heard.deviation if heard.used else abs(heard.learned - 1.0)
+            off = share * self._kinematics.multipliers[2]
             kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
         yield self._share("parameters", basis, kind, driving.plain())
         if heard.gyro:

@@ -1,0 +1,1 @@
+"""`acsard odom`: what makes the odometry of a running robot wrong, cause by cause."""

@@ -1,0 +1,84 @@
+"""Which effective track is used: the configured one until another is known, and within bounds."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.drive.learned_track import (
+    BOUNDS,
+    CERTAIN,
+    CONFIGURED,
+    UNCERTAIN,
+    LearnedTrack,
+    Track,
+    tracks,
+)
+from acsard.values import GyroStatus, TrackUse
+
+SURE = CERTAIN / 2
+
+
+def told(track: LearnedTrack) -> str | None:
+    return None if track.event is None else track.event.kind
+
+
+def test_until_something_is_learned_the_configured_one_is_used_and_nothing_is_told() -> None:
+    track = LearnedTrack(1.0)
+    track.look(None)
+    track.look(Track(1.6, 2 * CERTAIN))
+    assert (track.used, track.use, track.event) == (CONFIGURED, "uncertain", None)
+
+
+def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
+    track = LearnedTrack(1.5)
+    track.look(Track(1.2, CERTAIN))
+    assert track.used == Track(1.2, CERTAIN)
+    assert track.event is not None
+    assert (track.event.name, track.event.kind, track.event.level) == ("track", "used", "info")
+    assert track.event.text.endswith(": learned 1.800 ± 0.180 in use, configured 1.500")
+    track.look(Track(1.25, SURE))
+    assert track.used == Track(1.25, SURE)
+    assert told(track) is None
+
+
+def test_what_is_in_use_is_given_up_only_when_it_is_doubted_by_far() -> None:
+    track = LearnedTrack(1.0)
+    for deviation, use in (
+        (SURE, "used"), (1.5 * CERTAIN, "used"), (1.01 * UNCERTAIN, "uncertain"),
+        (1.5 * CERTAIN, "uncertain"), (CERTAIN, "used"),
+    ):  # fmt: skip
+        track.look(Track(1.6, deviation))
+        assert track.use == use
+        assert (track.used == CONFIGURED) is (use != "used")
+
+
+@pytest.mark.parametrize("share", [0.99 * BOUNDS[0], 1.01 * BOUNDS[1]])
+def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share: float) -> None:
+    track = LearnedTrack(1.0)
+    track.look(Track(share, SURE))
+    assert track.used == CONFIGURED
+    assert track.event is not None
+    assert track.event.level == "warning"
+    assert "(too far off), configured 1.000 in use" in track.event.text
+    track.look(Track(share, SURE))
+    assert told(track) is None
+
+
+@pytest.mark.parametrize("share", BOUNDS)
+def test_the_bounds_themselves_are_within(share: float) -> None:
+    track = LearnedTrack(1.0)
+    track.look(Track(share, SURE))
+    assert told(track) == "used"
+
+
+@pytest.mark.parametrize(
+    ("use", "says"),
+    [
+        ("shown", "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"),
+        ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 in use"),
+        ("used", "learned 1.800 ± 0.090 in use, configured 1.500"),
+    ],
+)
+def test_both_stand_beside_each_other_as_multipliers(use: TrackUse, says: str) -> None:
+    assert tracks(GyroStatus("used", track=1.2, track_deviation=0.05, track_use=use), 1.5) == says
+    assert tracks(GyroStatus("used", track_use=use), 1.5) == ""
