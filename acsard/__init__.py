@@ -49,6 +49,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     web/           S  `acsard web`: the robot's page, a process of its own; a viewer per browser;
                       guide has a check or calibration done, by errands (the command's words)
     doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
+    asking/        S  how a verb asks who stands beside the robot: at a terminal, by a program
     cli/           S  one verb per file
 
 Three invariants, each tested:

@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
-from acsard.cli.common import JSON_LINES, add_bus, load, writable
+from acsard.cli.common import JSON_LINES, add_bus, load
+from acsard.host.config_file import writable
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.files import change
 
 if TYPE_CHECKING:
+    from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape import Tape
-    from acsard.cli.json_lines import JsonAttendant
     from acsard.config.settings import DriveConfig
 
 DESCRIPTION = """\
@@ -80,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
         return _calibrate(args, None)
     if args.yes:
         raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
-    from acsard.cli.json_lines import JsonAttendant
+    from acsard.asking.json_lines import JsonAttendant
 
     with JsonAttendant() as lines:
         return _calibrate(args, lines)

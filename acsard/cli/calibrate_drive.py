@@ -15,12 +15,12 @@ from acsard.host.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
+    from acsard.asking.attendant import Attendant
+    from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.guided.setup import Setup
     from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
-    from acsard.cli.attendant import Attendant
     from acsard.cli.calibrate_robot import Robot
-    from acsard.cli.json_lines import JsonAttendant
     from acsard.client import Client
     from acsard.config.settings import Config
 
@@ -169,7 +169,7 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 @contextmanager
 def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
-    from acsard.cli.attendant import Nobody, attending, interrupted_by
+    from acsard.asking.attendant import Nobody, attending, interrupted_by
 
     if args.yes:
         yield Nobody()

@@ -1,11 +1,10 @@
-"""What several verbs share: finding the configuration, and the options of the bus tools."""
+"""What several verbs share: reading the configuration, and the options of the bus tools."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from pathlib import Path
 
 from msgspec.structs import replace
 
@@ -13,12 +12,11 @@ from acsard.bus.address import Address, address_of
 from acsard.config import parsing as configuration
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import RECORD, Config
+from acsard.host.config_file import find
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.messages.text import printable
 from acsard.messages.topics import key_hint, row_of, unknown
-
-PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 Overrides = dict[str, dict[str, object]]
 
@@ -61,42 +59,6 @@ def count(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
     return number
-
-
-def find(path: str | None) -> tuple[str, bytes]:
-    """Where the configuration is and what it holds; ("built-in defaults", b"") without a file."""
-    named = path or os.environ.get("ACSARD_CONFIG")
-    if named:
-        try:
-            return named, Path(named).read_bytes()
-        except OSError as error:
-            raise ExitError(
-                Exit.BAD_CONFIG, f"cannot read {named}: {error.strerror}; correct --config"
-            ) from None
-    for place in PLACES:
-        try:
-            return str(place), place.read_bytes()
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            raise ExitError(Exit.BAD_CONFIG, f"cannot read {place}: {error.strerror}") from None
-    return "built-in defaults", b""
-
-
-def writable(path: str | None) -> Path:
-    """The file that --write is to change; raises `ExitError` where it has none, or no tomlkit."""
-    from acsard.host.files import require_tomlkit
-
-    require_tomlkit()
-    where, text = find(path)
-    if not text and not Path(where).is_file():
-        raise ExitError(
-            Exit.FAILURE,
-            "--write has no configuration file to write to: on the robot, name it by --config, or "
-            "make an acsard.toml there (an empty one is valid); a file on another machine changes "
-            "nothing for the robot",
-        )
-    return Path(where)
 
 
 def by_environment() -> Overrides:

@@ -7,8 +7,9 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, by_environment, find, require_one
+from acsard.cli.common import add_bus, by_environment, require_one
 from acsard.host.colours import coloured
+from acsard.host.config_file import find
 
 if TYPE_CHECKING:
     from acsard.doctor.finding import Finding

@@ -9,16 +9,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import JSON_LINES, Overrides, add_config, load, writable
-from acsard.cli.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
+from acsard.asking.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
+from acsard.cli.common import JSON_LINES, Overrides, add_config, load
+from acsard.host.config_file import writable
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.exits import Exit
 from acsard.host.files import change
 
 if TYPE_CHECKING:
+    from acsard.asking.json_lines import JsonPerson
     from acsard.checkup.findings import Finding
     from acsard.checkup.outside import Wire
-    from acsard.cli.json_lines import JsonPerson
     from acsard.config.settings import Config
 
 DESCRIPTION = """\

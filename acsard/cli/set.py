@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import add_bus, robot_address, writable
+from acsard.cli.common import add_bus, robot_address
+from acsard.host.config_file import writable
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 from acsard.messages.text import json_line, lines

@@ -1,7 +1,7 @@
 """A check or a calibration that somebody goes through in his browser: the very command, as a child.
 
 One at a time. What the child tells and asks goes to the connection that began it, and from that one
-alone come answers and keys, by `--json-lines` (cli/json_lines.py). When the connection ends the
+alone come answers and keys, by `--json-lines` (asking/json_lines.py). When the connection ends the
 child is ended as by Ctrl-C, so that its zeros go out; it listens for us too, and does not outlive
 us. Nothing waits here: an answer goes to an open question, once, or is refused.
 """

@@ -14,7 +14,7 @@ from typing import Any, cast
 import aiohttp
 import pytest
 
-from acsard.cli.json_lines import HEARD_S
+from acsard.asking.json_lines import HEARD_S
 from acsard.lan.authority import Authority
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost

@@ -7,20 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from acsard.cli import common
 from acsard.cli.common import (
-    PLACES,
-    find,
     load,
     recorded,
     require_asked,
     require_followed,
     robot_address,
     warn_of_unknown,
-    writable,
 )
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
+from acsard.host import config_file
+from acsard.host.config_file import PLACES, find, writable
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 
@@ -46,7 +44,7 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
     places.here.parent.mkdir()
     monkeypatch.chdir(places.here.parent)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr(common, "PLACES", (PLACES[0], places.etc))
+    monkeypatch.setattr(config_file, "PLACES", (PLACES[0], places.etc))
     return places
 
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
+from acsard.asking.person import Person, ended_by_signals
 from acsard.checkup import procedure
 from acsard.cli import mcu
 from acsard.cli.exits import code_of
-from acsard.cli.person import Person, ended_by_signals
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host.errors import NoPortError, UsageError
@@ -126,7 +126,7 @@ def test_write_without_a_file_is_told_before_anything_moves(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr("acsard.cli.common.PLACES", (Path("acsard.toml"),))
+    monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
     parser = argparse.ArgumentParser()
     mcu.add(parser.add_subparsers())
     args = parser.parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])

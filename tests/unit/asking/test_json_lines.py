@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 
 import pytest
 
+from acsard.asking import json_lines
+from acsard.asking.attendant import interrupted_by
+from acsard.asking.json_lines import LINE_BYTES, JsonAttendant, JsonLines, JsonPerson
 from acsard.calibration.guided.steps import Ask
 from acsard.checkup.findings import Finding
-from acsard.cli import json_lines
-from acsard.cli.attendant import interrupted_by
-from acsard.cli.json_lines import LINE_BYTES, JsonAttendant, JsonLines, JsonPerson
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
@@ -263,7 +263,7 @@ def test_what_cannot_be_written_is_not_asked_for_and_says_why(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr("acsard.cli.common.PLACES", (Path("acsard.toml"),))
+    monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
     with program.hears(JsonLines()) as lines:
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")

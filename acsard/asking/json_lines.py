@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Self, TypeVar
 import msgspec
 from msgspec import Struct
 
+from acsard.asking.attendant import number_of
 from acsard.calibration.guided.steps import Ask
-from acsard.cli.attendant import number_of
-from acsard.cli.common import writable
+from acsard.host.config_file import writable
 from acsard.host.errors import MendableError
 from acsard.host.files import change, require_changeable
 

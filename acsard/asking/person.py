@@ -19,9 +19,9 @@ from acsard.host.colours import coloured
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
+    from acsard.asking.json_lines import JsonPerson
     from acsard.checkup.findings import Finding
     from acsard.checkup.report import Report
-    from acsard.cli.json_lines import JsonPerson
 
 SIMULATOR = "sim"
 
@@ -120,7 +120,7 @@ def answering(args: argparse.Namespace, port: str) -> Person | Nobody | JsonPers
             "DEVICE`; `--port sim` checks the built-in simulator",
         )
     if args.json_lines:
-        from acsard.cli.json_lines import JsonPerson
+        from acsard.asking.json_lines import JsonPerson
 
         if args.yes:
             raise ExitError(

@@ -1,0 +1,1 @@
+"""How a verb asks who stands beside the robot: at a terminal, or through a program."""
