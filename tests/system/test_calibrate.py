@@ -283,6 +283,7 @@ SETS = ("Push", "Set", "Mark")
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(120 * TRIES)
 @pytest.mark.parametrize("way", ["wall", "umbmark"])
 def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
     tmp_path: Path, way: str
