@@ -81,6 +81,10 @@ class Run(Struct):
 
     numbers: set[int] = field(default_factory=set)
     """Of the files that ended in it."""
+    cut: dict[str, Kind] = field(default_factory=dict)
+    """The files that the disk has cut in it, by name. What else is cut, a crash has cut before."""
+    given: int = 0
+    """bytes of recordings that went for a disk that refused, and has taken nothing since."""
     clock: Steady = field(default_factory=Steady)
 
 
@@ -88,17 +92,10 @@ class Ring:
     """Makes room, begins and ends files. Everything may raise `OSError`."""
 
     def __init__(
-        self,
-        settings: RecordConfig,
-        cut: str = "crash",
-        kind: Kind = "kept",
-        run: Run | None = None,
-        refused: bool = False,
+        self, settings: RecordConfig, run: Run | None = None, refused: bool = False
     ) -> None:
-        """Take the directory, and make whole what was cut, of which it makes this `kind`.
-
-        `cut` is a word of `CUTS`, `refused` says that the disk was full.
-        """
+        """Take the directory, and make whole what was cut; `refused` says that the disk was
+        full."""
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
@@ -123,23 +120,26 @@ class Ring:
             for left in self._directory.glob(f".*{PART}.new"):
                 left.unlink()  # a copy that did not become whole
             self.trim(None, refused)  # first: what is made whole needs room
-            self._recover(cut, kind)
+            self._recover()
         except OSError:
             self.close()
             raise
         if self._open:
             self._let_in()
 
-    def _recover(self, cut: str, kind: Kind) -> None:
+    def _recover(self) -> None:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
             seen, disk = part.stat(), self._disk()
+            ours = self._run.cut.get(part.name)
+            kind: Kind = ours or "kept"
+            cut = "disk" if ours else "crash"
             whole = part.with_name(_stem(part) + ENDINGS[kind])
             try:
                 said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
             except OSError as error:  # to record what comes is more than that
                 said = f"{part.name} cannot be made whole: {error.strerror}"
             self.said += [said] if said else []
-            if cut != "crash":
+            if ours:
                 self._run.numbers.add(_number(part) or 0)
             elif whole.exists():
                 self.cut_ns = seen.st_mtime_ns
@@ -217,7 +217,10 @@ class Ring:
         oldest_s = (
             now.wall_ns / NS_PER_S - self._days * S_PER_DAY if now and believed else -math.inf
         )
-        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, refused)
+        given = self._run.given if refused else None
+        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, given)
+        if refused:
+            self._run.given += sum(one.size for one in ended if one.name in gone)
         for name in gone:
             with suppress(OSError):  # somebody else's: to record comes first
                 (self._directory / name).unlink()

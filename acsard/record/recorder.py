@@ -169,10 +169,10 @@ class _Disk:
         self._kind: Kind = "plain"
         """What the file is that is being written."""
         self._told = self._refused = False
-        self._run: Run | None = None
-        """Since the directory was taken first: what is cut later, the disk has cut."""
+        self._run = Run()
         self._cut_ns: int | None = None
-        """When a crash has cut what was before this run, wall clock; looked at once."""
+        """When a crash has cut what was before this run, wall clock, once that is whole; looked at
+        once."""
         self._pause = 0
 
     def round(self, items: list[Taken | _Start], over: bool) -> None:
@@ -198,14 +198,8 @@ class _Disk:
 
     def _take(self) -> Ring:
         """The directory, and what is told of it."""
-        record = self._config.record
-        if self._run is None:
-            run = Run()
-            ring, self._run = Ring(record, run=run, refused=self._refused), run
-            self._cut_ns = ring.cut_ns
-        else:
-            ring = Ring(record, "disk", self._kind, self._run, self._refused)
-        self._refused = False
+        ring = Ring(self._config.record, self._run, self._refused)
+        self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
         for text in ring.said:
             self._say(Event("recording", text, "warning"))
         return ring
@@ -248,7 +242,7 @@ class _Disk:
         self._began_ns, self._reason = now.mono_ns, None
         if self._cut_ns is not None:
             since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
-            self._happened_ns = now.mono_ns - max(0, since_ns)
+            self._happened_ns = max(self._happened_ns, now.mono_ns - max(0, since_ns))
         self._kind = "near" if now.mono_ns - self._happened_ns < AROUND_NS else "plain"
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)
@@ -270,6 +264,7 @@ class _Disk:
         if self._writing is None:
             return
         self._writing.flush()
+        self._run.given = 0
         ring.tend(self._last)
         if self.trouble or not self._told:
             self.trouble, self._told = "", True
@@ -279,17 +274,20 @@ class _Disk:
             self._ask()
 
     def _finish(self, ring: Ring) -> None:
-        writing, self._writing = self._writing, None
-        if writing is not None:
-            path, last_ns = ring.end(writing, self._kind), self._last.mono_ns
-            recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
-            self._recent = recent if self._kind != "plain" else [*recent, (path, last_ns)]
+        if self._writing is None:
+            return
+        path, last_ns = ring.end(self._writing, self._kind), self._last.mono_ns
+        self._writing = None
+        recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
+        self._recent = recent if self._kind != "plain" else [*recent, (path, last_ns)]
 
     def _fail(self, error: OSError) -> None:
         text = f"{self.where}: {error.strerror or error}"
         if text != self.trouble:
             self.trouble = text
             self._say(Event("recording", f"{text}; driving goes on", "warning"))
+        if self._writing is not None:
+            self._run.cut[self._writing.path.name] = self._kind
         for open_one in (self._writing, self._ring):
             if open_one is not None:
                 open_one.close()

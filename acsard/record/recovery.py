@@ -1,6 +1,7 @@
 """A recording that was cut -> a finished one: beside it, or in its place where there is no room.
 
-Nothing that anybody could read is thrown away: what this version cannot read is left as it is.
+Nothing that anybody could read is thrown away: what this version cannot read is left as it is, and
+so is what the disk has no room to end.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import io
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -37,9 +40,9 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     """Make a finished file `whole` of `part`; what there is to tell of it, "" where it went well.
 
     `cut` is a word of `CUTS`; `room` says that the disk has some for a copy. One with nothing in it
-    goes; one that cannot be read here only gets the other name. Raises `OSError`.
+    goes; one that cannot be read here, or not be ended, only gets the other name. Raises `OSError`.
     """
-    seen = part.stat()
+    seen, told = part.stat(), ""
     try:
         if not _begins(part):
             if seen.st_size > NOTHING_BYTES:
@@ -53,13 +56,14 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
             part.unlink()
             return ""
         if not room or not _beside(recording, part, whole, cut):
-            _in_place(recording, part, cut)
+            if not _in_place(recording, part, cut):
+                told = f"{whole.name} was cut and has no end, for want of room; all else is in it"
             part.rename(whole)
     except RecordingError as error:
         part.rename(whole)
         return f"it was cut and stays so, as {whole.name}: {error}"
     os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))  # when it ended, not when it was found
-    return ""
+    return told
 
 
 def _begins(part: Path) -> bool:
@@ -91,28 +95,41 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
     return True
 
 
-def _in_place(recording: Recording, part: Path, cut: str) -> None:
-    """The end goes where the last whole chunk ends, or one before, if that is the room there is."""
+def _in_place(recording: Recording, part: Path, cut: str) -> bool:
+    """The end goes behind the last whole chunk, over what is torn; False where the disk does not
+    take it: then the file is as it was. No chunk is given up for the room: some disks give none
+    back, and all of them would go."""
     news, last_ns = list[Told](), recording.about.wall_ns
     for topic, wall_ns, data in recording.messages():
         last_ns = max(last_ns, wall_ns)
         if topic == "events" and (told := event_of(recording, data)).name in NEWS:
             news.append(told)
     if recording.ended:
-        return
+        return True
     end = _end(Closing(recording.about.wall_ns, last_ns, summary(news), cut))
+    before = part.read_bytes()
+    at = max(_ends(before))
     with part.open("r+b", buffering=0) as stream:
-        for at in reversed(list(_ends(part.read_bytes()))):
-            try:
-                stream.truncate(at)
-                stream.seek(at)
-                if stream.write(end) == len(end):
-                    os.fsync(stream.fileno())
-                    return
-            except OSError as error:
-                if error.errno not in FULL:
-                    raise
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        try:
+            _put(stream, at, end)
+        except OSError as error:
+            with suppress(OSError):
+                stream.truncate(len(before))
+                _put(stream, at, before[at : at + len(end)])
+            if error.errno not in FULL:
+                raise
+            return False
+        stream.truncate(at + len(end))
+        os.fsync(stream.fileno())
+    return True
+
+
+def _put(stream: FileIO, at: int, data: bytes) -> None:
+    """There, and on the disk; raises `OSError`, when some of it may be there."""
+    stream.seek(at)
+    while data:
+        data = data[stream.write(data) :]
+    os.fsync(stream.fileno())
 
 
 def _end(last: Closing) -> bytes:

@@ -87,11 +87,14 @@ def share(bound: int, own: int, disk: Disk) -> int:
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
 
-def too_much(ended: Sequence[Ended], bounds: Bounds, disk: Disk, refused: bool = False) -> set[str]:
+def too_much(
+    ended: Sequence[Ended], bounds: Bounds, disk: Disk, given: int | None = None
+) -> set[str]:
     """The names of those that go, of all that ended, by their numbers.
 
-    There is to be room for one file more. `refused`: the disk took nothing any more, whatever it
-    says of its room, so at least one goes.
+    There is to be room for one file more. `given` is of a disk that took nothing any more, whatever
+    it says of its room: at least one goes. It is how many bytes went for that before, in vain: then
+    none goes that is kept, and none at all beyond what any file may have.
     """
     stays = _protected(ended)
     plain = [one for one in ended if one.name not in stays]
@@ -105,7 +108,9 @@ def too_much(ended: Sequence[Ended], bounds: Bounds, disk: Disk, refused: bool =
         if one.name in gone:
             continue
         gives_way = one.name not in stays and one is not ended[-1]
-        if own > most or free < (disk.spare if gives_way else needed) or (refused and not gone):
+        refused = given is not None and not gone
+        helps = not given or (one.name not in stays and given < LEAST_BYTES)
+        if own > most or free < (disk.spare if gives_way else needed) or (refused and helps):
             gone.add(one.name)
             own, free = own - one.size, free + one.size
     return gone

@@ -6,7 +6,7 @@ Every request passes `_admit` first. What it hands on has a `Who`, but for the p
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
 from aiohttp import web
@@ -26,24 +26,24 @@ from acsard.web.limits import Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports
 from acsard.web.requests import (
-    COOKIE,
     STATUS,
     asked_of,
     body_of,
     keep_little,
     own_address,
+    own_port,
     peer_of,
     problem,
     secured,
     sent,
     takes_gzip,
     token_posted,
-    token_shown,
+    tokens_shown,
 )
 from acsard.web.robots import Robots
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
-from acsard.web.who import MAINTAINER, Reason, Refusal, Who, foreign, place
+from acsard.web.who import MAINTAINER, Reason, Refusal, Who, cookie_name, foreign, place
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -146,7 +146,7 @@ class Page:
             if request.path in OPEN or request.path.startswith("/page/"):
                 request[WHO] = here if spot == "here" else None
             else:
-                shown = token_shown(request)
+                shown = tokens_shown(request, self._robots.id)
                 who = here if spot == "here" else await self._known(asked.peer, shown)
                 if isinstance(who, Refusal):
                     return self.refused(who, asked.peer)
@@ -164,12 +164,13 @@ class Page:
             self._counts.refuse(REASONS.get(error.status, "malformed"), origin)
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
-    async def _known(self, peer: str, shown: str) -> Who | Refusal:
-        """Whose token this is; raises `TimeoutError` for one that cannot be looked up."""
+    async def _known(self, peer: str, shown: Sequence[str]) -> Who | Refusal:
+        """Whose the first of these tokens is that counts; raises `TimeoutError` where they cannot
+        be looked up."""
         now_ns = clock.mono_ns()
-        if not shown:
+        if not any(shown):
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
-        who = await in_thread(lambda: self._vault.who(shown), READ_S)
+        who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
         if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
             return replace(who, address=peer)
         if self._tries.spent(peer, now_ns):
@@ -189,13 +190,13 @@ class Page:
         text, peer = await token_posted(request), peer_of(request)
         if not request.secure:
             return self.refused(Refusal("plain", "here you need no token"), peer)
-        who = await self._known(peer, text)
+        who = await self._known(peer, [text])
         if isinstance(who, Refusal):
             return self.refused(who, peer)
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
-            COOKIE, text, max_age=left_s, path="/",
+            cookie_name(self._robots.id, own_port(request)), text, max_age=left_s, path="/",
             secure=True, httponly=True, samesite="Strict",
         )  # fmt: skip
         return response

@@ -11,10 +11,7 @@ import msgspec
 from aiohttp import web
 
 from acsard.web.files import File
-from acsard.web.who import Asked, Reason, unmapped
-
-COOKIE = "__Host-acsard"
-"""By its name browsers take it only with Secure, of this host, for all paths."""
+from acsard.web.who import Asked, Reason, tokens_in, unmapped
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
 """What a browser writes into `Host`; it is written back into a header."""
@@ -76,14 +73,26 @@ def problem(status: int, text: str) -> web.Response:
 
 def own_address(request: web.Request) -> str:
     """The address of ours that the client has reached: no name that somebody points here."""
+    return unmapped(_reached(request)[0].lower())
+
+
+def own_port(request: web.Request) -> int:
+    """The port of ours that it has reached."""
+    return _reached(request)[1]
+
+
+def _reached(request: web.Request) -> tuple[str, int]:
     at = None if request.transport is None else request.transport.get_extra_info("sockname")
-    return unmapped(str(at[0]).lower()) if at else ""
+    return (str(at[0]), int(at[1])) if at else ("", 0)
 
 
-def token_shown(request: web.Request) -> str:
-    """The token in the cookie of a browser, or in the header of a program."""
+def tokens_shown(request: web.Request, robot: str) -> list[str]:
+    """The token in the header of a program, or those in the cookies of a browser that may be for
+    the page of this robot, the likeliest first."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
-    return text.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
+    if kind.lower() == "bearer":
+        return [text.strip()]
+    return tokens_in(request.cookies, robot, own_port(request))
 
 
 async def body_of(request: web.Request) -> bytes:

@@ -10,7 +10,7 @@ rewritten, it would make a maintainer of everybody behind it.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Literal
 
 from msgspec import Struct
@@ -27,6 +27,13 @@ Place = Literal["here", "away"]
 
 HERE = "here"
 """The name of who needs none."""
+
+COOKIE = "__Host-acsard"
+"""How our cookies' names begin: by that browsers take them only with Secure, of this host, for all
+paths."""
+
+MOST_COOKIES = 8
+"""So many are looked at."""
 
 
 class Who(Struct, frozen=True):
@@ -106,6 +113,20 @@ def foreign(asked: Asked) -> Refusal | None:
     if strange or asked.site not in (None, "same-origin", "none"):
         return Refusal("origin", "a page of another origin may not do that")
     return None
+
+
+def cookie_name(robot: str, port: int) -> str:
+    """What the cookie of this page is called: a browser sends those of all ports of a host to each,
+    and keeps one of each name."""
+    return f"{COOKIE}-{robot}-{port}"
+
+
+def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
+    """The tokens in a browser's cookies that may be for this page: its own, then those of the same
+    robot at other ports, and of before cookies were told apart."""
+    own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
+    names = [name for name in cookies if name == COOKIE or name.rpartition("-")[0] == ours]
+    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_COOKIES]
 
 
 def host_name(host: str) -> str:

@@ -112,7 +112,8 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.tap("tab-drive")
     page.hold()
     bus.get("srv/stop")  # by somebody else
-    page.shows("told", "press Clear")
+    page.shows("told", "why stands above")
+    assert browser.js("document.body.innerText").count("press Clear") == 1
     bus.get("srv/clear")
     page.shows("mode", "READY")
     # The finger is still down.
@@ -122,6 +123,17 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     page.shows("mode", "READY")
     assert bus.count("commands") == sent
     browser.touch("End")
+
+
+def test_what_a_button_could_not_is_said_once(page: Phone) -> None:
+    page.browser.tap("tab-set")
+    page.browser.js("document.getElementById('reset').click()")
+    page.shows("set-told", "pose is x 0")
+    page.server.process.kill()
+    page.shows("age", "no connection")
+    page.browser.js("document.getElementById('reset').click()")
+    page.shows("alarm", "no connection to the robot")
+    assert page.browser.js("document.body.innerText").count("no connection to the robot") == 1
 
 
 def test_keys_drive_while_they_are_held(page: Phone) -> None:
@@ -190,6 +202,46 @@ def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
     page.browser.tap(where)
     page.shows("told", "one finger drives")
     page.bus.at_rest()
+
+
+def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Phone) -> None:
+    """The browser tells no pointerup until the last of them is up."""
+    browser, bus = page.browser, page.bus
+    browser.size(*DESKTOP, touch=False)
+    x, y = browser.middle("stick")
+
+    def mouse(kind: str, dy: float = 0.0, button: str = "none", buttons: int = 1) -> None:
+        told = {"type": f"mouse{kind}", "button": button, "buttons": buttons, "clickCount": 1}
+        browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **told)
+
+    mouse("Pressed", button="left")
+    mouse("Moved", 90)
+    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    mouse("Pressed", 90, "right", 3)
+    mouse("Released", 90, "left", 2)
+    try:
+        bus.at_rest()
+    finally:
+        mouse("Released", 90, "right", 0)
+    page.shows("told", "another button is down")
+
+
+JAM = """(() => {
+    const send = WebSocket.prototype.send;
+    window.sent = [];
+    WebSocket.prototype.send = function (text) { window.sent.push(text); send.call(this, text); };
+    Object.defineProperty(WebSocket.prototype, 'bufferedAmount', {get: () => 1e6});
+})();1"""
+"""A network that takes nothing for now; what the page hands to it is written down."""
+
+
+def test_the_zero_of_a_finger_that_leaves_goes_also_where_much_waits(page: Phone) -> None:
+    page.hold()
+    page.browser.js(JAM)
+    page.browser.touch("End")
+    page.bus.at_rest()
+    sent = [json.loads(one) for one in page.browser.js("window.sent")]
+    assert [one["cmd"]["linear_x"] for one in sent if "cmd" in one] == [0]
 
 
 def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
@@ -307,6 +359,42 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     page.shows("age", "no connection")
     page.shows("mode", "NO CONNECTION")
     assert page.browser.text("speed") == "–"
+    assert "waiting for a command" not in page.browser.text("reason")
+
+
+def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_measured(
+    page: Phone,
+) -> None:
+    """Its server has a state of before still."""
+    browser = page.browser
+    page.daemon.signal(signal.SIGSTOP)
+    try:
+        page.shows("reason", "nothing is heard of the daemon")
+        browser.open(page.server.here)
+        page.shows("reason", "nothing is heard of the daemon")
+        browser.js("new Promise(done => setTimeout(done, 500))")  # more than one look
+        said = [browser.text(one) for one in ("mode", "age", "speed", "turn", "who")]
+        assert said == ["WAITING", "waiting", "–", "–", "–"]
+        assert not browser.js("document.body.classList.contains('stale')")
+    finally:
+        page.daemon.signal(signal.SIGCONT)
+    page.shows("age", "live")
+    page.shows("mode", "READY")
+    page.shows("speed", "0.00 of 0.00 m/s")
+
+
+def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser) -> None:
+    with (
+        Daemon(tmp_path, tmp_path / "none") as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as server,
+    ):
+        page = Phone(daemon, bus, server, browser)
+        browser.open(server.here)
+        page.shows("age", "live")
+        page.shows("mode", "WAITING")
+        page.shows("speed", "– of ")
+        assert "– of " in browser.text("turn")
 
 
 def test_somebody_else_who_drives_is_named(page: Phone) -> None:
@@ -558,6 +646,12 @@ def test_a_hand_that_is_not_followed_lets_go_and_says_why(
     assert all(one[1] is None for one in told[:-1])
 
 
+def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
+    for linear, turn in ((1, -0.8), (0, -0.4)):
+        script = f"out.push(...twist(1, 0, 0.2, {{linear: {linear}, angular: 4}}))"
+        assert by_hand(page, script)[1] == pytest.approx(turn)
+
+
 READ = """import('/page/settings.js').then(({read}) => [
     read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2), read('info', 'debug'),
     read('1,2.5, 3', [0, 0, 0]), read('1,,x', [0, 0, 0])])"""
@@ -593,6 +687,11 @@ def test_what_strangers_write_is_text(page: Phone) -> None:
     assert page.browser.js("document.title") == "acsar"
 
 
+WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
+    .map(name => document.getElementById(name).textContent).join(' ') ?? ''"""
+"""What describes an element to who does not see it."""
+
+
 def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
     Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [NAME], 1)
     settings = {"record": {"directory": str(tmp_path / "record")}}
@@ -609,6 +708,8 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             told = browser.js(f"[...document.querySelectorAll('[data-least]')].map({off})")
             assert len(told) >= 6
             assert {tuple(one) for one in told} == {(True, "for who is operator; you are viewer")}
+            described = browser.js(f"[...document.querySelectorAll('[data-least]')].map({WORDS})")
+            assert all("for who is operator; you are viewer" in one for one in described)
             page.shows("barred", "for who is operator; you are viewer")
             page.shows("hint", "You may watch and stop, not drive")
             browser.tap("tab-events")

@@ -16,6 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from acsard.record.file import About, Recording, Writing
+from acsard.record.recovery import recover
+from acsard.web.recordings import rows
 from tests.system import bystander
 from tests.system.harness import Bus, Daemon, Periods, environment, until
 from tests.system.test_record import files, replayed
@@ -26,6 +29,9 @@ pytestmark = [
 ]
 
 SPAN_S = 5.0
+
+PAGE, EDGE = 4096, 50
+"""bytes: of what a disk gives at once, and left of that behind a recording's last chunk."""
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 
@@ -169,6 +175,30 @@ def test_a_ring_larger_than_its_disk_loses_the_oldest_and_records_on(tmp_path: P
         assert whole.name[:6] == cut.name[:6] < new.name[:6]
         assert replayed(tmp_path, whole) == lines
         assert replayed(tmp_path, new) > 0
+
+
+def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every_chunk(
+    tmp_path: Path,
+) -> None:
+    with disk(tmp_path, "size=64k") as path:
+        part = path / "000001-20260101T000000Z.mcap.part"
+        whole = part.with_suffix("")
+        writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+        for size in (1000, 2000):
+            before = writing.size
+            writing.add("steps", 2, os.urandom(size))
+            writing.flush()
+        more = writing.size - before - size  # than the bytes themselves
+        writing.add("steps", 2, os.urandom(PAGE + (-writing.size - more - EDGE) % PAGE))
+        writing.flush()
+        writing.close()
+        assert 0 < -part.stat().st_size % PAGE < 2 * EDGE
+        fill(path, bytes(PAGE), (f"{number}" for number in range(100)))
+        before_it = list(Recording(part).messages())
+        assert "for want of room" in recover(part, whole, "crash", room=False)
+        assert list(Recording(whole).messages()) == before_it
+        assert len(before_it) == 3
+        assert [row.events for row in rows(path)] == ["no end: cut"]
 
 
 def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:

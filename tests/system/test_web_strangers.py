@@ -6,11 +6,13 @@ import asyncio
 import itertools
 import json
 import re
+import shutil
 import socket
 import ssl
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -27,7 +29,7 @@ from acsard.web.server import TIDY_S
 from acsard.web.tokens import Vault
 from tests.system.browser import Page, hands, run
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Bus, until
+from tests.system.harness import PATIENCE_S, Bus, Daemon, until
 
 pytestmark = pytest.mark.network
 
@@ -100,7 +102,7 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
             ) as answer:
                 assert answer.status == 303
                 cookie = answer.headers["Set-Cookie"]
-            for word in ("__Host-acsard=", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
+            for word in ("__Host-acsard-", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
                 assert word in cookie
             async with session.get(f"{page.away}/api/whoami") as answer:
                 assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
@@ -115,6 +117,30 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
     run(story)
     assert "lent" not in page.tokens("--tokens")
     assert token not in page.stdout + page.stderr
+
+
+def test_two_pages_on_one_host_leave_each_other_s_phones_in(
+    page: Page, daemon: Daemon, tmp_path: Path
+) -> None:
+    """A browser's cookies know no ports."""
+    shutil.copytree(page.tls, tmp_path / "tls")
+
+    async def story() -> None:
+        invited = [(one, one.invite("operator", name)) for one, name in rooms]
+        async with page.client() as phone:
+            for one, token in invited:
+                form = {"token": token}
+                async with phone.post(
+                    f"{one.away}/token", data=form, allow_redirects=False
+                ) as answer:
+                    assert answer.status == 303
+            for one, name in rooms:
+                async with phone.get(f"{one.away}/api/whoami") as answer:
+                    assert (await answer.json()).get("name") == name
+
+    with Page(daemon, tmp_path) as other:
+        rooms = [(page, "first"), (other, "second")]
+        run(story)
 
 
 def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_stops(

@@ -85,8 +85,11 @@ export class Drive {
     this.#told(why);
   }
 
+  /** What lets go goes whatever waits before it. */
   #send(cmd) {
-    this.#link.send({ cmd, stamp: performance.timeOrigin + performance.now() });
+    const message = { cmd, stamp: performance.timeOrigin + performance.now() };
+    if (this.held) this.#link.send(message);
+    else this.#link.urge(message);
   }
 
   #show(x, y) {
@@ -98,7 +101,7 @@ export class Drive {
   #listen() {
     const stick = this.stick;
     stick.addEventListener("pointerdown", (event) => this.#down(event));
-    stick.addEventListener("pointermove", (event) => event.pointerId === this.#pointer && this.#move(event));
+    stick.addEventListener("pointermove", (event) => event.pointerId === this.#pointer && this.#moved(event));
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"])
       stick.addEventListener(name, (event) => event.pointerId === this.#pointer && this.release());
     stick.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -130,6 +133,12 @@ export class Drive {
     this.#move(event);
     this.#press("stick");
     if (!this.#hand.held) this.release();
+  }
+
+  /** A mouse tells the end of one button beside another one by a move. */
+  #moved(event) {
+    if (event.buttons === 1) this.#move(event);
+    else this.release("let go: another button is down");
   }
 
   #move(event) {

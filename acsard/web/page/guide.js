@@ -86,8 +86,8 @@ export class Guide {
   }
 
   #runs({ running, by, yours }) {
-    for (const id of ["check", "calibrate"]) $(id).disabled = Boolean(running);
     this.#busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
+    for (const id of ["check", "calibrate"]) [$(id).disabled, $(id).title] = [Boolean(running), this.#busy];
     text("guide-note", this.#busy);
     if (!running || !yours) return;
     this.#running = true;

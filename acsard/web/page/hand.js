@@ -91,6 +91,8 @@ export function twist(x, y, limit, limits) {
   const far = Math.hypot(x, y);
   if (far < 0.08) return [0, 0];
   const scale = far > 1 ? 1 / far : 1;
-  const turn = Math.min(limits.angular, Math.max(0.4, (limits.angular * limit) / limits.linear));
+  // A robot that may only turn has no part of its speed to go by.
+  const share = limits.linear > 0 ? limit / limits.linear : 0;
+  const turn = Math.min(limits.angular, Math.max(0.4, limits.angular * share));
   return [y * scale * limit, -x * scale * turn];
 }

@@ -11,7 +11,7 @@ import { Recordings } from "./recordings.js";
 import { barred, hint, may, permit } from "./roles.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { milliseconds, said as clickable, signed, yaw } from "./words.js";
+import { figure, milliseconds, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 /** Another robot than the page's own: seen and stopped here; to drive or set it, it has its own page. */
@@ -22,7 +22,7 @@ const LATCHED = ["stopped", "fault"];
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
-const drive = new Drive(link, $("stick"), $("knob"), (why) => views.text("told", words(why)));
+const drive = new Drive(link, $("stick"), $("knob"), told);
 const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
@@ -38,6 +38,8 @@ let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
 let hello = null;
 let wished = null;
+let tried = false; // to connect
+let seen = false; // a state, whatever has become of it
 let uninvited = ""; // why the invitation did not let us in
 let period = 0; // s from one state of another robot's to the next
 
@@ -83,13 +85,18 @@ async function posted() {
 
 async function asked(verb) {
   const told = await link.call(verb);
-  views.alarm(told.ok ? "" : words(told.text));
-  said(told);
+  views.alarm(told.ok ? "" : words(told.text)); // which is seen in every view
+  said(told.ok ? told : { ok: true, text: "" });
 }
 
 async function set(payload) {
   said(await link.call("set", payload));
   configured();
+}
+
+/** At the stick; what the banner says is not said twice. */
+function told(why) {
+  views.text("told", why && why === state?.reason ? "not driving: why stands above" : words(why));
 }
 
 function said(told) {
@@ -129,21 +136,28 @@ function limited() {
   $("most").textContent = `${drive.limit.toFixed(2)} m/s`;
 }
 
+/** For how long a state is fresh, ms: one that is published seldom for longer. */
+function lasts() {
+  return Math.max(500, OTHER ? 2500 * period : 2500 / (hello?.state_rate || 10));
+}
+
 function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
-  // A state that is published seldom is old for longer.
-  const fresh = Math.max(500, OTHER ? 2500 * period : 2500 / (hello?.state_rate || 10));
-  views.freshness(old, fresh, link.way);
-  if (old > 2 * fresh) drive.release("let go: nothing is heard of the robot");
+  const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
+  views.freshness(old, lasts(), link.way, none, seen);
+  if (old > 2 * lasts()) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
   for (const plot of Object.values(plots)) plot.draw(performance.now());
 }
 
 function stated({ detail }) {
+  // What was true long before this page came is nothing that it has measured.
+  if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
   if (since > 0) period = Math.min(since, 2);
   // What was said of a stop is not true any more once that is cleared.
   if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
+  seen = true;
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   views.banner(state, hello?.role === "viewer", OTHER);
@@ -151,13 +165,14 @@ function stated({ detail }) {
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
-  const wish = wished ?? { linear: 0, angular: 0 };
-  views.text("speed", `${signed(state.linear, 2)} of ${signed(wish.linear, 2)} m/s`);
-  views.text("turn", `${signed(state.angular, 2)} of ${signed(wish.angular, 2)} rad/s`);
+  // Without the board nobody measures: what stands there is zero, or was so.
+  const { linear, angular } = state.link === "up" ? state : { linear: null, angular: null };
+  views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
+  views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
   const late = state.figures.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
-  plots.speed.add(heard, state.linear, null);
-  plots.turn.add(heard, state.angular, null);
+  plots.speed.add(heard, linear, null);
+  plots.turn.add(heard, angular, null);
   if (view !== "status") return;
   views.sources($("sources"), state);
   views.counters($("counters"), state);
@@ -176,7 +191,6 @@ function greeted({ detail }) {
   $("limit").max = String(hello.limits.linear);
   limited();
   views.text("hint", hint(hello.role, OTHER));
-  views.text("barred", barred(hello.role, "operator"));
   if (uninvited) views.text("told", uninvited); // let in all the same, by an earlier one
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
@@ -226,14 +240,19 @@ link.addEventListener("fleet", ({ detail }) => {
 });
 link.addEventListener("refused", ({ detail }) => {
   if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
-  const why = detail.refused === "cmd" ? words(objection(state, SOURCE, hello?.sender)) : "";
-  views.text("told", why || detail.reason);
+  told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
 });
 link.addEventListener("gone", ({ detail }) => OTHER || views.text("reason", detail.gone));
+link.addEventListener("up", () => {
+  tried = true;
+  views.waiting();
+});
 link.addEventListener("down", ({ detail }) => {
   drive.release("let go: the connection is gone");
+  tried = true;
   heard = -Infinity;
-  views.lost(detail.reason);
+  views.lost(detail.reason || (state ? "it is tried again" : "")); // what stands there else is of before
+  state = drive.state = wished = null;
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));

@@ -19,9 +19,10 @@ export function hint(role, other) {
   return may(role, "operator") ? "Hold and push to drive; let go to stop." : "You may watch and stop, not drive.";
 }
 
-/** Switch off what this role may not, and say why on it; or all of it, for another reason. `role` is
- *  "" while nobody knows. */
+/** Switch off what this role may not, and say why on it and in what describes it; or all of it, for
+ *  another reason. `role` is "" while nobody knows. */
 export function permit(role, reason = "") {
+  document.getElementById("barred").textContent = reason || barred(role, "operator");
   for (const one of document.querySelectorAll("[data-least]")) {
     const why = reason || barred(role, one.dataset.least);
     if ("disabled" in one) one.disabled = Boolean(why);

@@ -94,6 +94,13 @@ export function banner(state, viewer, elsewhere) {
   doubt.hidden = !doubt.textContent;
 }
 
+/** The robot's computer is there, and nothing is known of the robot yet. */
+export function waiting() {
+  document.body.dataset.mode = "waiting";
+  text("mode", "WAITING");
+  text("reason", "for the robot: nothing is heard of it yet");
+}
+
 /** Nothing is known any more: what was shown last is not what is. */
 export function lost(why) {
   document.body.dataset.mode = "waiting";
@@ -102,11 +109,12 @@ export function lost(why) {
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 
-/** How old what is shown is, ms; beyond `fresh` it is stale. And the way to the robot and back. */
-export function freshness(old, fresh, way) {
+/** How old what is shown is, ms; beyond `fresh` it is stale. And the way to the robot and back.
+ *  `none` is said while nothing is known; `seen`: something was, and is still shown. */
+export function freshness(old, fresh, way, none, seen) {
   const stale = old > fresh;
-  document.body.classList.toggle("stale", stale);
-  text("age", old === Infinity ? "no connection" : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
+  document.body.classList.toggle("stale", stale && seen);
+  text("age", old === Infinity ? none : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
 }
 
 /** What must be seen in every view, until `words` are "". */

@@ -5,6 +5,11 @@ export function signed(value, decimals) {
   return Number(text) === 0 ? (0).toFixed(decimals) : text.replace("-", "−");
 }
 
+/** A measurement, or a dash where there is none. */
+export function figure(value, decimals) {
+  return value === null || value === undefined ? "–" : signed(value, decimals);
+}
+
 /** A number as people type it, "−1,5" too; NaN for none. */
 export function number(typed) {
   const plain = typed.trim().replace("−", "-").replace(",", ".");

@@ -305,7 +305,7 @@ def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> Non
     writing.flush()
     writing.close()
     one.close()
-    Ring(RecordConfig(str(tmp_path)), "disk", "plain")
+    Ring(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
     (path,) = listed(tmp_path)
     assert path.name == writing.path.name.removesuffix(".part")
     last = closing(path)

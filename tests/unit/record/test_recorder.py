@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, RecordConfig
 from acsard.record import recorder as module
 from acsard.record.closing import closing
-from acsard.record.directory import KEPT, listed
+from acsard.record.directory import KEPT, Ring, listed
 from acsard.record.export import export
 from acsard.record.file import About, Recording, Writing
 from acsard.record.recorder import MOST, Recorder
@@ -260,6 +260,106 @@ def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
     assert last is not None
     assert last.cut == "disk"
     assert live(Recording(second)).tally.same
+
+
+def no_copies(handle: int) -> None:
+    """A disk that syncs no copy of what was cut."""
+    if os.readlink(f"/proc/self/fd/{handle}").endswith(".new"):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def full(handle: int) -> None:
+    """A disk that has no room for anything, which it says at a sync."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """One that drives, and tries a disk that refused in the next round."""
+    monkeypatch.setattr(module, "RETRY_ROUNDS", 0)
+    bench.world.drive(0.5, 0.2, seconds=0.5)
+    rounds(bench)
+    return bench
+
+
+def rounds(bench: Bench, count: int = 3) -> None:
+    """Short ones: in the first a disk is tried again, in the second a file begins."""
+    for _ in range(count):
+        bench.world.hold(0.5, 0.2, seconds=0.1)
+        bench.write()
+
+
+def refuse(bench: Bench) -> None:
+    """The disk takes no more, is tried again, and takes what comes then."""
+    bench.recorder._disk._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
+    rounds(bench)
+
+
+def cuts(paths: list[Path]) -> list[tuple[str, str]]:
+    """What each file is by its name, and why it was finished late."""
+    return [(p.name.partition(".")[2], last.cut) for p in paths if (last := closing(p))]
+
+
+def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    die(eager)
+    again = Bench(eager.where, monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", no_copies)
+        rounds(again)
+    refuse(again)
+    assert any("cannot be made whole" in event.text for event in again.said)
+    assert cuts(again.end()) == [("kept.mcap", "crash"), ("mcap", "disk"), ("mcap", "")]
+
+
+def test_each_file_that_the_disk_cut_stays_what_it_was(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eager.world.call("stop")
+    rounds(eager)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", no_copies)
+        refuse(eager)
+    refuse(eager)
+    told = [("kept.mcap", "disk"), ("near.mcap", "disk"), ("near.mcap", "")]
+    assert cuts(eager.end()) == told
+
+
+def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eager.recorder._ask()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(eager, 1)
+    assert eager.recorder.status.trouble.endswith("No space left on device")
+    (part,) = listed(eager.where)
+    part.write_bytes(part.read_bytes()[:-40])  # what was not synced never came there
+    rounds(eager)
+    assert cuts(eager.end()) == [("mcap", "disk"), ("mcap", "")]
+
+
+def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For want of inodes, say, which others take as soon as one is there."""
+    die(eager)
+    ring = Ring(config(eager.where).record)
+    before = [
+        ring.end(ring.begin(About("acsar", "0.1.0", "3.11.0", 1, number)), "kept")
+        for number in range(4)
+    ]
+    ring.close()
+    again = Bench(eager.where, monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(again, 10)
+    assert again.recorder.status.trouble.endswith("No space left on device")
+    assert all(path.exists() for path in before), "the oldest, of the crash, was worth a try"
+    rounds(again)
+    assert again.recorder.status.trouble == ""
+    assert len(again.end()) == 5
 
 
 def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 from pathlib import Path
@@ -55,6 +56,26 @@ def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
         assert last.last_ns == max(wall_ns for _, wall_ns, _ in before)
         with whole.open("rb") as stream:
             assert len(list(make_reader(stream).iter_messages())) == len(before)
+
+
+@pytest.mark.parametrize("torn", [b"", b"torn", bytes(700)])
+def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
+    data: bytes, torn: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that gives no room back says so again and again, some of them only at a sync."""
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    cut = data[: chunks(data)[-1][1]] + torn
+    part.write_bytes(cut)
+    os.utime(part, (0, 1e9))
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    told = recover(part, whole, "crash", room=False)
+    assert whole.read_bytes() == cut
+    assert "a.mcap was cut and has no end, for want of room" in told
+    assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
 def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(

@@ -70,9 +70,17 @@ def test_where_no_room_is_left_at_all_everything_gives_way_to_what_comes() -> No
 
 
 def test_a_disk_that_refuses_whatever_it_says_gets_one_back() -> None:
-    assert too_much(files("kept", "plain", "plain"), BOUNDS, WIDE, refused=True) == {"2"}
-    assert too_much(files("kept"), BOUNDS, WIDE, refused=True) == {"1"}
-    assert too_much([], BOUNDS, WIDE, refused=True) == set()
+    assert too_much(files("kept", "plain", "plain"), BOUNDS, WIDE, given=0) == {"2"}
+    assert too_much(files("kept"), BOUNDS, WIDE, given=0) == {"1"}
+    assert too_much([], BOUNDS, WIDE, given=0) == set()
+
+
+def test_a_disk_that_refuses_all_the_same_gets_none_that_is_kept_and_no_more_than_a_file() -> None:
+    assert too_much(files("kept", "plain", "plain"), BOUNDS, WIDE, given=1) == {"2"}
+    assert too_much(files("kept", "near"), BOUNDS, WIDE, given=1) == set()
+    assert too_much(files("kept", "plain"), BOUNDS, WIDE, given=LEAST_BYTES) == set()
+    low = Disk(100_000, 300)
+    assert too_much(files("kept", "near", size=400), BOUNDS, low, given=1) == {"1", "2"}
 
 
 def test_a_file_has_a_hundredth_of_what_all_may_have_on_this_disk() -> None:

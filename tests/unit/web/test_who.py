@@ -5,14 +5,18 @@ from __future__ import annotations
 import pytest
 
 from acsard.web.who import (
+    COOKIE,
     MAINTAINER,
+    MOST_COOKIES,
     Asked,
     Refusal,
     Who,
+    cookie_name,
     foreign,
     host_name,
     is_loopback,
     place,
+    tokens_in,
     unmapped,
 )
 
@@ -125,3 +129,24 @@ def test_names_are_told_from_ports_and_loopback_from_names() -> None:
 def test_an_ipv4_address_is_itself_by_a_socket_for_both() -> None:
     told = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
     assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]
+
+
+def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
+    """A browser shows those of all ports of a host."""
+    shown = {
+        COOKIE: "of before",
+        cookie_name("robot1", 8444): "elsewhere",
+        cookie_name("robot2", 8443): "another robot's",
+        cookie_name("robot1-8443", 8443): "another robot's",
+        cookie_name("robot1", 8443): "own",
+        "session": "no token",
+    }
+    assert tokens_in(shown, "robot1", 8443) == ["own", "of before", "elsewhere"]
+    assert tokens_in(shown, "robot3", 8443) == ["of before"]
+    assert tokens_in({}, "robot1", 8443) == []
+
+
+def test_of_cookies_without_end_a_few_are_looked_at_and_the_page_s_own_is_one() -> None:
+    shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
+    told = tokens_in(shown, "robot1", 8443)
+    assert (len(told), told[0]) == (MOST_COOKIES, "8443")
