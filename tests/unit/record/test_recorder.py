@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import shutil
 import stat
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -293,6 +296,53 @@ def refuse(bench: Bench) -> None:
     """The disk takes no more, is tried again, and takes what comes then."""
     bench.recorder._disk._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
     rounds(bench)
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """bytes: what is beyond is not written, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def numbers_of(paths: list[Path]) -> list[int]:
+    return [step.number for path in paths for step in steps(Recording(path))]
+
+
+def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) -> None:
+    (part,) = listed(eager.where)
+    with files_of_at_most(part.stat().st_size + 20):
+        rounds(eager, 1)
+    assert eager.recorder.status.trouble.endswith("File too large")
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert numbers == sorted(set(numbers))
+    gap = max(b - a - 1 for a, b in pairwise(numbers))
+    assert missing == gap == eager.world.steps - len(numbers) > 10
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
+    over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a chunk's sync, and at that of a file's end."""
+    (part,) = listed(eager.where)
+    synced = part.stat().st_size
+    if over:
+        eager.recorder._ask()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(eager, 1)
+    part.write_bytes(part.read_bytes()[:synced])  # what was not synced never came there
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert missing == eager.world.steps - len(numbers) > 10
 
 
 def cuts(paths: list[Path]) -> list[tuple[str, str]]:
