@@ -148,10 +148,11 @@ class Ring:
     def _near(self, part: Path, cut_ns: int) -> None:
         """What ended less than a minute before it stays, too."""
         for path in listed(self._directory):
-            before_ns = cut_ns - path.stat().st_mtime_ns
-            earlier = (_number(path) or 0) < (_number(part) or 0)
-            if earlier and before_ns < AROUND_NS:
-                self.keep(path)
+            with suppress(FileNotFoundError):  # somebody removes it just now
+                before_ns = cut_ns - path.stat().st_mtime_ns
+                earlier = (_number(path) or 0) < (_number(part) or 0)
+                if earlier and before_ns < AROUND_NS:
+                    self.keep(path)
 
     def _let_in(self) -> None:
         """Also to what a version has left that recorded for itself alone."""
@@ -203,9 +204,10 @@ class Ring:
         """The clock was set: what ended in this run is no older for that."""
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
-                seen = path.stat()
-                at_ns = max(0, seen.st_mtime_ns + jumped_ns)
-                os.utime(path, ns=(seen.st_atime_ns, at_ns))
+                with suppress(FileNotFoundError):  # somebody removes it just now
+                    seen = path.stat()
+                    at_ns = max(0, seen.st_mtime_ns + jumped_ns)
+                    os.utime(path, ns=(seen.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
         """Remove what is too much or too old; what is being written stays.
@@ -230,7 +232,9 @@ class Ring:
     def _ended(self) -> list[Ended]:
         found = []
         for path in listed(self._directory):
-            if not path.name.endswith(PART):
+            if path.name.endswith(PART):
+                continue
+            with suppress(FileNotFoundError):  # somebody removes it just now
                 seen, number = path.stat(), _number(path) or 0
                 here = number in self._run.numbers
                 size, at_s = seen.st_size, seen.st_mtime
