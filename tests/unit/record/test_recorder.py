@@ -438,17 +438,36 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
     assert (lived.tally.same, lived.trouble) == (True, "")
 
 
-def test_the_loop_only_appends(bench: Bench) -> None:
+def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the thread hangs in a sync, a thousand steps go by."""
+    asked, goes, sync = threading.Event(), threading.Event(), os.fsync
+    who = set[str]()
+
+    def hangs(handle: int) -> None:
+        who.add(threading.current_thread().name)
+        asked.set()
+        goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", hangs)
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    monkeypatch.setattr(module, "CLOSE_S", 20.0)
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, seconds=0.5)
-    inputs, outputs, left = tape.taken[-1]
-    held = threading.Lock()
-    with held:  # whatever the thread does meanwhile
-        bench.recorder.step(inputs, outputs, left, world.loop.robot, b"")
-    last = bench.recorder._queue[-1]
-    assert last == (inputs, outputs, left)
-    assert last[0] is inputs
+    taken = tape.taken[-1]
+    recorder = Recorder(config(tmp_path), lambda event: None)
+    recorder.step(*taken, world.loop.robot, b"")
+    assert asked.wait(20.0)
+    before = len(recorder._queue)
+    for _ in range(1000):
+        recorder.step(*taken, world.loop.robot, b"")
+    hung = not goes.is_set()
+    assert (len(recorder._queue) - before, who, hung) == (1000, {"record"}, True)
+    assert recorder._queue[-1][0] is taken.inputs
+    goes.set()
+    recorder.close()
+    assert len(numbers_of(listed(tmp_path))) == 1001
 
 
 def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
