@@ -11,6 +11,7 @@ import platform
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.record.batch import encode
-from acsard.record.directory import Ring, Run
+from acsard.record.directory import Ring, Run, leave
 from acsard.record.file import About, Writing
 from acsard.record.recovery import FULL
 from acsard.record.room import AROUND_NS, Kind
@@ -119,6 +120,8 @@ class Recorder:
         """Write the last chunk and the end of the file, if the disk lets us in time."""
         self._over.set()
         self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            self._disk.leave()
 
     # the thread's side
 
@@ -197,6 +200,13 @@ class _Disk:
             self._start = None
         if self._start is None and self._writing is None and self._pause == 0:
             self._ask()
+
+    def leave(self) -> None:
+        """The daemon ends while the thread still waits for the disk; called beside it."""
+        writing = self._writing
+        if writing is not None:
+            with suppress(OSError):  # then the next start takes it for a crash's
+                leave(writing.path, self._kind)
 
     def _take(self) -> Ring:
         """The directory, and what is told of it."""

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.record.closing import closing
 from acsard.record.file import About, Recording, Writing
 from acsard.record.recovery import recover
 from acsard.web.recordings import rows
@@ -229,5 +230,11 @@ def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
         assert syncs.stat().st_size > before
         assert bus.state()["recording"] == ""
         daemon.process.terminate()
-        daemon.ended(5.0)
+        assert daemon.ended(5.0) == 0
+    with records(tmp_path, tmp_path / "record"):
+        pass
     lived_again(tmp_path, tmp_path / "record")
+    first, *_ = files(tmp_path)
+    last = closing(first)
+    assert last is not None
+    assert (last.cut in ("", "late"), first.name.endswith("Z.mcap")) == (True, True)

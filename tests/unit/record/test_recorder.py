@@ -309,6 +309,39 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.parametrize("happened", [False, True])
+def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
+    happened: bool,
+    eager: Bench,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if happened:
+        eager.world.call("stop")
+        rounds(eager)
+    goes, sync = threading.Event(), os.fsync
+
+    def hangs(handle: int) -> None:
+        goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(module, "CLOSE_S", 0.01)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", hangs)
+        eager.recorder.close()
+        # As it is on the disk when the process is gone.
+        shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
+    goes.set()
+    eager.recorder._thread.join(20.0)
+    (part,) = listed(where)
+    part.write_bytes(part.read_bytes()[:-40])
+    again = Bench(where, monkeypatch)
+    rounds(again)
+    kind = "kept.mcap" if happened else "mcap"
+    assert cuts(again.end()) == [(kind, "late"), ("mcap", "")]
+    assert not list(where.glob(".0*"))
+
+
 def numbers_of(paths: list[Path]) -> list[int]:
     return [step.number for path in paths for step in steps(Recording(path))]
 
@@ -444,9 +477,10 @@ def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     who = set[str]()
 
     def hangs(handle: int) -> None:
-        who.add(threading.current_thread().name)
+        who.add(name := threading.current_thread().name)
         asked.set()
-        goes.wait(20.0)
+        if name == "record":
+            goes.wait(20.0)
         sync(handle)
 
     monkeypatch.setattr(os, "fsync", hangs)
