@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from acsard.config.settings import RecordConfig
 from acsard.record.closing import closing
+from acsard.record.directory import Ring, Run
 from acsard.record.file import About, Recording, Writing
 from acsard.record.recorder import HAPPENED
 from acsard.record.recovery import recover
@@ -201,6 +203,29 @@ def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every
         assert list(Recording(whole).messages()) == before_it
         assert len(before_it) == 3
         assert [row.events for row in rows(path)] == ["no end: cut"]
+
+
+def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_help(
+    tmp_path: Path,
+) -> None:
+    with disk(tmp_path, "size=1m", "nr_inodes=20") as path:
+        settings = RecordConfig(str(path / "record"))
+        about = About("acsar", "0.1.0", "3.11.0", 1, 2)
+        run = Run()
+        ring = Ring(settings, run=run)
+        kept = [ring.end(ring.begin(about), "kept") for _ in range(4)]
+        fill(path, b"", (f"{number}" for number in range(100)))
+        for more in ("more", "most"):  # others take what is given
+            with pytest.raises(OSError, match="No space left on device"):
+                ring.begin(about)
+            ring.close()
+            ring = Ring(settings, run=run, refused=True)
+            assert [one.exists() for one in kept] == [False, True, True, True]
+            with suppress(OSError):
+                (path / more).touch()
+        (path / "more").unlink()
+        ring.end(ring.begin(about), "plain")
+        ring.close()
 
 
 def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:
