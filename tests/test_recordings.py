@@ -33,3 +33,4 @@ def test_it_comes_out_as_it_did(path: Path) -> None:
         pytest.fail("\n".join(differs(tally.first, recording.about.mono_ns)))
     assert tally.lines == tally.lines_same > 100
     assert tally.modes_same == tally.steps
+    assert tally.exact, "an estimate is another in its last bits"

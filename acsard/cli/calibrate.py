@@ -147,7 +147,7 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
     from acsard.calibration.table import AS_CSV, LogError, noted, read
-    from acsard.record.file import MAGIC
+    from acsard.record.walk import MAGIC
 
     if log.is_dir():
         raise LogError(f"it is a directory (a bag of ROS, perhaps): {AS_CSV}")

@@ -27,6 +27,7 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 CUTS = {
     "crash": "cut: the daemon or the computer ended without a word",
     "disk": "cut: the disk took no more",
+    "late": "cut: the daemon was told to end, and the disk was too slow for the rest",
     "open": "cut, or still being written, when it was recovered",
 }
 """Why somebody else than the daemon finished a file."""

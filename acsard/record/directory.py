@@ -76,6 +76,27 @@ def _stem(path: Path) -> str:
     return path.name.partition(".")[0]
 
 
+def leave(part: Path, kind: Kind) -> None:
+    """The daemon ends and the disk is too slow for the end of this file: no crash has cut it.
+
+    A mark beside it says so, and what the file is. Raises `OSError`.
+    """
+    _mark(part).write_text(kind)
+
+
+def _mark(part: Path) -> Path:
+    return part.with_name(f".{part.name}.left")
+
+
+def _left(part: Path) -> Kind | None:
+    """What the file is whose daemon has ended in order, None where it has not."""
+    try:
+        said = _mark(part).read_bytes()
+    except FileNotFoundError:
+        return None
+    return next((kind for kind in ENDINGS if kind.encode() == said), None)
+
+
 class Run(Struct):
     """What a daemon knows of its recordings from its start on, whatever becomes of the disk."""
 
@@ -121,6 +142,9 @@ class Ring:
                 left.unlink()  # a copy that did not become whole
             self.trim(None, refused)  # first: what is made whole needs room
             self._recover()
+            for mark in self._directory.glob(f".*{PART}.left"):
+                if not mark.with_name(mark.name[1 : -len(".left")]).exists():
+                    mark.unlink()  # what it was of is whole now
         except OSError:
             self.close()
             raise
@@ -131,8 +155,9 @@ class Ring:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
             seen, disk = part.stat(), self._disk()
             ours = self._run.cut.get(part.name)
-            kind: Kind = ours or "kept"
-            cut = "disk" if ours else "crash"
+            ended = _left(part)
+            kind: Kind = ours or ended or "kept"
+            cut = "disk" if ours else "late" if ended else "crash"
             whole = part.with_name(_stem(part) + ENDINGS[kind])
             try:
                 said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
@@ -141,17 +166,18 @@ class Ring:
             self.said += [said] if said else []
             if ours:
                 self._run.numbers.add(_number(part) or 0)
-            elif whole.exists():
+            elif whole.exists() and not ended:
                 self.cut_ns = seen.st_mtime_ns
                 self._near(part, seen.st_mtime_ns)
 
     def _near(self, part: Path, cut_ns: int) -> None:
         """What ended less than a minute before it stays, too."""
         for path in listed(self._directory):
-            before_ns = cut_ns - path.stat().st_mtime_ns
-            earlier = (_number(path) or 0) < (_number(part) or 0)
-            if earlier and before_ns < AROUND_NS:
-                self.keep(path)
+            with suppress(FileNotFoundError):  # somebody removes it just now
+                before_ns = cut_ns - path.stat().st_mtime_ns
+                earlier = (_number(path) or 0) < (_number(part) or 0)
+                if earlier and before_ns < AROUND_NS:
+                    self.keep(path)
 
     def _let_in(self) -> None:
         """Also to what a version has left that recorded for itself alone."""
@@ -203,9 +229,10 @@ class Ring:
         """The clock was set: what ended in this run is no older for that."""
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
-                seen = path.stat()
-                at_ns = max(0, seen.st_mtime_ns + jumped_ns)
-                os.utime(path, ns=(seen.st_atime_ns, at_ns))
+                with suppress(FileNotFoundError):  # somebody removes it just now
+                    seen = path.stat()
+                    at_ns = max(0, seen.st_mtime_ns + jumped_ns)
+                    os.utime(path, ns=(seen.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
         """Remove what is too much or too old; what is being written stays.
@@ -230,7 +257,9 @@ class Ring:
     def _ended(self) -> list[Ended]:
         found = []
         for path in listed(self._directory):
-            if not path.name.endswith(PART):
+            if path.name.endswith(PART):
+                continue
+            with suppress(FileNotFoundError):  # somebody removes it just now
                 seen, number = path.stat(), _number(path) or 0
                 here = number in self._run.numbers
                 size, at_s = seen.st_size, seen.st_mtime

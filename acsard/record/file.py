@@ -9,23 +9,22 @@ whole of it is read all the same, and `rewrite` makes a finished file of it.
 from __future__ import annotations
 
 import errno
-import io
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import msgspec
-from mcap.records import Attachment, Chunk, Footer, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Attachment, Footer, Message, Metadata
 from mcap.writer import IndexType, Writer
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
 from acsard.record import earlier
-from acsard.record.closing import DAMAGE, END, Closing, Ns, fields
+from acsard.record.closing import END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
 from acsard.record.story import NEWS, Told, summary
+from acsard.record.walk import walk
 from acsard.values import NS_PER_S
 
 CHUNK_BYTES = 32 * 1024
@@ -36,12 +35,6 @@ MODE = 0o640
 
 FORMATS = (earlier.FORMAT, FORMAT)
 """Of the messages in it: those that are read here."""
-
-MAGIC = b"\x89MCAP0\r\n"
-"""Begins every file of this kind, whatever it is called."""
-
-LARGEST_RECORD = 1 << 26
-"""bytes; a longer one is damage."""
 
 Topic = Literal["steps", "events", "state"]
 
@@ -155,7 +148,7 @@ class Recording:
         self.ended = False
         """It was read to its end, and has one."""
         self.damaged = 0
-        """Chunks that could not be read, in the midst of others."""
+        """Places in the midst of others, a chunk mostly, that could not be read."""
         self.cut = ""
         """A word of `CUTS` where somebody else than the daemon has finished it."""
         self.about = self._about()
@@ -169,41 +162,26 @@ class Recording:
         """Topic, wall-clock time in ns and bytes of each; sets `ended`, `damaged`, `cut`."""
         self.ended, self.damaged, self.cut = False, 0, ""
         topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
-        for record in self._records():
+        for found in walk(self._data):
+            record = found.record
             if isinstance(record, Footer):
                 self.ended = True
-                return
-            if isinstance(record, Metadata) and record.name == END:
+            elif isinstance(record, Metadata) and record.name == END:
                 self.cut = record.metadata.get("cut", "")
-            if not isinstance(record, Chunk):
-                continue
-            try:
-                inside = breakup_chunk(record, validate_crc=True)
-            except DAMAGE:
-                self.damaged += 1
-                continue
-            for one in inside:
+            self.damaged += found.damaged
+            for one in found.inside:
                 if isinstance(one, Message) and one.channel_id in topics:
                     yield topics[one.channel_id], one.log_time, one.data
-
-    def _records(self) -> Iterator[object]:
-        reader = StreamReader(
-            io.BytesIO(self._data), emit_chunks=True, record_size_limit=LARGEST_RECORD
-        )
-        try:
-            yield from reader.records
-        except DAMAGE:
-            return  # cut, or damaged from here on
 
     def _about(self) -> About:
         found: dict[str, str] = {}
         config = None
-        for record in self._records():
+        for record, inside, _ in walk(self._data):
             if isinstance(record, Metadata) and record.name == "acsard":
                 found = record.metadata
             elif isinstance(record, Attachment) and record.name == "acsard.toml":
                 config = record.data.decode(errors="replace")
-            elif isinstance(record, Chunk):
+            elif inside:
                 break
         try:
             if config is None:

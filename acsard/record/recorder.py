@@ -11,6 +11,7 @@ import platform
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.record.batch import encode
-from acsard.record.directory import Ring, Run
+from acsard.record.directory import Ring, Run, leave
 from acsard.record.file import About, Writing
 from acsard.record.recovery import FULL
 from acsard.record.room import AROUND_NS, Kind
@@ -119,6 +120,8 @@ class Recorder:
         """Write the last chunk and the end of the file, if the disk lets us in time."""
         self._over.set()
         self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            self._disk.leave()
 
     # the thread's side
 
@@ -174,27 +177,36 @@ class _Disk:
         """When a crash has cut what was before this run, wall clock, once that is whole; looked at
         once."""
         self._pause = 0
+        self._handed = self._safe = 0
+        """Steps of this round: given to the file, or counted as missing, and how many of them are
+        synced, or counted. What a disk that refuses has not synced is gone."""
 
     def round(self, items: list[Taken | _Start], over: bool) -> None:
         """Write what came, or count it as missing."""
-        written = 0
+        self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
                 ring = self._ring = self._ring or self._take()
                 for start, steps in _runs(items):
                     self._write(ring, start, steps)
-                    written += len(steps)
                 self._flush(ring, over)
             else:
                 self._pause -= 1
         except OSError as error:
             self._fail(error)
-        missed = sum(isinstance(item, Taken) for item in items) - written
+        missed = sum(isinstance(item, Taken) for item in items) - self._safe
         if missed:
             self.missing += missed
             self._start = None
         if self._start is None and self._writing is None and self._pause == 0:
             self._ask()
+
+    def leave(self) -> None:
+        """The daemon ends while the thread still waits for the disk; called beside it."""
+        writing = self._writing
+        if writing is not None:
+            with suppress(OSError):  # then the next start takes it for a crash's
+                leave(writing.path, self._kind)
 
     def _take(self) -> Ring:
         """The directory, and what is told of it."""
@@ -211,6 +223,8 @@ class _Disk:
         if self._writing is None:
             if self._start is None or not steps:
                 self.missing += len(steps)
+                self._handed += len(steps)
+                self._safe = self._handed
                 return
             self._begin(ring, self._start, steps[0])
         assert self._writing is not None
@@ -221,6 +235,7 @@ class _Disk:
             )
             self._reason = batch[-1].outputs.reason
             self._number += len(batch)
+            self._handed += len(batch)
             self._last = batch[-1].inputs.now
             for _, outputs, _ in batch:
                 for event in outputs.events:
@@ -264,7 +279,7 @@ class _Disk:
         if self._writing is None:
             return
         self._writing.flush()
-        self._run.given = 0
+        self._safe, self._run.given = self._handed, 0
         ring.tend(self._last)
         if self.trouble or not self._told:
             self.trouble, self._told = "", True
@@ -277,7 +292,7 @@ class _Disk:
         if self._writing is None:
             return
         path, last_ns = ring.end(self._writing, self._kind), self._last.mono_ns
-        self._writing = None
+        self._writing, self._safe = None, self._handed
         recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
         self._recent = recent if self._kind != "plain" else [*recent, (path, last_ns)]
 

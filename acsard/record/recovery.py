@@ -7,30 +7,22 @@ so is what the disk has no room to end.
 from __future__ import annotations
 
 import errno
-import io
 import os
-import struct
-from collections.abc import Iterator
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Chunk, DataEnd, Footer, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.data_stream import RecordBuilder
+from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.host.errors import RecordingError
-from acsard.record.closing import DAMAGE, END, Closing, fields
-from acsard.record.file import MAGIC, Recording, event_of, rewrite
+from acsard.record.closing import END, Closing, fields
+from acsard.record.file import Recording, event_of, rewrite
 from acsard.record.story import NEWS, Told, summary
+from acsard.record.walk import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """What a disk says that has no room."""
-
-HEAD = struct.Struct("<BQ")
-"""Of a record: what it is, and its bytes after this."""
-
 
 NOTHING_BYTES = 64 << 10
 """What is larger than a beginning and a chunk had something in it, be it unreadable here."""
@@ -45,7 +37,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     seen, told = part.stat(), ""
     try:
         if not _begins(part):
-            if seen.st_size > NOTHING_BYTES:
+            if seen.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no beginning that can be read")
             part.unlink()
             return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
@@ -68,16 +60,12 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
 
 def _begins(part: Path) -> bool:
     """It can be told whose it is; without that nobody can read any of it."""
-    with part.open("rb") as stream:
-        try:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(record, Attachment):
-                    return True
-                if isinstance(record, Chunk):
-                    return False
-        except DAMAGE:
-            pass
-    return False
+    records = (found.record for found in walk(part.read_bytes()))
+    return any(isinstance(record, Attachment) for record in records)
+
+
+def _has_chunks(part: Path) -> bool:
+    return any(found.inside for found in walk(part.read_bytes()))
 
 
 def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
@@ -108,7 +96,7 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
         return True
     end = _end(Closing(recording.about.wall_ns, last_ns, summary(news), cut))
     before = part.read_bytes()
-    at = max(_ends(before))
+    at = max(found.end for found in walk(before) if found.inside)
     with part.open("r+b", buffering=0) as stream:
         try:
             _put(stream, at, end)
@@ -139,24 +127,3 @@ def _end(last: Closing) -> bytes:
     DataEnd(0).write(builder)
     Footer(0, 0, 0).write(builder)
     return bytes(builder.end()) + MAGIC
-
-
-def _ends(data: bytes) -> Iterator[int]:
-    """Where each chunk ends that is whole; what is damaged between two of them stays."""
-    at = len(MAGIC)
-    while at + HEAD.size <= len(data):
-        opcode, length = HEAD.unpack_from(data, at)
-        end = at + HEAD.size + length
-        if not opcode or end > len(data) or opcode == Opcode.DATA_END:
-            return
-        if opcode == Opcode.CHUNK and _sound(data[at + HEAD.size : end]):
-            yield end
-        at = end
-
-
-def _sound(content: bytes) -> bool:
-    try:
-        chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
-        return bool(breakup_chunk(chunk, validate_crc=True))
-    except DAMAGE:
-        return False

@@ -17,8 +17,10 @@ from pathlib import Path
 import pytest
 
 from acsard.config.settings import RecordConfig
+from acsard.record.closing import closing
 from acsard.record.directory import Ring, Run
 from acsard.record.file import About, Recording, Writing
+from acsard.record.recorder import HAPPENED
 from acsard.record.recovery import recover
 from acsard.web.recordings import rows
 from tests.system import bystander
@@ -254,5 +256,13 @@ def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
         assert syncs.stat().st_size > before
         assert bus.state()["recording"] == ""
         daemon.process.terminate()
-        daemon.ended(5.0)
+        assert daemon.ended(5.0) == 0
+        happened = any(daemon.events(name) for name in HAPPENED)
+    with records(tmp_path, tmp_path / "record"):
+        pass
     lived_again(tmp_path, tmp_path / "record")
+    first, *_ = files(tmp_path)
+    last = closing(first)
+    assert last is not None
+    assert last.cut in ("", "late"), "no crash has cut it"
+    assert happened or first.name.endswith("Z.mcap"), "it is kept for nothing"

@@ -359,3 +359,35 @@ def test_a_copy_that_did_not_become_whole_goes(tmp_path: Path) -> None:
     (left := tmp_path / f".000007-20270115T080000Z{PART}.new").write_bytes(b"half")
     Ring(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
+
+
+def test_a_file_that_somebody_removes_meanwhile_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the list of them and the look at each: when room is made, when the clock is set, and
+    when what a crash has cut is made whole."""
+
+    def found(where: Path) -> list[Path]:
+        paths = listed(where)
+        for path in removed:
+            path.unlink(missing_ok=True)
+        return paths
+
+    removed = list[Path]()
+    monkeypatch.setattr(directory, "listed", found)
+    one = ring(tmp_path)
+    first, second = record(one), record(one)
+    removed = [first]
+    one.trim(None)
+    one.tend(Instant(0, NOW_NS))
+    removed = [second]
+    one.tend(Instant(1, NOW_NS + DAY_NS))
+    third, part = record(one), one.begin(about())
+    part.add("steps", NOW_NS, b"cut")
+    part.flush()
+    one.close()
+    monkeypatch.setattr(Ring, "trim", lambda *_: None)  # it would find the third first
+    removed = [third]
+    again = ring(tmp_path)
+    assert again.cut_ns is not None
+    assert [path.name.endswith(KEPT) for path in listed(tmp_path)] == [True]

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import shutil
 import stat
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -295,6 +298,86 @@ def refuse(bench: Bench) -> None:
     rounds(bench)
 
 
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """bytes: what is beyond is not written, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("happened", [False, True])
+def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
+    happened: bool,
+    eager: Bench,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if happened:
+        eager.world.call("stop")
+        rounds(eager)
+    goes, sync = threading.Event(), os.fsync
+
+    def hangs(handle: int) -> None:
+        goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(module, "CLOSE_S", 0.01)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", hangs)
+        eager.recorder.close()
+        # As it is on the disk when the process is gone.
+        shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
+    goes.set()
+    eager.recorder._thread.join(20.0)
+    (part,) = listed(where)
+    part.write_bytes(part.read_bytes()[:-40])
+    again = Bench(where, monkeypatch)
+    rounds(again)
+    kind = "kept.mcap" if happened else "mcap"
+    assert cuts(again.end()) == [(kind, "late"), ("mcap", "")]
+    assert not list(where.glob(".0*"))
+
+
+def numbers_of(paths: list[Path]) -> list[int]:
+    return [step.number for path in paths for step in steps(Recording(path))]
+
+
+def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) -> None:
+    (part,) = listed(eager.where)
+    with files_of_at_most(part.stat().st_size + 20):
+        rounds(eager, 1)
+    assert eager.recorder.status.trouble.endswith("File too large")
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert numbers == sorted(set(numbers))
+    gap = max(b - a - 1 for a, b in pairwise(numbers))
+    assert missing == gap == eager.world.steps - len(numbers) > 10
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
+    over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a chunk's sync, and at that of a file's end."""
+    (part,) = listed(eager.where)
+    synced = part.stat().st_size
+    if over:
+        eager.recorder._ask()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(eager, 1)
+    part.write_bytes(part.read_bytes()[:synced])  # what was not synced never came there
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert missing == eager.world.steps - len(numbers) > 10
+
+
 def cuts(paths: list[Path]) -> list[tuple[str, str]]:
     """What each file is by its name, and why it was finished late."""
     return [(p.name.partition(".")[2], last.cut) for p in paths if (last := closing(p))]
@@ -388,17 +471,37 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
     assert (lived.tally.same, lived.trouble) == (True, "")
 
 
-def test_the_loop_only_appends(bench: Bench) -> None:
+def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the thread hangs in a sync, a thousand steps go by."""
+    asked, goes, sync = threading.Event(), threading.Event(), os.fsync
+    who = set[str]()
+
+    def hangs(handle: int) -> None:
+        who.add(name := threading.current_thread().name)
+        asked.set()
+        if name == "record":
+            goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", hangs)
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    monkeypatch.setattr(module, "CLOSE_S", 20.0)
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, seconds=0.5)
-    inputs, outputs, left = tape.taken[-1]
-    held = threading.Lock()
-    with held:  # whatever the thread does meanwhile
-        bench.recorder.step(inputs, outputs, left, world.loop.robot, b"")
-    last = bench.recorder._queue[-1]
-    assert last == (inputs, outputs, left)
-    assert last[0] is inputs
+    taken = tape.taken[-1]
+    recorder = Recorder(config(tmp_path), lambda event: None)
+    recorder.step(*taken, world.loop.robot, b"")
+    assert asked.wait(20.0)
+    before = len(recorder._queue)
+    for _ in range(1000):
+        recorder.step(*taken, world.loop.robot, b"")
+    hung = not goes.is_set()
+    assert (len(recorder._queue) - before, who, hung) == (1000, {"record"}, True)
+    assert recorder._queue[-1][0] is taken.inputs
+    goes.set()
+    recorder.close()
+    assert len(numbers_of(listed(tmp_path))) == 1001
 
 
 def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

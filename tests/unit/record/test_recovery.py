@@ -104,6 +104,29 @@ def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
     assert (recording.ended, recording.damaged) == (True, 1)
 
 
+@pytest.mark.parametrize("room", [False, True])
+def test_a_damaged_head_costs_nothing_of_what_is_behind_it(
+    data: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, before = tmp_path / "a.part", tmp_path / "a.mcap", tmp_path / "b.mcap"
+    before.write_bytes(data)
+    bad = bytearray(data[: chunks(data)[-1][1]])
+    for (begin, _), place in zip(chunks(data)[1:], (0, 1, 7), strict=False):
+        bad[begin + place] ^= 0x41
+    part.write_bytes(bad)
+    recover(part, whole, "crash", room)
+    assert messages(whole) == messages(before)
+
+
+def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_path: Path) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    (begin, end), *_ = chunks(data)
+    part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
+    assert part.stat().st_size < NOTHING_BYTES
+    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert list(tmp_path.iterdir()) == [whole]
+
+
 def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     for content, told in ((b"", ""), (b"\x89MC", "it has no beginning")):
