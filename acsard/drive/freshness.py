@@ -47,10 +47,9 @@ jitter, but a clock that was slewed, and goes evenly again."""
 GAP_NS = 2 * NS_PER_S
 """Who is silent for longer begins the proof again."""
 
-MOST_KNOWN, MOST_NEW = 32, 96
-"""Clocks remembered at once, those believed once and those not yet; of each the one heard of
-longest ago goes first. So no flood of names makes anybody a stranger who is not, and what a
-recording begins with stays small: it is written in a step of the loop."""
+MAX_CLOCKS = 1024
+"""Clocks remembered at once; the one heard of longest ago goes first. As many as senders may name
+within a twentieth of a second, and more: none is forgotten between two of its commands."""
 
 State = Literal["new", "known", "stepped"]
 Sign = Literal["usual", "wavering", "steady", "proven"]
@@ -137,6 +136,11 @@ class _Clock:
         """Its delays have not been believed yet, or not for long."""
         return self._state == "new"
 
+    @property
+    def heard_ns(self) -> int:
+        """When it was heard last."""
+        return self._heard_ns
+
     def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
         """What to do with a command that took so long by the two clocks."""
         silence, self._heard_ns = at_ns - self._heard_ns, at_ns
@@ -181,8 +185,23 @@ class Freshness:
         name, at_ns = command.clock or command.source, command.arrived_ns
         clock = self._clocks.pop(name, None) or self._newcomers.pop(name, None) or _Clock(at_ns)
         verdict = clock.judge(at_ns - command.stamp_ns, at_ns, timeout_ns)
-        held, most = (self._newcomers, MOST_NEW) if clock.new else (self._clocks, MOST_KNOWN)
+        held = self._newcomers if clock.new else self._clocks
         held[name] = clock
-        if len(held) > most:
-            del held[next(iter(held))]
+        self._forget(at_ns)
         return verdict
+
+    def _forget(self, now_ns: int) -> None:
+        """Those who would begin anew if they came back, so that it changes nothing: a recording
+        begins with all that is remembered, which the loop writes in one step."""
+        for held, silent_ns in ((self._newcomers, GAP_NS), (self._clocks, FORGET_NS)):
+            while held and now_ns - _oldest(held).heard_ns > silent_ns:
+                del held[next(iter(held))]
+        if len(self._newcomers) + len(self._clocks) > MAX_CLOCKS:
+            both = [held for held in (self._newcomers, self._clocks) if held]
+            held = min(both, key=lambda one: _oldest(one).heard_ns)
+            del held[next(iter(held))]
+
+
+def _oldest(held: dict[str, _Clock]) -> _Clock:
+    """The one heard of longest ago: whoever is heard goes last."""
+    return next(iter(held.values()))

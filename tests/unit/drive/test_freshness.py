@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.config.settings import Source
-from acsard.drive.freshness import MOST_KNOWN, MOST_NEW, NEXT, Freshness, Sign, State, Verdict
+from acsard.drive.freshness import NEXT, Freshness, Sign, State, Verdict
 from acsard.values import NS_PER_S, REST, Command
 from tests.unit.drive.commanders import GO, HIGH, HOUR_NS, LOW, MS, SLOW, Bench
 
@@ -186,38 +186,59 @@ def test_after_so_long_a_silence_that_drift_is_a_delay_a_clock_is_as_good_as_new
     assert clock.steadily(0.0, 250)[-1] == "fresh"
 
 
-def test_no_flood_of_names_makes_a_stranger_of_one_who_is_known() -> None:
+def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
     clock = Clock()
-    for number in range(5000):
-        clock.sends(0.0, 1.0, f"stranger {number}")
+    for number in range(1023):
+        clock.sends(0.0, 0.0, f"sender {number}")
     assert clock.sends(0.0) == "fresh"
+    for number in range(1024):
+        clock.sends(0.0, 1e-3, f"another {number}")
+    assert clock.sends(0.0) == "first"
 
 
-def test_one_who_is_new_is_heard_between_nearly_two_thousand_names_a_second() -> None:
+def test_one_at_20_hz_stays_known_among_four_thousand_names_a_second() -> None:
+    clock = Clock()
+    for number in range(2000):
+        verdict = clock.sends(0.0, 0.0) if number % 200 == 0 else "fresh"
+        assert verdict == "fresh"
+        clock.sends(0.0, 0.25, f"stranger {number}")
+
+
+def test_one_at_20_hz_who_is_new_becomes_known_among_four_thousand_names_a_second() -> None:
     clock = Clock(known=False)
     verdicts = []
-    for number in range(800):
-        if number % 80 == 0:
-            verdicts.append(clock.sends(0.0, 0.6))
-        else:
-            clock.sends(0.0, 0.6, f"stranger {number}")
+    for number in range(2000):
+        if number % 200 == 0:
+            verdicts.append(clock.sends(0.0, 0.0))
+        clock.sends(0.0, 0.25, f"stranger {number}")
     assert verdicts[-1] == "fresh"
 
 
-def test_of_those_who_are_new_the_longest_unheard_is_forgotten_first() -> None:
-    clock = Clock(known=False)
-    for number in range(MOST_NEW + 1):
-        clock.sends(0.0, 1.0, f"stranger {number}")
-    assert clock.sends(0.0, 1.0, "stranger 1") == "unproven"
-    assert clock.sends(0.0, 1.0, "stranger 0") == "first"
+def test_one_who_comes_late_among_others_who_send_as_well_begins_anew_at_best() -> None:
+    clock, verdicts = Clock(), []
+    for _ in range(100):
+        for number in range(40):
+            clock.sends(0.0, 1.0, f"another {number}")
+        verdicts.append(clock.sends(1000.0, 10.0))
+    set_at = verdicts.index("set")
+    assert set(verdicts[:set_at]) == {"stale"}
+    assert set_at * 50.0 > 1000.0
 
 
-def test_of_those_who_are_known_the_longest_unheard_is_forgotten_first() -> None:
-    clock = Clock(known=False)
-    for number in range(MOST_KNOWN + 1):
-        assert [clock.sends(0.0, 200.0, f"sender {number}") for _ in range(3)][-1] == "fresh"
-    assert clock.sends(0.0, 1.0, "sender 1") == "fresh"
-    assert clock.sends(0.0, 1.0, "sender 0") == "first"
+@given(
+    order=st.lists(
+        st.tuples(st.integers(0, 4), st.sampled_from([1.0, 50.0, 900.0, 2100.0, 260_000.0])),
+        max_size=60,
+    )
+)
+def test_what_is_forgotten_would_have_begun_anew(order: list[tuple[int, float]]) -> None:
+    """Each sender is judged among the others as if it were alone."""
+    among = Clock(known=False)
+    alone = {name: Clock(known=False) for name in range(5)}
+    for name, after in order:
+        verdict = among.sends(0.0, after, f"sender {name}")
+        alone[name].now = among.now - 50.0
+        assert alone[name].sends(0.0) == verdict
 
 
 @given(
