@@ -31,7 +31,7 @@ from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.signature import Signature
-from acsard.messages.topics import by_key, full_key, key_hint, service_key, unknown
+from acsard.messages.topics import VERBS, by_key, full_key, key_hint, service_key, unknown
 from acsard.values import Plain, Pose
 
 AGAIN_S = 0.03
@@ -209,9 +209,10 @@ class Client:
                     f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
                     "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
                 )
-            if said != BUSY or time.monotonic() > end_s:
+            # A question is asked again; not what somebody else may have decided otherwise since.
+            if said != BUSY or name in VERBS or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {said}")
-            time.sleep(AGAIN_S)  # others ask more than is answered: nothing was done
+            time.sleep(AGAIN_S)
 
     def _first(self, name: str, payload: bytes | None) -> zenoh.Reply | None:
         try:

@@ -96,7 +96,9 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
         return True
     end = _end(Closing(recording.about.wall_ns, last_ns, summary(news), cut))
     before = part.read_bytes()
-    at = max(found.end for found in walk(before) if found.inside)
+    at = max((found.end for found in walk(before) if found.inside), default=0)
+    if not at:  # somebody else has changed it since
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     with part.open("r+b", buffering=0) as stream:
         try:
             _put(stream, at, end)
