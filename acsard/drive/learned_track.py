@@ -12,15 +12,20 @@ from msgspec import Struct
 
 from acsard.values import Event, GyroStatus, Level, TrackUse
 
-LEAST = 0.02
-"""Standard deviation at best, as a share: the next floor is another one."""
+LEAST = 0.05
+"""Standard deviation at best, as a share: the next floor is another one, and so is the next rate.
+That is half of `gyro_match.FINE`, how far a single moment of it may be off: a way has many."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Standard deviations, as shares: it is used from the first on, and no more beyond the second."""
+"""Standard deviations, as shares: it is known from the first on, and no more beyond the second."""
 
 BOUNDS = (0.5, 2.5)
 """Shares of the configured track. Robots skid by 1.4 to 1.9 on most floors, by 2.5 on slippery ones
 (drive.wheel_separation alone); beyond, either of the two is wrong."""
+
+INWARDS = 1.05
+"""By which factor within the bounds it has to come before it is used: at a bound each turn would
+else be by another track."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -67,11 +72,12 @@ class LearnedTrack:
 
 
 def _use(learned: Track | None, before: TrackUse) -> TrackUse:
-    most = UNCERTAIN if before == "used" else CERTAIN
+    most = CERTAIN if before == "uncertain" else UNCERTAIN
     if learned is None or learned.deviation > most:
         return "uncertain"
-    least, most = BOUNDS
-    return "used" if least <= learned.share <= most else "too far off"
+    inwards = 1.0 if before == "used" else INWARDS
+    within = BOUNDS[0] * inwards <= learned.share <= BOUNDS[1] / inwards
+    return "used" if within else "too far off"
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:

@@ -34,8 +34,8 @@ SLIPPING = 100.0
 class Noise:
     """Variances of one step in base_link."""
 
-    def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
-        track = kinematics.track
+    def __init__(self, odometry: OdometryConfig, track: float) -> None:
+        """`track` in m is the one that the wheels turn the robot by."""
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,

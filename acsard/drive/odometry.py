@@ -104,8 +104,9 @@ class Odometry:
         if track != self._track:
             self._track, self._share = track, track.share
             parameters = columns(self._declared, self._kinematics, track)
-            self._uncertainty.bent_by(parameters)
-            self._twist_uncertainty.bent_by(parameters)
+            apart = self._kinematics.track * track.share
+            self._uncertainty.bent_by(parameters, apart)
+            self._twist_uncertainty.bent_by(parameters, apart)
 
     def set_pose(self, pose: Pose) -> None:
         """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""

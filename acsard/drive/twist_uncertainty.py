@@ -42,23 +42,31 @@ class TwistUncertainty:
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
         """`counts` of the encoders per wheel turn, 0 if unknown."""
-        self._kinematics = kinematics
+        self._track = kinematics.track
         self.use(odometry)
         self._effects = columns(odometry, kinematics, in_use(odometry))
         self._count = math.tau / counts if counts else 0.0
         # Of four independent wheels' errors: each side is the mean of two.
         self._to_linear = kinematics.radius**2 / 4 / 12
-        self._to_angular = kinematics.radius**2 / kinematics.track**2 / 12
+        self._radius = kinematics.radius
+        self._turn_by(self._track)
         self._period = PERIOD
 
     def use(self, odometry: OdometryConfig) -> None:
         """With this noise from now on."""
+        self._odometry = odometry
         self._lateral = odometry.twist_covariance_diagonal[1]
-        self._noise = Noise(odometry, self._kinematics)
+        self._noise = Noise(odometry, self._track)
 
-    def bent_by(self, parameters: tuple[Column, ...]) -> None:
-        """By these columns from now on."""
+    def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
+        """By these columns from now on, and by wheels that are `track` m apart."""
         self._effects = parameters
+        self._turn_by(track)
+        self._noise = Noise(self._odometry, track)
+
+    def _turn_by(self, track: float) -> None:
+        self._track = track
+        self._to_angular = self._radius**2 / track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
         """Of a report that came `dt` s after the one before; 0 if that is unknown.

@@ -58,11 +58,10 @@ class PoseUncertainty:
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
         """`counts` of the encoders per wheel turn, 0 if unknown."""
-        self._kinematics = kinematics
-        self._half = kinematics.track / 2
+        self._radius, self._track = kinematics.radius, kinematics.track
+        self._half = self._track / 2
         self.use(odometry)
         self._parameters = self._effects = columns(odometry, kinematics, in_use(odometry))
-        self._radius, self._track = kinematics.radius, kinematics.track
         self._configured = self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
@@ -74,13 +73,18 @@ class PoseUncertainty:
         """With this noise from now on, and so certain where the pose is set; the parameters and
         how certain they are stay."""
         self._start = odometry.pose_covariance_diagonal
-        self._noise = Noise(odometry, self._kinematics)
+        self._odometry = odometry
+        self._noise = Noise(odometry, self._track)
 
-    def bent_by(self, parameters: tuple[Column, ...]) -> None:
-        """By these columns from now on, as many as before; what they did until now stays."""
+    def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
+        """By these columns from now on, as many as before, and by wheels that are `track` m apart;
+        what they did until now stays."""
         of_gaps = self._effects[len(self._parameters) :]
         self._effects = (*parameters, *of_gaps)
         self._parameters = parameters
+        self._track, self._half = track, track / 2
+        self._noise = Noise(self._odometry, track)
+        self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
         """A side is the mean of two wheels, each of which may stand anywhere within that, rad."""

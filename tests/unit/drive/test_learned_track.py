@@ -64,11 +64,31 @@ def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share
     assert told(track) is None
 
 
-@pytest.mark.parametrize("share", BOUNDS)
-def test_the_bounds_themselves_are_within(share: float) -> None:
+@pytest.mark.parametrize(("bound", "inwards"), [(BOUNDS[0], 1.0), (BOUNDS[1], -1.0)])
+def test_at_a_bound_it_is_used_or_not_and_not_in_turns(bound: float, inwards: float) -> None:
+    """What is in use is used up to the bounds; what is not has to come a bit further in."""
+    within, beyond = (Track(bound * (1.0 + inwards * off), SURE) for off in (0.001, -0.001))
     track = LearnedTrack(1.0)
-    track.look(Track(share, SURE))
+    track.look(Track(1.0, SURE))
+    track.look(Track(bound, SURE))
+    assert track.use == "used"
+    seen = []
+    for _ in range(10):
+        for learned in (beyond, within):
+            track.look(learned)
+            seen.append(told(track))
+    assert seen == ["too far off", *[None] * 19]
+    track.look(Track(bound * (1.0 + inwards * 0.06), SURE))
     assert told(track) == "used"
+
+
+def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
+    track, seen = LearnedTrack(1.0), []
+    for _ in range(10):
+        for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
+            track.look(Track(2 * BOUNDS[1], deviation))
+            seen.append(told(track))
+    assert seen == ["too far off", *[None] * 19]
 
 
 @pytest.mark.parametrize(

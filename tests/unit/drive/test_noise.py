@@ -27,7 +27,7 @@ def noise(distance: float, yaw: float, skid: float) -> Noise:
         yaw_variance_per_metre=yaw,
         yaw_variance_per_radian=skid,
     )
-    return Noise(config, Kinematics(DriveConfig()))
+    return Noise(config, Kinematics(DriveConfig()).track)
 
 
 @given(distance=steps, turn=steps)

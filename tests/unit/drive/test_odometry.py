@@ -742,3 +742,20 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
                 robot.turn_by(Track(1.6, 0.02))
     assert liar.doubt.left_out == ("front_left",)
     assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.6])
+def test_by_a_learned_track_it_is_as_uncertain_as_if_that_were_configured(share: float) -> None:
+    """Not only by its own error: noise, counts and their play are of the wheels, too."""
+    asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
+    asked.turn_by(Track(share, 0.02))
+    asked.use(OdometryConfig(learned_track=True))
+    asked.set_pose(Pose())
+    such = Kinematics(DriveConfig(wheel_separation_multiplier=share))
+    plain = Odometry(OdometryConfig(wheel_separation_multiplier_std=0.02 * share), such, 400)
+    for n in range(300):
+        line = feedback(5.0 + 4.0 * math.sin(n), 9.0 + 4.0 * math.cos(n), 0.01, 0.05 * (n == 150))
+        came, would = asked.fold(line), plain.fold(line)
+        got, expected = came.twist_variances, would.twist_variances
+        assert (got.linear, got.angular) == pytest.approx((expected.linear, expected.angular))
+        assert matrix(came.covariance) == pytest.approx(matrix(would.covariance), rel=1e-6)

@@ -45,9 +45,9 @@ def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
             assert there["key_exprs"] == [
                 key.replace("acsard/robot1/", f"acsard/{robot}/") for key in rule["key_exprs"]
             ]
-        (policy,) = [p for p in ten["policies"] if p["subjects"] == [robot]]
-        assert policy["rules"] == [robot]
-        (subject,) = [s for s in ten["subjects"] if s["id"] == robot]
+        (policy,) = [p for p in ten["policies"] if p["subjects"] == [f"robot-{robot}"]]
+        assert policy["rules"] == [f"own-{robot}"]
+        (subject,) = [s for s in ten["subjects"] if s["id"] == f"robot-{robot}"]
         assert subject["cert_common_names"] == [robot]
         assert {f"{robot}-state", f"{robot}-odom", f"{robot}-tf_static"} <= ten["storages"].keys()
     for role in ("viewers", "operators", "maintainers"):
@@ -69,7 +69,7 @@ def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> No
         "viewers": ["viewer", "wall"],
         "operators": ["operator", "laptop-anna", 'b"c'],
         "maintainers": ["maintainer"],
-        "a-1": ["a-1"],
+        "robot-a-1": ["a-1"],
     }
 
 
@@ -85,6 +85,15 @@ def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> No
 def test_a_name_has_one_place(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
     with pytest.raises(UsageError, match="there twice"):
         router_file(TEMPLATE, robots, people)
+
+
+def test_no_robot_is_called_as_something_else_in_the_file_is() -> None:
+    robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
+    access = made(robots)
+    for kind in ("rules", "subjects"):
+        ids = [one["id"] for one in access[kind]]
+        assert len(set(ids)) == len(ids)
+    assert len(access["storages"]) == 3 * len(robots)
 
 
 def test_every_role_has_its_list() -> None:
