@@ -7,6 +7,8 @@ well. What was found in such a time is looked at again (`procedure.py`), and nev
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from acsard.checkup import limits, manual
 from acsard.checkup.findings import Finding
 from acsard.checkup.manual import Unsure
@@ -54,3 +56,9 @@ def finding(name: str, late_s: float) -> Finding:
 def judged(found: Finding) -> bool:
     """It says something of the board."""
     return found.figure != manual.MANUAL[LATE].figure
+
+
+def unjudged(findings: Iterable[Finding]) -> list[str]:
+    """The names that no finding says anything of; a later one may have."""
+    last = {found.name: found for found in findings}
+    return [name for name, found in last.items() if not judged(found)]

@@ -22,7 +22,7 @@ from acsard.checkup import (
     watchdog,
 )
 from acsard.checkup.board import Board
-from acsard.checkup.findings import Finding, StoppedError, WireLostError, motor_name
+from acsard.checkup.findings import REST, Finding, StoppedError, WireLostError, motor_name
 from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.manual import Unsure
 from acsard.checkup.outside import Operator, Wire
@@ -46,8 +46,6 @@ STEPS = (
     "damaged lines",
 )  # fmt: skip
 """In this order; what the check does not come to is said to be skipped, in one row."""
-
-REST = "the rest"
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),

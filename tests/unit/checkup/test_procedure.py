@@ -11,7 +11,7 @@ import pytest
 
 from acsard.checkup import procedure
 from acsard.checkup.board import FAREWELL
-from acsard.checkup.findings import Finding, WireLostError
+from acsard.checkup.findings import REST, Finding, WireLostError
 from acsard.checkup.limits import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.codec import Codec
@@ -122,7 +122,7 @@ def test_the_person_is_told_what_can_happen() -> None:
 
 def test_every_step_has_a_finding() -> None:
     checked = check(person=True)
-    assert not [f for f in checked.findings if f.name == procedure.REST]
+    assert not [f for f in checked.findings if f.name == REST]
     names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
     assert names == set(procedure.STEPS)
 
@@ -375,7 +375,7 @@ def test_a_runaway_stops_it_at_once() -> None:
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
     assert "more than 6 rad/s" in checked["runaway"].text
-    assert "watchdog" in checked[procedure.REST].text
+    assert "watchdog" in checked[REST].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a has had its 3 rad/s; b never was told more than what already looked like a runaway.
