@@ -44,8 +44,10 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Whether so late a computer may have made this finding."""
-    return late_s >= (PAUSE_S if found.verdict == "PASS" else SPOILS_S)
+    """Whether so late a computer may have made this finding: it can have been so late twice in what
+    was measured, where that began and where it ended."""
+    least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
+    return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:

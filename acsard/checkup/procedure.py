@@ -78,12 +78,17 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     Whatever happens, the last lines are zeros in both forms, then silence: the wire is closed.
     """
     told: set[str] = set()
+    unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """What several steps can find is told by the first of them."""
-        if finding is not None and finding.name not in told:
+        """What several steps can find is told by the first of them that could judge it."""
+        if finding is None:
+            return
+        judged = lateness.judged(finding)
+        if finding.name not in told or (judged and finding.name in unjudged):
+            (unjudged.discard if judged else unjudged.add)(finding.name)
             told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
-            tell(finding)
+            tell(manual.plain(finding))
 
     why = ""
     seen: list[Restart] = []

@@ -686,3 +686,55 @@ def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))
     assert "motor b (front left)" in names(checked)
     assert checked["watchdog"].verdict in ("SKIPPED", "WARN")
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("computer", [Busy, Starved])
+@pytest.mark.parametrize(
+    ("fault", "name"),
+    [
+        ("late_watchdog", "watchdog"),
+        ("fed_by_anything", "watchdog"),
+        ("bias=a:1.5", "motor a (front right)"),
+    ],
+)
+def test_a_fault_beyond_what_the_lateness_explains_is_told(
+    computer: type[Busy], fault: str, name: str
+) -> None:
+    checked = Checked(computer(fault, late_s=0.03, every=3))
+    assert checked[name].verdict == "FAIL"
+    assert type(checked[name]) is Finding  # no more goes to programs
+
+
+def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not() -> None:
+    class Refuses(Busy):
+        """Late, and deaf to lines without a comma, while the form of the lines is looked at."""
+
+        looked = False
+
+        def wakes_late(self) -> bool:
+            return self.looked and super().wakes_late()
+
+    def obeys(line: bytes) -> protocol.Command | None:
+        command = None if b"#" in line else protocol.whole(line)
+        if command and not line.endswith(b",\r\n"):
+            if robot.looked:
+                return None
+            if not command.values[3]:
+                command.values.pop(3)
+        return command
+
+    class Sees(Nobody):
+        def say(self, text: str) -> None:
+            if "once more" not in text:
+                robot.looked = text.startswith("trying the comma")
+
+    robot = Refuses("plain_only", late_s=0.05, every=3)
+    robot.mcu.understand = obeys
+    found: list[Finding] = []
+    with robot.faulty():
+        robot.mcu.understand = obeys
+        procedure.run(robot, Sees(), robot.config, found.append)
+    told = [one for one in found if one.name == "trailing comma"]
+    assert [one.figure for one in told] == ["not judged", "needed"]
+    assert told[1].keys == {"mcu.trailing_comma": True}
