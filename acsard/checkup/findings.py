@@ -13,6 +13,9 @@ from acsard.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
+REST = "the rest"
+"""The row of a check that ended early: what it did not come to."""
+
 
 class Finding(Struct, frozen=True):
     """One thing that was looked at; the words are those of `manual.py`.

@@ -7,6 +7,8 @@ well. What was found in such a time is looked at again (`procedure.py`), and nev
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from acsard.checkup import limits, manual
 from acsard.checkup.findings import Finding
 from acsard.checkup.manual import Unsure
@@ -42,8 +44,10 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Whether so late a computer may have made this finding."""
-    return late_s >= (PAUSE_S if found.verdict == "PASS" else SPOILS_S)
+    """Whether so late a computer may have made this finding: it can have been so late twice in what
+    was measured, where that began and where it ended."""
+    least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
+    return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
@@ -54,3 +58,9 @@ def finding(name: str, late_s: float) -> Finding:
 def judged(found: Finding) -> bool:
     """It says something of the board."""
     return found.figure != manual.MANUAL[LATE].figure
+
+
+def unjudged(findings: Iterable[Finding]) -> list[str]:
+    """The names that no finding says anything of; a later one may have."""
+    last = {found.name: found for found in findings}
+    return [name for name, found in last.items() if not judged(found)]

@@ -15,7 +15,12 @@ from acsard.checkup.outcomes import OUTCOMES
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that a computer which is late can make, whatever the board does."""
+    """A finding that a computer which is late can make, whatever the board does.
+
+    `margin_s` is by how much it is beyond its bound: one that is less late cannot have made it.
+    """
+
+    margin_s: float = 0.0
 
 
 class Outcome(Struct, frozen=True):
@@ -44,9 +49,17 @@ MANUAL = _read(OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
-    """The finding of this outcome, with what was seen; it bears the name of the step, or `name`."""
+    """The finding of this outcome, with what was seen; it bears the name of the step, or `name`,
+    and has the margin `margin_s` where a late computer can make it."""
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
     figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
-    kind = Unsure if entry.unsure else Finding
-    return kind(name, entry.verdict, figure, text, mend, keys or {})
+    if not entry.unsure:
+        return Finding(name, entry.verdict, figure, text, mend, keys or {})
+    margin_s = float(str(seen.get("margin_s", 0.0)))
+    return Unsure(name, entry.verdict, figure, text, mend, keys or {}, margin_s)
+
+
+def plain(found: Finding) -> Finding:
+    """As it is told: without what it needs to be doubted."""
+    return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

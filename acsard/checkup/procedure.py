@@ -22,7 +22,7 @@ from acsard.checkup import (
     watchdog,
 )
 from acsard.checkup.board import Board
-from acsard.checkup.findings import Finding, StoppedError, WireLostError, motor_name
+from acsard.checkup.findings import REST, Finding, StoppedError, WireLostError, motor_name
 from acsard.checkup.limits import BOOT_S, GLANCE_S
 from acsard.checkup.manual import Unsure
 from acsard.checkup.outside import Operator, Wire
@@ -46,8 +46,6 @@ STEPS = (
     "damaged lines",
 )  # fmt: skip
 """In this order; what the check does not come to is said to be skipped, in one row."""
-
-REST = "the rest"
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
@@ -80,12 +78,17 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     Whatever happens, the last lines are zeros in both forms, then silence: the wire is closed.
     """
     told: set[str] = set()
+    unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """What several steps can find is told by the first of them."""
-        if finding is not None and finding.name not in told:
+        """What several steps can find is told by the first of them that could judge it."""
+        if finding is None:
+            return
+        judged = lateness.judged(finding)
+        if finding.name not in told or (judged and finding.name in unjudged):
+            (unjudged.discard if judged else unjudged.add)(finding.name)
             told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
-            tell(finding)
+            tell(manual.plain(finding))
 
     why = ""
     seen: list[Restart] = []

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.checkup import advice
-from acsard.checkup.findings import Finding
+from acsard.checkup import advice, lateness
+from acsard.checkup.findings import REST, Finding
 from acsard.config.writing import excerpt
 
 COLOURS = {"PASS": 32, "WARN": 33, "FAIL": 31, "SKIPPED": 90}
@@ -37,8 +37,11 @@ def report(
     error: str,
     withheld: str = "",
 ) -> Report:
-    """Put together; a board that never answered has not passed."""
-    passed = advice.answered(findings) and not failed(findings)
+    """Put together; a board that never answered has not passed, nor one that was not looked at
+    to the end, or while this computer was late."""
+    ended = not any(finding.name == REST for finding in findings)
+    judged = ended and not lateness.unjudged(findings)
+    passed = advice.answered(findings) and judged and not failed(findings)
     toml = "\n".join(excerpt(changes))
     return Report(
         port,
@@ -70,9 +73,12 @@ def row(finding: Finding, colours: bool) -> str:
 
 
 def summary(found: Report, where: str) -> str:
-    """How many of each verdict, and the lines for the configuration `where`."""
+    """How many of each verdict, how many were not judged, and the lines for `where`."""
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
+    if late := lateness.unjudged(found.findings):
+        again = "so it has not passed: try again when this computer is free"
+        counts += f"\n{len(late)} not judged, {again}"
     if found.withheld:
         return f"\n{counts}\nnothing is for {where}: {found.withheld}"
     if not found.toml:

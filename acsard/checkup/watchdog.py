@@ -76,7 +76,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(limits.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= FED * fed.silent_s:
-        return manual.find("watchdog: fed", figure=judged.figure)
+        beyond_s = fed.ran_s - stop.ran_s - most_s  # one that is not fed had cut them by then
+        return manual.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
 
 
@@ -94,7 +95,8 @@ def _judged(least_s: float, most_s: float) -> Finding:
         outcome = "unclear"
     else:
         outcome = "right"
-    return manual.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s)
+    beyond_s = least_s - limits.WATCHDOG_MOST_S if outcome == "late" else 0.0
+    return manual.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from acsard.checkup import manual
 from acsard.checkup.findings import Finding, motor_name, wheel_of, words
-from acsard.checkup.limits import PROBE_MOVES, SPEED
+from acsard.checkup.limits import GLANCE_S, PROBE_MOVES, SPEED
 from acsard.checkup.motion import moving
 from acsard.config.settings import McuConfig
 from acsard.mcu.codec import LETTERS, Motors
@@ -83,6 +83,8 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
+    # As if it had stood while this computer was late, in half of the looks.
+    beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     return manual.find(
         f"motor: {channel.kind}{_whose(mcu, channel)}",
         name=motor_name(mcu, motor),
@@ -96,6 +98,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         which="slower" if forth - back < 2 * SPEED else "faster",
         tolerance=TOLERANCE,
         speed=SPEED,
+        margin_s=beyond_s,
     )
 
 

@@ -30,7 +30,8 @@ itself: stop the daemon first (exit 75 if it has the port). Motors turn one by o
 together, after you have typed that the wheels are lifted: told 3 rad/s at the most, but a wheel
 whose encoder is dead or reversed can reach full speed. A board that starts anew meanwhile is told,
 and what was being looked at is looked at again. The last lines out are zeros, whatever happens,
-then silence. Exit 0 when nothing fails, 1 when something does.
+then silence. Exit 0 when all of it was judged and nothing fails; 1 when something does, when it
+ended early, or when this computer was too late to judge a row: try again when it is free.
 """
 
 
@@ -93,7 +94,7 @@ def _checked(
     args: argparse.Namespace, config: Config, where: str, person: Person | Nobody | JsonPerson
 ) -> int:
     from acsard.checkup import advice, procedure
-    from acsard.checkup.report import failed, report
+    from acsard.checkup.report import report
 
     _, configured = load(args.config)
     port, simulated = config.mcu.port, config.mcu.simulated
@@ -123,12 +124,13 @@ def _checked(
             written = where
         except MendableError as error:  # a minute's findings are told first
             trouble = error
-    person.result(report(port, findings, changes, written, str(trouble or ""), withheld), where)
+    found = report(port, findings, changes, written, str(trouble or ""), withheld)
+    person.result(found, where)
     if trouble is not None:
         raise trouble
     if changes and not args.write:
         person.offer(args.config, changes)
-    return int(Exit.FAILURE if failed(findings) else Exit.OK)
+    return int(Exit.OK if found.passed else Exit.FAILURE)
 
 
 def _wire(config: Config) -> Wire:

@@ -168,7 +168,7 @@ def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: 
         named = [one["name"] for one in found["findings"] if one["verdict"] == "FAIL"]
         late = any(one["figure"] == "not judged" for one in found["findings"])
         assert named == failed or (late and set(named) <= set(failed)), (name, found)
-        assert code == (1 if named else 0)
+        assert code == (1 if named or late else 0)
         assert late or changes.items() <= found["changes"].items(), name
         if name in ("spaces", "unpadded"):
             form = next(one for one in found["findings"] if one["name"] == "reply form")
@@ -204,7 +204,7 @@ def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: i
     for code, found, _ in results:
         told = [one for one in found["findings"] if one["verdict"] in ("FAIL", "WARN")]
         print(*told, sep="\n")
-        assert code == 0, found
+        assert code == (1 if told else 0), found
         assert all("this computer was late" in one["text"] for one in told), found
         assert found["changes"].keys() <= {"mcu.port", "mcu.link_check", "mcu.encoder_counts"}
         assert found["changes"].get("mcu.encoder_counts", 3200) == 3200

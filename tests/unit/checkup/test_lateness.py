@@ -30,6 +30,8 @@ def test_the_most_since_a_moment_is_told() -> None:
         ("reply rate: slow", SPOILS_S, True),
         ("lost lines: none", 10.0, False),
         ("motor: reversed, not seen", 10.0, False),
+        ("motor: size", SPOILS_S, False),
+        ("motor: size", 0.5, True),
     ],
 )
 def test_only_what_a_late_computer_can_make_is_doubted(
@@ -38,6 +40,8 @@ def test_only_what_a_late_computer_can_make_is_doubted(
     seen: dict[str, Any] = dict.fromkeys(
         ("figure", "seconds", "rate", "way", "gap", "quiet", "period", "lines", "here"), 1.0
     )
+    seen |= {"error": 1.0, "tolerance": 0.25, "speed": 3.0}
+    seen["margin_s"] = 0.5 if outcome == "motor: size" else 0.0
     found = find(outcome, **seen)
     assert (isinstance(found, Unsure) and spoilt(found, late_s)) is doubted
 

@@ -11,7 +11,7 @@ import pytest
 
 from acsard.checkup import procedure
 from acsard.checkup.board import FAREWELL
-from acsard.checkup.findings import Finding, WireLostError
+from acsard.checkup.findings import REST, Finding, WireLostError
 from acsard.checkup.limits import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.codec import Codec
@@ -122,7 +122,7 @@ def test_the_person_is_told_what_can_happen() -> None:
 
 def test_every_step_has_a_finding() -> None:
     checked = check(person=True)
-    assert not [f for f in checked.findings if f.name == procedure.REST]
+    assert not [f for f in checked.findings if f.name == REST]
     names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
     assert names == set(procedure.STEPS)
 
@@ -375,7 +375,7 @@ def test_a_runaway_stops_it_at_once() -> None:
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
     assert "more than 6 rad/s" in checked["runaway"].text
-    assert "watchdog" in checked[procedure.REST].text
+    assert "watchdog" in checked[REST].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a has had its 3 rad/s; b never was told more than what already looked like a runaway.
@@ -686,3 +686,55 @@ def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))
     assert "motor b (front left)" in names(checked)
     assert checked["watchdog"].verdict in ("SKIPPED", "WARN")
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("computer", [Busy, Starved])
+@pytest.mark.parametrize(
+    ("fault", "name"),
+    [
+        ("late_watchdog", "watchdog"),
+        ("fed_by_anything", "watchdog"),
+        ("bias=a:1.5", "motor a (front right)"),
+    ],
+)
+def test_a_fault_beyond_what_the_lateness_explains_is_told(
+    computer: type[Busy], fault: str, name: str
+) -> None:
+    checked = Checked(computer(fault, late_s=0.03, every=3))
+    assert checked[name].verdict == "FAIL"
+    assert type(checked[name]) is Finding  # no more goes to programs
+
+
+def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not() -> None:
+    class Refuses(Busy):
+        """Late, and deaf to lines without a comma, while the form of the lines is looked at."""
+
+        looked = False
+
+        def wakes_late(self) -> bool:
+            return self.looked and super().wakes_late()
+
+    def obeys(line: bytes) -> protocol.Command | None:
+        command = None if b"#" in line else protocol.whole(line)
+        if command and not line.endswith(b",\r\n"):
+            if robot.looked:
+                return None
+            if not command.values[3]:
+                command.values.pop(3)
+        return command
+
+    class Sees(Nobody):
+        def say(self, text: str) -> None:
+            if "once more" not in text:
+                robot.looked = text.startswith("trying the comma")
+
+    robot = Refuses("plain_only", late_s=0.05, every=3)
+    robot.mcu.understand = obeys
+    found: list[Finding] = []
+    with robot.faulty():
+        robot.mcu.understand = obeys
+        procedure.run(robot, Sees(), robot.config, found.append)
+    told = [one for one in found if one.name == "trailing comma"]
+    assert [one.figure for one in told] == ["not judged", "needed"]
+    assert told[1].keys == {"mcu.trailing_comma": True}

@@ -28,7 +28,7 @@ from acsard.host.errors import NoPortError, UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
-from tests.unit.checkup.robots import Robot
+from tests.unit.checkup.robots import Busy, Robot
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
@@ -52,6 +52,19 @@ def test_the_simulator_passes_and_the_lines_are_toml(
     assert "FAIL" not in out
     lines = out.split("for acsard.toml:\n")[1]
     assert parse(lines.encode()).mcu.encoder_counts == 3200
+
+
+def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def late(config: Config) -> Busy:
+        return Busy(late_s=0.45, every=3, config=config)
+
+    monkeypatch.setattr(mcu, "_wire", late)
+    assert called(tmp_path, "--port", "sim", "--yes", "--json") == 1
+    found = json.loads(capsys.readouterr().out)
+    assert not found["passed"]
+    assert "FAIL" not in [one["verdict"] for one in found["findings"]]
 
 
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
