@@ -67,7 +67,7 @@ def walk(data: bytes) -> Iterator[Found]:
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
         claimed = at + HEAD.size + length
-        found = _chunk(data, stream, at) or _read(stream, at, opcode, len(data))
+        found = _chunk(data, stream, at, claimed) or _read(stream, at, opcode, claimed, len(data))
         if found is None and opcode in OTHERS and claimed <= len(data):
             at = claimed
             continue
@@ -82,8 +82,22 @@ def walk(data: bytes) -> Iterator[Found]:
         at = found.end
 
 
-def _chunk(data: bytes, stream: io.BytesIO, at: int) -> Found | None:
-    """The sound chunk whose record begins there, whatever its head says; None where none is."""
+def _chunk(data: bytes, stream: io.BytesIO, at: int, claimed: int) -> Found | None:
+    """The sound chunk whose record begins there, whatever its head says; None where none is.
+
+    Where head and chunk differ about its end, the next one tells: a length that is too great would
+    swallow all behind it, for what is compressed knows itself where it ends.
+    """
+    found = _sound(data, stream, at)
+    if found is None or found.end == claimed:
+        return found
+    after = _next(data, stream, at + 1)
+    if after is not None:
+        return found._replace(end=min(found.end, after))
+    return found._replace(end=claimed) if claimed < found.end == len(data) else found
+
+
+def _sound(data: bytes, stream: io.BytesIO, at: int) -> Found | None:
     if data[at] != Opcode.CHUNK and not COMPRESSED.match(data, at + BEFORE):
         return None
     stream.seek(at + HEAD.size)
@@ -94,7 +108,7 @@ def _chunk(data: bytes, stream: io.BytesIO, at: int) -> Found | None:
     return Found(None, inside, stream.tell()) if inside else None
 
 
-def _read(stream: io.BytesIO, at: int, opcode: int, size: int) -> Found | None:
+def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
     """The record of use that begins there; None where none is, or it is cut by the end."""
     read = READ.get(opcode)
     if read is None:
@@ -104,12 +118,13 @@ def _read(stream: io.BytesIO, at: int, opcode: int, size: int) -> Found | None:
         record = read(ReadDataStream(stream))
     except DAMAGE:
         return None
-    return Found(record, [], stream.tell()) if stream.tell() < size else None
+    end = stream.tell()
+    return Found(record, [], end) if end < size or end == claimed else None
 
 
 def _next(data: bytes, stream: io.BytesIO, begin: int) -> int | None:
     """Where the next sound chunk begins."""
     for match in COMPRESSED.finditer(data, begin + BEFORE):
-        if _chunk(data, stream, match.start() - BEFORE):
+        if _sound(data, stream, match.start() - BEFORE):
             return match.start() - BEFORE
     return None
