@@ -517,6 +517,7 @@ def trouble(world: World, dice: random.Random) -> None:
                 world.hold(0.5, 0.3, seconds=seconds, hz=50.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stories", [2, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(3600)])]
 )

@@ -669,7 +669,6 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     ("kind", "count"),
     [
         ("steady", 1),
-        ("stalls", 1),
         *(pytest.param(kind, 6 if kind == "cuts" else 2, marks=pytest.mark.slow) for kind in KINDS),
         *(
             pytest.param(kind, 100, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])

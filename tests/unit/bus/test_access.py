@@ -292,6 +292,7 @@ def test_nothing_outside_the_robots_own_keys_is_granted(role: Role, key: str) ->
 IDS = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
 
 
+@pytest.mark.slow
 @given(IDS, IDS)
 def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> None:
     access = Access(robot=RobotConfig(id=one), ros=RosConfig(bridge=False, rmw=False))

@@ -594,7 +594,7 @@ def names(checked: Checked) -> set[str]:
     return {f.name for f in checked.findings if f.figure == "not judged"}
 
 
-@pytest.mark.variations(5)
+@pytest.mark.variations(10)
 @pytest.mark.parametrize(
     ("computer", "fault", "late_s", "every"),
     [
@@ -654,7 +654,7 @@ def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> Non
     assert len(which) == len(set(which))
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(
     ("fault", "name"),
     [
@@ -688,7 +688,7 @@ def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     assert checked["watchdog"].verdict in ("SKIPPED", "WARN")
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(6)
 @pytest.mark.parametrize("computer", [Busy, Starved])
 @pytest.mark.parametrize(
     ("fault", "name"),

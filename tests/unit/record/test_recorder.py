@@ -202,7 +202,7 @@ def die(bench: Bench) -> None:
     disk._ring.close()
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("after_s", [5.0, 300.0])
 def test_the_minute_before_and_after_a_crash_is_kept(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -224,7 +224,7 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
 def test_a_clock_that_is_set_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -83,6 +83,7 @@ def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str,
     assert {name: keys[f"{name} drives"] for name in looks} == {n: c for n, (c, _) in looks.items()}
 
 
+@pytest.mark.slow
 def test_ten_who_drove_are_told_apart() -> None:
     rows = [f'[[commands.sources]]\nname = "app{n}"\npriority = {n}\n' for n in range(10)]
     config, tape = parse("".join(rows).encode()), Tape()
