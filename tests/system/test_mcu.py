@@ -157,6 +157,7 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
     return ended.code, json.loads(ended.out), config.read_text()
 
 
+@pytest.mark.soak
 @pytest.mark.network
 @pytest.mark.timeout(3 * CHECK_S)
 def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
@@ -211,7 +212,9 @@ def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: i
 
 
 @pytest.mark.network
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGINT]
+)
 def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: signal.Signals) -> None:
     with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]

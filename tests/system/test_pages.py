@@ -238,6 +238,7 @@ def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: 
             os.killpg(program.pid, signal.SIGTERM)  # the shell, and the daemon under it
 
 
+@pytest.mark.soak
 @pytest.mark.network
 @pytest.mark.xdist_group("installing")
 @pytest.mark.timeout(2 * INSTALL_S)

@@ -110,7 +110,7 @@ def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
     assert replayed(tmp_path, path) > 3
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
     full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes a file
     with recording(tmp_path, before=full) as (daemon, bus):

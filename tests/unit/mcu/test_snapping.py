@@ -117,7 +117,7 @@ def filtered(counts: int, share: float, seed: int) -> Array:
 
 
 @pytest.mark.parametrize(
-    "streams", [8, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+    "streams", [8, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])]
 )
 def test_no_firmware_that_filters_is_taken_for_one_that_counts(streams: int) -> None:
     dice, taken = np.random.default_rng(1), 0
