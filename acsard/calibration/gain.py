@@ -25,6 +25,9 @@ FOLDS = 5
 LEAST_RUNS = 3
 """So many runs are left out each; of fewer, fifths of the log."""
 
+STRAIGHT = 0.1
+"""rad/m; what bends more by the wheels is no straight, however slowly it turns."""
+
 TOLD = 0.1
 """Standard deviation, as a share, of a block's own track by positions that is sure enough."""
 
@@ -82,14 +85,15 @@ def gain(
     held = list(folds(fit, parts, rate))
     now = fit.parameters.copy()
     now[: RATE + 1] = base.start()[: RATE + 1]
-    off_now = truth - turned(rows, base, now)
+    by_wheels = turned(rows, base, now)
+    off_now = truth - by_wheels
     off_then = np.zeros_like(truth)
     for one in held:
         mine = one.blocks[rows.block]
         off_then[mine] = (truth - turned(rows, base, one.parameters))[mine]
     turning = np.abs(truth) > TURNING * rows.seconds
     way = base.radius * np.abs(rows.left + rows.right) / 2
-    ahead = ~turning & (way > 0.0) & (truth != 0.0)
+    ahead = ~turning & (truth != 0.0) & (np.abs(by_wheels) < STRAIGHT * way)
     side = 2 * rows.block + (truth > 0.0)
     amount, metres = float(np.abs(truth[turning]).sum()), float(way[ahead].sum())
     return Gain(

@@ -9,6 +9,7 @@ falls silent while one turns, ends any experiment at once, as one that starts an
 from __future__ import annotations
 
 from math import ceil
+from typing import NamedTuple
 
 from acsard.checkup import limits, manual, motion
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
@@ -36,6 +37,19 @@ FAREWELL = 5
 """How many times the last zeros go out, in each form."""
 
 
+class Known(NamedTuple):
+    """What later steps use of what earlier ones found out; each has its words at `Board`."""
+
+    comma: bool
+    latched: bool
+    sealed: bool
+    sampled: bool
+    own_clock: bool
+    gap_s: float
+    paced: bool
+    lost: float
+
+
 class Board:
     """One wire; entering opens it, leaving sends zeros and falls silent, whatever happened."""
 
@@ -47,7 +61,7 @@ class Board:
         """The most that mcu.reply_period may be."""
         self.armed = False
         """The motors have been seen to stand: from now on a runaway ends the check."""
-        # its language, as it is found out
+        # what is found out of it
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         self.latched = False
@@ -57,16 +71,18 @@ class Board:
         self.identity: dict[str, str] = {}
         self.own_clock = False
         """It reports by its own clock."""
-        self.gap_s = 0.0
+        self.gap_s = mcu.reply_period
         """Between two replies while lines go out."""
+        self.paced = False
+        """Those two were measured."""
+        self.lost = 0.0
+        """Share of the lines that get lost or damaged, of either way."""
         # the recording
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Lines that are no good replies."""
         self.heard = Heard()
         """All that came since the line was opened."""
-        self.lost = 0.0
-        """Share of the lines that get lost or damaged, of either way."""
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
@@ -131,13 +147,14 @@ class Board:
         return self.wire.now_ns() / NS_PER_S
 
     @property
-    def language(self) -> tuple[bool, bool, bool, bool]:
+    def known(self) -> Known:
         """What a step may have found out of it, to be what it was when that is tried again."""
-        return self.comma, self.latched, self.sealed, self.sampled
+        return Known(*(getattr(self, name) for name in Known._fields))
 
-    @language.setter
-    def language(self, known: tuple[bool, bool, bool, bool]) -> None:
-        self.comma, self.latched, self.sealed, self.sampled = known
+    @known.setter
+    def known(self, known: Known) -> None:
+        for name, value in known._asdict().items():
+            setattr(self, name, value)
 
     @property
     def line_s(self) -> float:

@@ -12,7 +12,7 @@ from statistics import fmean, median
 
 from msgspec import Struct
 
-from acsard.checkup import limits, manual, motion
+from acsard.checkup import lateness, limits, manual, motion
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, Reply
@@ -53,8 +53,11 @@ def finding(board: Board) -> Finding:
     """Send zeros at the host's pace, and judge what comes back; sets `board.lost`.
 
     Ends the check where plain lines come damaged: the ones on the way there may be, too, and a
-    damaged one can tell a motor any speed.
+    damaged one can tell a motor any speed. What is lost cannot be told of a board whose pace nobody
+    knows.
     """
+    if not board.paced:
+        return lateness.finding("lost lines", board.lateness.since(0.0))
     board.listen(limits.GLANCE_S)  # what comes later answers what goes out now
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from statistics import fmean, median
 
-from acsard.checkup import manual
+from acsard.checkup import lateness, manual
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.limits import CUT_S, GLANCE_S
@@ -27,6 +27,7 @@ TRIPS = 10
 
 def rate(board: Board) -> Finding:
     """How often it answers at the host's pace, and whether by itself."""
+    board.paced = True
     board.listen(GLANCE_S / 4)
     unasked = board.listen(CUT_S)
     # What had been held up, here or at the board, comes all at once.
@@ -64,6 +65,8 @@ def rate(board: Board) -> Finding:
 
 def trip(board: Board) -> Finding:
     """How soon a line is answered."""
+    if not board.paced:
+        return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:
         return manual.find("round trip: own clock")
     trips = [trip_s for trip_s, _ in board.answers(TRIPS, GLANCE_S)]

@@ -173,12 +173,12 @@ class _Steps:
 
     def _in_time(self, step: Step) -> Finding | None:
         """What a step finds while this computer is in time, or that it never was."""
-        board, language, late_s = self._board, self._board.language, 0.0
+        board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
                 self._operator.say("this computer was late; once more")
-                board.language = language
+                board.known = known
                 if board.armed:
                     board.rest()
             began_s = board.now_s
@@ -195,7 +195,7 @@ class _Steps:
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
         else:
-            found, board.language = told, language
+            found, board.known = told, known
         if found is not None and ends:
             raise StoppedError(found)
         return found
@@ -203,7 +203,7 @@ class _Steps:
     def _take(self, doing: str, step: Step) -> None:
         """A step and what it found."""
         board, again = self._board, 0
-        language = board.language
+        known = board.known
         while True:
             try:
                 if again:
@@ -217,7 +217,7 @@ class _Steps:
                 again += 1
                 if again > AGAIN or len(self._seen) >= MOST:
                     raise StoppedError(restarts.finding(board.mcu, self._seen)) from None
-                board.language = language
+                board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
         """What a step finds; a board that is silent then may have started anew, and says so."""

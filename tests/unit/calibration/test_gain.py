@@ -9,6 +9,7 @@ from acsard.calibration.fit import fit
 from acsard.calibration.gain import constant, folds, gain, seen_by_places
 from acsard.calibration.multipliers import Rates
 from tests.unit.calibration.cut import BASE, ideal, ready
+from tests.unit.calibration.robots import GUIDED
 
 RATE = Rates(0.5, 1.0)
 
@@ -42,6 +43,16 @@ def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
         fitted, BASE, made.parts, RATE, made.rows, np.zeros_like(made.rows.turned), [], []
     )
     assert (better.turn.now, better.place.then) == (None, None)
+
+
+def test_a_slow_curve_is_no_straight() -> None:
+    """It turns as slowly as a straight drive may, and much more in each metre."""
+    slow = (60.0, 0.04, 0.06)
+    made = ready(ideal([*GUIDED, slow]).csv(places=False))
+    fitted = fit(made.sources, made.start, places=False)
+    better = gain(fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, [], [])
+    assert better.straight.now is not None
+    assert better.straight.now < 5.0
 
 
 def test_positions_tell_how_far_it_turned() -> None:

@@ -639,6 +639,22 @@ def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
 
 
 @pytest.mark.slow
+def test_lines_of_a_board_whose_pace_was_not_measured_are_not_counted() -> None:
+    """Those that come by its own clock are not one to each of ours."""
+    unpaced = 0
+    for until_s in range(2, 10):
+        late = Busy(
+            "unprompted", "plain_only", late_s=0.45, every=9, until_s=until_s, reply_period=0.1
+        )
+        checked = Checked(late)
+        if "reply rate" in names(checked):
+            unpaced += 1
+            assert {"round trip", "lost lines"} <= names(checked)
+        assert checked.failed == []
+    assert unpaced
+
+
+@pytest.mark.slow
 def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> None:
     robot = Busy("plain_only", late_s=0.45, every=30)
     asked: list[str] = []
