@@ -364,13 +364,19 @@ def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) 
 
 
 def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -> None:
+    page.hold()
+    page.shows("mode", "DRIVING")
     page.daemon.signal(signal.SIGSTOP)
     try:
         page.shows("age", "STALE")
+        page.shows("mode", "NOT HEARD")  # nobody knows whether it still drives
+        page.shows("reason", "nothing is heard of the daemon")
         assert page.browser.js("document.body.classList.contains('stale')")
     finally:
         page.daemon.signal(signal.SIGCONT)
+    page.browser.lift()
     page.shows("age", "live")
+    page.shows("mode", "READY")
     page.server.process.kill()
     page.shows("age", "no connection")
     page.shows("mode", "NO CONNECTION")

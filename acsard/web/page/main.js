@@ -40,6 +40,7 @@ let hello = null;
 let wished = null;
 let tried = false; // to connect
 let seen = false; // a state, whatever has become of it
+let silent = ""; // why nothing is heard, as the page's server says
 let uninvited = ""; // why the invitation did not let us in
 let period = 0; // s from one state of another robot's to the next
 
@@ -145,6 +146,7 @@ function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen);
+  if (state && old > lasts()) views.unheard(silent);
   if (old > 2 * lasts()) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
   for (const plot of Object.values(plots)) plot.draw(performance.now());
@@ -160,6 +162,7 @@ function stated({ detail }) {
   seen = true;
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
+  silent = "";
   views.banner(state, hello?.role === "viewer", OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
@@ -242,7 +245,11 @@ link.addEventListener("refused", ({ detail }) => {
   if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
   told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
 });
-link.addEventListener("gone", ({ detail }) => OTHER || views.text("reason", detail.gone));
+link.addEventListener("gone", ({ detail }) => {
+  if (OTHER) return;
+  silent = detail.gone;
+  views.text("reason", silent);
+});
 link.addEventListener("up", () => {
   tried = true;
   views.waiting();

@@ -45,7 +45,7 @@ export function happened(list, told, elsewhere) {
   const rows = [...told.events].reverse().map((one) => {
     const by = one.by ? ` — ${one.by}` : "";
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp)), " ", head, ` ${said(one.text, elsewhere)}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(one.text, elsewhere)}${by}`);
   });
   list.replaceChildren(...rows);
 }
@@ -99,6 +99,13 @@ export function waiting() {
   document.body.dataset.mode = "waiting";
   text("mode", "WAITING");
   text("reason", "for the robot: nothing is heard of it yet");
+}
+
+/** What stands there is old: nobody knows whether it still drives. */
+export function unheard(why) {
+  document.body.dataset.mode = "waiting";
+  text("mode", "NOT HEARD");
+  text("reason", why || "nothing is heard of the robot; what is shown is of before");
 }
 
 /** Nothing is known any more: what was shown last is not what is. */

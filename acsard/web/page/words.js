@@ -16,9 +16,10 @@ export function number(typed) {
   return plain === "" ? NaN : Number(plain);
 }
 
-/** A stamp {sec, nanosec} as the clock on the wall. */
-export function clock(stamp) {
-  return new Date(stamp.sec * 1000 + stamp.nanosec / 1e6).toLocaleTimeString();
+/** A stamp {sec, nanosec} as the clock on the wall, with the day if that is not today's. */
+export function clock(stamp, now) {
+  const at = new Date(milliseconds(stamp));
+  return at.toDateString() === now.toDateString() ? at.toLocaleTimeString() : at.toLocaleString();
 }
 
 export function milliseconds(stamp) {
