@@ -44,6 +44,9 @@ ASK_S, DEAD_S = 0.3, 2.0
 """Without a state for so long it is asked for, since it may be published seldom; without an answer
 nobody is there."""
 
+QUIET_S = 2 * ASK_S
+"""A state older than this is none to end by."""
+
 STANDS = 0.01, 0.02
 """m/s and rad/s below which it stands."""
 
@@ -124,7 +127,7 @@ def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
     """Zeros until it stands, or gets no slower: then something else moves it."""
     begun = since = time.monotonic()
     slowest = math.inf
-    while since + SLOWS_S > (now := time.monotonic()):
+    while since + SLOWS_S > (now := time.monotonic()) or now - watch.heard > QUIET_S:
         robot.send(0.0, 0.0)
         yield SEND_PERIOD_S
         watch.look()
@@ -168,9 +171,9 @@ class _Watch:
         now = time.monotonic()
         try:
             while self._answers:  # first: what comes by itself is later
-                self._take(self._answers.popleft())
+                self._take(self._answers.popleft(), asked=True)
             while (sample := self._states.try_recv()) is not None:
-                self._take(sample)
+                self._take(sample, asked=False)
         except zenoh.ZError:
             raise NoAnswerError("the connection was closed while the robot drove") from None
         if now - max(self.heard, self._asked) > ASK_S:
@@ -196,16 +199,28 @@ class _Watch:
         """No more states."""
         self._states.undeclare()
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _take(self, sample: zenoh.Sample, asked: bool) -> None:
         try:
             state = self._decoder.decode(*encoded(sample))
         except DecodeError:
             self._unreadable = True
             return
+        if asked and not newer(state, self.state):
+            self.state = self.state or state  # the first may be a storage's: the next tells
+            return
         self.state, self.heard = state, time.monotonic()
         self.objection = objection(state, self._robot.source, self._robot.sender)
         if not self.objection:
             self._fine = self.heard
+
+
+def newer(answer: RobotState, held: RobotState | None) -> bool:
+    """An answer shows that the daemon lives: it is newer than the state held so far.
+
+    A storage of a router answers too, for a robot that is dead with the last state there was. What
+    comes unasked is no storage's, and may be older: clocks are set back.
+    """
+    return held is not None and answer.stamp.to_ns() > held.stamp.to_ns()
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:

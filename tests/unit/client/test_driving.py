@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import closing
 from threading import Thread, get_ident
@@ -25,6 +26,7 @@ from acsard.client.driving import (
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import RobotState, SourceState, Time
+from acsard.values import NS_PER_S
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "neutral first: app must send a zero"
@@ -54,6 +56,11 @@ Says = Callable[[float, float, list[float]], RobotState | None]
 """What the daemon says at a time, s, with the last command for m/s, and all of them."""
 
 
+def sample_of(state: RobotState) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
+    return SimpleNamespace(encoding=encoding_name("msgpack", "RobotState"), payload=payload)
+
+
 class World:
     """A robot, a clock and a daemon that says its state ten times a second."""
 
@@ -65,6 +72,9 @@ class World:
         self.asked = 0
         self.subscribed = self.answers = True
         self.published = True
+        self.dies = math.inf
+        """From when on, s, only a storage of a router answers, with the last state."""
+        self.stored: Any = None
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -78,14 +88,15 @@ class World:
         self.subscribed = False
 
     def try_recv(self) -> Any:
-        if not self.published or self.now < self._told:
+        if not self.published or self.now < self._told or self.now - 100.0 >= self.dies:
             return None
         self._told = self.now + 0.1
-        return self._sample()
+        self.stored = self._sample()
+        return self.stored
 
     def ask(self, name: str, take: Any) -> None:
         self.asked += 1
-        sample = self._sample()
+        sample = self._sample() if self.now - 100.0 < self.dies else self.stored
         if self.answers and sample is not None:
             take(sample)
 
@@ -93,8 +104,7 @@ class World:
         state = self._says(self.now - 100.0, self.sent[-1] if self.sent else 0.0, self.sent)
         if state is None:
             return None
-        payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
-        return SimpleNamespace(encoding=encoding_name("msgpack", "RobotState"), payload=payload)
+        return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
 
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
         """How long a drive of 0.5 m/s takes, s."""
@@ -241,6 +251,40 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
         return held_up if 0.9 < t < 1.2 else followed(t, last, sent)
 
     world = World(says)
+    world.drive(monkeypatch)
+    assert world.sent.count(0.5) in (20, 21)
+
+
+@pytest.mark.parametrize("seconds", [0.4, 1.0, 60.0])
+@pytest.mark.parametrize("dies", [0.35, 0.7, 1.0])
+def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
+    monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
+) -> None:
+    """Of a router, which answers with the last one there was."""
+    world = World(followed)
+    world.dies = dies
+    with pytest.raises(NoAnswerError, match="no word"):
+        world.drive(monkeypatch, seconds)
+    assert world.asked
+    assert world.now - 100.0 <= dies + DEAD_S + 0.3
+    assert world.sent[-1] == 0.0
+
+
+@pytest.mark.parametrize("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
+def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_drive(
+    monkeypatch: pytest.MonkeyPatch, last: RobotState
+) -> None:
+    world = World(followed)
+    world.dies, world.stored = 0.0, sample_of(last)
+    with pytest.raises(NoAnswerError, match="no word"):
+        world.drive(monkeypatch, 0.4)
+    assert set(world.sent) == {0.0}
+
+
+def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it publishes is no storage's, whatever its stamp."""
+    world, made = World(followed), sample_of(FOLLOWED)
+    monkeypatch.setattr(world, "_sample", lambda: made)
     world.drive(monkeypatch)
     assert world.sent.count(0.5) in (20, 21)
 
