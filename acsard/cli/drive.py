@@ -123,7 +123,7 @@ def main(args: argparse.Namespace) -> int:
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         if tls and (us := robot.whoami()).role in ("", "viewer"):
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())
-        ride = _Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
+        ride = Ride(robot, Teleop(args.linear, args.angular), robot_id, endpoint)
         try:
             _show(ride)
         finally:
@@ -133,7 +133,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _show(ride: _Ride) -> None:
+def _show(ride: Ride) -> None:
     """On a screen of its own where there is one."""
     dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     if dumb or not sys.stdout.isatty():
@@ -146,7 +146,7 @@ def _show(ride: _Ride) -> None:
     return terminal.drive(ride.step, ride.seen)
 
 
-def _plain(ride: _Ride) -> None:
+def _plain(ride: Ride) -> None:
     """Some lines when there is news, and now and then."""
     from acsard.top.keys import keys, until_told
     from acsard.top.teleop import news
@@ -161,7 +161,7 @@ def _plain(ride: _Ride) -> None:
                 print("\n".join(news(seen, _width())), flush=True)
 
 
-def _part(ride: _Ride) -> None:
+def _part(ride: Ride) -> None:
     """The last word, to who is still there: not that it drives, when it stands a moment later."""
     from acsard.top.teleop import moves, parting
 
@@ -203,7 +203,7 @@ class News:
         return True
 
 
-class _Ride:
+class Ride:
     """Between the keys and the robot."""
 
     def __init__(self, robot: Client, teleop: Teleop, robot_id: str, endpoint: str) -> None:
@@ -233,21 +233,25 @@ class _Ride:
     def take(self) -> None:
         """Take what has come; ask when nothing does."""
         while self._answers:  # first: what comes by itself is later
-            self._take(self._answers.popleft())
+            self._take(self._answers.popleft(), asked=True)
         while (sample := self._states.try_recv()) is not None:
-            self._take(sample)
+            self._take(sample, asked=False)
         now = time.monotonic()
         if now - max(self._heard, self._asked) > ASK_S:
             self._asked = now
             self._robot.ask("state", self._answers.append)
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _take(self, sample: zenoh.Sample, asked: bool) -> None:
         from acsard.bus.subscription import encoded
+        from acsard.client.driving import newer
         from acsard.messages.encodings import DecodeError
 
         with suppress(DecodeError):  # a stranger's
-            self._state = self._decoder.decode(*encoded(sample))
-            self._heard = time.monotonic()
+            state = self._decoder.decode(*encoded(sample))
+            if asked and not newer(state, self._state):
+                self._state = self._state or state  # the first may be a storage's: no news yet
+                return
+            self._state, self._heard = state, time.monotonic()
 
     def seen(self) -> Seen:
         """What there is to show."""

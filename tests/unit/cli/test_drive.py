@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.cli.drive import HOLD_S, ZEROS, News, Teleop, split
-from acsard.messages.schema import RobotState
+from acsard.cli import drive
+from acsard.cli.drive import ASK_S, HOLD_S, ZEROS, News, Ride, Teleop, split
+from acsard.messages.encodings import encode
+from acsard.messages.schema import RobotState, Time
 from acsard.values import REST, Twist
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_teleop import SEEN
@@ -150,6 +155,66 @@ def test_cutting_loses_nothing(text: str) -> None:
 @given(st.lists(st.sampled_from([*"io,k ", UP, DOWN, LEFT, RIGHT])))
 def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
     assert split("".join(keys)) == keys
+
+
+# what is heard of the robot
+
+
+class Robot:
+    """A client whose robot has said these, and whose router's storage keeps the last of them."""
+
+    source, sender = "teleop", "joe/1/aa"
+
+    def __init__(self, *said: RobotState) -> None:
+        self.said = deque(map(sample_of, said))
+        self.stored: RobotState | None = None
+
+    def subscribe(self, name: str) -> Any:
+        return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
+
+    def ask(self, name: str, take: Any) -> None:
+        if self.stored is not None:
+            take(sample_of(self.stored))
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        """It is dead."""
+
+
+def sample_of(state: RobotState) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
+    return SimpleNamespace(encoding="application/json", payload=payload)
+
+
+def heard_after(robot: Any, seconds: float, monkeypatch: pytest.MonkeyPatch) -> float:
+    """The age that is shown so long after the begin, s."""
+    now = [100.0]
+    monkeypatch.setattr(drive, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    ride = Ride(robot, Teleop(0.5, 2.0), "acsar", "tcp/127.0.0.1:7448")
+    while now[0] < 100.0 + seconds:
+        ride.take()
+        now[0] += 0.05
+    return ride.seen().age
+
+
+@pytest.mark.parametrize("said", [(STATE,), ()], ids=["it died on the way", "it is long dead"])
+def test_what_a_storage_still_has_of_a_dead_robot_is_no_news(
+    said: tuple[RobotState, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot(*said)
+    robot.stored = STATE
+    assert heard_after(robot, 10 * ASK_S, monkeypatch) == pytest.approx(10 * ASK_S, abs=0.11)
+
+
+def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Answers(Robot):
+        def ask(self, name: str, take: Any) -> None:
+            before = self.stored or STATE
+            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
+            super().ask(name, take)
+
+    assert heard_after(Answers(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
 
 
 # without a screen
