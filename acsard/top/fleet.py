@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from threading import Lock
 
 import zenoh
@@ -11,6 +13,7 @@ import zenoh
 from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
+from acsard.client.driving import newer
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState
 from acsard.messages.topics import full_key
@@ -19,6 +22,11 @@ from acsard.top.seen import SILENT_S
 
 ASK_S = 2.0
 """A robot that is there and says nothing is asked again so often."""
+
+SILENCE_S = SILENT_S + ASK_S
+"""An answer may be so late, and no later."""
+
+NEVER = -math.inf
 
 MOST = 1000
 """Robots; a stranger may invent names."""
@@ -29,9 +37,12 @@ class _Known:
 
     def __init__(self) -> None:
         self.here = False
-        self.said: tuple[RobotState | None, float] = None, 0.0
-        """Its state and when that came: one value, since another thread reads it."""
-        self.asked = 0.0
+        self.since = time.monotonic()
+        """When it came, or we began to look for it."""
+        self.said: tuple[RobotState | None, float] = None, NEVER
+        """Its state and when that came: one value, since another thread reads it. `NEVER`: a first
+        answer, which may be a storage's."""
+        self.asked = NEVER
         self.version = ""
 
 
@@ -55,17 +66,20 @@ class Fleet:
             sample = self._samples.try_recv()
             if sample is None:
                 break
-            self._state(sample)
+            self._state(sample, asked=False)
         now = time.monotonic()
         with self._lock:
             known = list(self._known.items())
         rows = []
         for name, one in known:
             state, heard = one.said
-            if now - max(heard, one.asked) > ASK_S or (one.here and not one.version):
+            unheard = one.here and (heard == NEVER or not one.version)
+            if now - max(heard, one.asked) > ASK_S or unheard:
                 self._ask(name, one, now)
+            if one.here and heard == NEVER and now - one.since < SILENCE_S:
+                state = None  # the robot itself may speak yet
             age = max(0.0, now - heard)
-            rows.append(Row(name, one.here, state, age, one.version, SILENT_S + ASK_S))
+            rows.append(Row(name, one.here, state, age, one.version, SILENCE_S))
         return rows
 
     @property
@@ -75,7 +89,7 @@ class Fleet:
         with self._lock:
             known = list(self._known.values())
         named = ALL not in self._ids
-        return named and all(one.here and one.version and one.said[0] for one in known)
+        return named and all(one.here and one.version and one.said[1] > NEVER for one in known)
 
     @property
     def seen(self) -> str:
@@ -100,7 +114,7 @@ class Fleet:
             return
         one.asked = now
         other = self._robot.like(name)
-        other.ask("state", self._state)
+        other.ask("state", partial(self._state, asked=True))
         other.ask("info", self._info)
 
     def _of(self, sample: zenoh.Sample) -> _Known | None:
@@ -117,17 +131,23 @@ class Fleet:
         one = self._of(sample)
         if one is not None:
             one.here = sample.kind == zenoh.SampleKind.PUT
+            one.since = time.monotonic()
             if not one.here:
                 one.version = ""  # it may come back as another
 
-    def _state(self, sample: zenoh.Sample) -> None:
+    def _state(self, sample: zenoh.Sample, asked: bool) -> None:
         try:
             state = self._states.decode(*encoded(sample))
         except DecodeError:
             return  # of another version: shown as silent
         one = self._of(sample)
-        if one is not None:
+        if one is None:
+            return
+        held = one.said[0]
+        if not asked or newer(state, held):
             one.said = state, time.monotonic()
+        elif held is None:
+            one.said = state, NEVER
 
     def _info(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)

@@ -32,7 +32,7 @@ class Row(Struct, frozen=True):
     """Its daemon runs."""
     state: RobotState | None
     age: float
-    """Since `state` came, s."""
+    """Since `state` came, s; inf when only an answer that may be a storage's has."""
     version: str
     silence: float = SILENT_S
     """The age from which on it is no news any more, s."""
@@ -76,6 +76,8 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _age(seconds: float) -> str:
+    if seconds == math.inf:
+        return "never"
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     for size, unit in ((1.0, "s"), (60.0, "min"), (3600.0, "h")):

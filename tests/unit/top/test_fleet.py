@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from itertools import count
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from acsard.messages.encodings import encode
-from acsard.messages.schema import Info, Message
+from acsard.messages.schema import Info, Message, Time
 from acsard.top import fleet as fleets
-from acsard.top.fleet import Fleet
+from acsard.top.fleet import ASK_S, Fleet
+from acsard.top.roster import table
 from tests.unit.top.screens import STATE
 
 
@@ -34,6 +37,19 @@ class Session:
         self.tell(SimpleNamespace(key_expr=f"acsard/{name}/alive", kind=kind))
 
 
+class Clock:
+    """Stands still until it is set."""
+
+    now = 1000.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(fleets, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    return clock
+
+
 @pytest.fixture
 def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     monkeypatch.setattr(fleets, "MOST", 3)
@@ -45,21 +61,24 @@ def fleet_of(
 ) -> Fleet:
     """Of robots of which some answer what they are asked."""
     robot: Any = SimpleNamespace(session=session)
+    stamps = count(2000)
     robot.like = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
-            payload = SimpleNamespace(to_bytes=lambda: encode(SAID[key], "json"))
-            full = f"acsard/{name}/{key}"
-            take(SimpleNamespace(key_expr=full, payload=payload, encoding="application/json"))
+            said = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
+            take(sample_of(name, key, said[key]))
 
     return Fleet(robot, ids, "tcp/127.0.0.1:7448")
 
 
-SAID: dict[str, Message] = {
-    "state": STATE,
-    "info": Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[]),
-}
+def sample_of(name: str, key: str, said: Message) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(said, "json"))
+    full = f"acsard/{name}/{key}"
+    return SimpleNamespace(key_expr=full, payload=payload, encoding="application/json")
+
+
+INFO = Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[])
 
 
 def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) -> None:
@@ -92,12 +111,59 @@ def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
     ],
 )
 def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
-    session: Session, ids: tuple[str, ...], answering: tuple[str, ...], here: Sequence[str],
-    whole: bool,
+    session: Session, clock: Clock, ids: tuple[str, ...], answering: tuple[str, ...],
+    here: Sequence[str], whole: bool,
 ) -> None:  # fmt: skip
     fleet = fleet_of(session, ids, answering)
     assert not fleet.whole
     for name in here:
         session.comes(name)
-    fleet.rows()  # asks
+    for _ in range(2):  # asks: what a storage may have said, and what only the robot says
+        fleet.rows()
+        clock.now += ASK_S
     assert fleet.whole is whole
+
+
+class Remembers:
+    """A client of a router whose storage has this robot's last state, and may be told a newer."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.stored = session, STATE
+
+    def like(self, name: str) -> Remembers:
+        return self
+
+    def ask(self, key: str, take: Callable[[Any], object]) -> None:
+        if key == "state":
+            take(sample_of("robot1", key, self.stored))
+
+
+def told(fleet: Fleet, clock: Clock, seconds: float) -> str:
+    """The line of its robot, looked at for so long."""
+    for _ in range(int(seconds / 0.25)):
+        fleet.rows()
+        clock.now += 0.25
+    return table(fleet.rows(), 120)[1]
+
+
+def test_a_robot_whose_state_only_a_storage_still_has_is_gone_and_not_heard(
+    session: Session, clock: Clock
+) -> None:
+    robot: Any = Remembers(session)
+    line = told(Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448"), clock, 20.0)
+    assert "never" in line
+    assert line.endswith("GONE, was: commanded by app")
+
+
+def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
+    session: Session, clock: Clock
+) -> None:
+    robot: Any = Remembers(session)
+    fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
+    session.comes("robot1")
+    assert told(fleet, clock, 0.5).endswith("waiting for its state")
+    assert told(fleet, clock, 5.0).endswith("SILENT, was: commanded by app")
+    robot.stored = replace(STATE, stamp=Time(1001))
+    assert told(fleet, clock, 2.5).endswith("commanded by app")
+    assert "SILENT" not in told(fleet, clock, 0.0)
+    assert told(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
