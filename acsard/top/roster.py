@@ -15,8 +15,11 @@ SILENT_S = 2.0
 
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")
 
-ROOM = (12, 8, 6, 7, 10, 6)
-"""At most so wide each but the last, which has what is left."""
+ROOM = (32, 8, 6, 7, 10, 6)
+"""At most so wide each but the last, which has what is left; the first is the longest id."""
+
+NAME, WHY = 12, 20
+"""So much of the last column is kept free of a long name, unless that gets narrower than this."""
 
 NARROW = (0, 1, 2, 5, 6)
 """The columns that a narrow terminal has, below `WIDE`."""
@@ -42,15 +45,38 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     """Heads and a line for each robot, at most `width` long and `height` many."""
     shown = range(len(HEADS)) if width >= WIDE else NARROW
     cells = [HEADS, *map(told, sorted(rows, key=lambda row: row.robot_id))]
-    rooms = [min(ROOM[n], max(len(row[n]) for row in cells)) for n in range(len(ROOM))]
+    widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
+    rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
+    rest = sum(rooms[n] + 2 for n in shown[1:])
+    rooms[0] = min(rooms[0], max(NAME, width - rest))
     lines = [
-        "  ".join([*(row[n][: rooms[n]].ljust(rooms[n]) for n in shown[:-1]), row[-1]]).rstrip()
-        for row in cells
+        "  ".join(
+            [name.ljust(rooms[0])]
+            + [row[n][: rooms[n]].ljust(rooms[n]) for n in shown[1:-1]]
+            + [row[-1]]
+        ).rstrip()
+        for name, row in zip(shortened([row[0] for row in cells], rooms[0]), cells, strict=True)
     ]
     cut = [line if len(line) <= width else f"{line[: width - 1]}…" for line in lines]
     if height is None or len(cut) <= height:
         return cut
     return [*cut[: max(1, height - 1)], f"and {len(cut) - height + 1} more"[:width]][:height]
+
+
+def shortened(names: Sequence[str], room: int) -> list[str]:
+    """At most `room` long: what is left out is the middle, or where fewer then look the same."""
+    if all(len(name) <= room for name in names):
+        return list(names)
+
+    def cut(head: int) -> list[str]:
+        tail = room - 1 - head
+        return [
+            name if len(name) <= room else f"{name[:head]}…{name[len(name) - tail :]}"
+            for name in names
+        ]
+
+    from_the_middle = sorted(range(room), key=lambda head: abs(2 * head - room + 1))
+    return max(map(cut, from_the_middle), key=lambda found: len(set(found)))
 
 
 def told(row: Row) -> tuple[str, ...]:

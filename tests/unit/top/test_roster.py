@@ -46,6 +46,36 @@ def test_a_narrow_terminal_has_what_matters_most() -> None:
     assert "driving" in line
 
 
+@pytest.mark.parametrize("width", [40, 80, 160])
+@pytest.mark.parametrize(
+    "ids",
+    [
+        ("warehouse-west-1", "warehouse-west-2"),
+        ("1-of-the-robots-in-the-warehouse", "2-of-the-robots-in-the-warehouse"),
+        ("robots-in-the-warehouse-west-0-1", "robots-in-the-warehouse-west-0-2"),
+        ("left-robot-of-the-warehouse-west", "left-robot-of-the-warehouse-east"),
+        ("warehouse1-of-the-north-and-west", "warehouse2-of-the-north-and-west"),
+    ],
+)
+def test_two_robots_look_different_at_every_width(ids: tuple[str, str], width: int) -> None:
+    first, second = (line.split()[0] for line in table(rows_of(*ids), width)[1:])
+    assert first != second
+    if width == 160 or (width == 80 and len(ids[0]) == 16):
+        assert [first, second] == sorted(ids)
+
+
+def test_of_a_narrow_name_the_middle_is_left_out_and_why_keeps_its_room() -> None:
+    shown = table(rows_of("warehouse-west-1", "warehouse-west-2"), 40)
+    assert [line.split()[0] for line in shown[1:]] == ["wareh…west-1", "wareh…west-2"]
+    wide = table(rows_of("robots-in-the-warehouse-west-0-1"), 80)[1]
+    assert wide.endswith("commanded by app")
+    assert len(wide) == 80
+
+
+def rows_of(*ids: str) -> list[Row]:
+    return [replace(ROW, robot_id=one) for one in ids]
+
+
 def test_more_robots_than_lines_are_counted() -> None:
     rows = [replace(ROW, robot_id=f"robot{n}") for n in range(10)]
     shown = table(rows, 80, 5)
