@@ -26,6 +26,9 @@ NARROW = (0, 1, 2, 5, 6)
 
 WIDE = 72
 
+URGENT = ("fault", "stopped", "GONE", "SILENT")
+"""What needs a person, and is above the others, whose lines may be too many."""
+
 
 class Row(Struct, frozen=True):
     """What is known of one robot."""
@@ -42,9 +45,9 @@ class Row(Struct, frozen=True):
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Heads and a line for each robot, at most `width` long and `height` many."""
+    """Heads and a line for each robot, at most `width` long and `height` many, the urgent first."""
     shown = range(len(HEADS)) if width >= WIDE else NARROW
-    cells = [HEADS, *map(told, sorted(rows, key=lambda row: row.robot_id))]
+    cells = [HEADS, *map(told, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
     rest = sum(rooms[n] + 2 for n in shown[1:])
@@ -86,10 +89,8 @@ def told(row: Row) -> tuple[str, ...]:
         why = "waiting for its state" if row.here else "not there"
         return (name, "-", "-", "-", printable(row.version) or "-", "never", why)
     state, why = row.state, reason(row.state)
-    if not row.here:
-        why = f"GONE, was: {why}"
-    elif row.age > row.silence:
-        why = f"SILENT, was: {why}"
+    if absence := _absence(row):
+        why = f"{absence}, was: {why}"
     return (
         name,
         printable(state.mode),
@@ -99,6 +100,18 @@ def told(row: Row) -> tuple[str, ...]:
         _age(row.age),
         why,
     )
+
+
+def _absence(row: Row) -> str:
+    if not row.here:
+        return "GONE"
+    return "SILENT" if row.state is not None and row.age > row.silence else ""
+
+
+def _order(row: Row) -> tuple[int, str]:
+    """What it is now comes before what it was."""
+    what = _absence(row) or ("" if row.state is None else row.state.mode)
+    return URGENT.index(what) if what in URGENT else len(URGENT), row.robot_id
 
 
 def _age(seconds: float) -> str:

@@ -76,6 +76,29 @@ def rows_of(*ids: str) -> list[Row]:
     return [replace(ROW, robot_id=one) for one in ids]
 
 
+IN_NEED = {
+    "fault": replace(ROW, state=replace(STATE, mode="fault", reason="fault: a wheel is stuck")),
+    "stopped": replace(ROW, state=replace(STATE, mode="stopped", reason="stopped by request")),
+    "gone": replace(ROW, here=False, age=90.0),
+    "silent": replace(ROW, age=7.0),
+    "not there": replace(ROW, state=None, here=False),
+}
+
+
+@pytest.mark.parametrize("need", IN_NEED)
+def test_of_more_robots_than_lines_the_one_that_needs_a_person_is_shown(need: str) -> None:
+    rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
+    shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
+    assert shown[1].startswith("robot99")
+    assert [line.split()[0] for line in shown[2:-1]] == [row.robot_id for row in rows[:19]]
+
+
+def test_a_robot_in_fault_is_before_those_that_are_off() -> None:
+    rows = [replace(row, robot_id=str(9 - n)) for n, row in enumerate(IN_NEED.values())]
+    names = [line[0] for line in table([*rows, ROW], 120)[1:]]
+    assert names == ["9", "8", "5", "7", "6", "r"]
+
+
 def test_more_robots_than_lines_are_counted() -> None:
     rows = [replace(ROW, robot_id=f"robot{n}") for n in range(10)]
     shown = table(rows, 80, 5)
