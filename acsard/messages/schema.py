@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from acsard.drive.modes import Mode
 from acsard.mcu.link_state import State
 from acsard.messages.topics import Direction
-from acsard.values import NS_PER_S, EventName, GyroDoes, Level, Plain
+from acsard.values import NS_PER_S, ROLES, EventName, GyroDoes, Level, Plain
 
 # What `cdr.py` has to know: the width of an int in CDR, the length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -371,8 +371,8 @@ class Topics(Message, frozen=True):
 class WhoAmI(Message, frozen=True):
     """Who asks, as the daemon sees it."""
 
-    role: str
-    """At least this, by the access rules: `viewer`, `operator` or `maintainer`."""
+    role: Annotated[str, one_of(ROLES)]
+    """At least this, by the access rules."""
     sender: str
     """The name he gives himself, and the way he came, as the log has it."""
 

@@ -22,7 +22,7 @@ from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.report import Report
 from acsard.messages.schema import MESSAGES, Info, Message, ServiceReply
 from acsard.messages.topics import PUBLISHED, TOPICS
-from acsard.values import GyroDoes
+from acsard.values import GyroDoes, Role
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 INCOMING = {"Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Settings", "DoorState"}
@@ -94,6 +94,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
         ("Interfaces", "HardwareInterface", "kind", {"command", "state"}),
         ("Interfaces", "HardwareInterface", "unit", {"rad", "rad/s"}),
         ("Topics", "TopicInfo", "direction", {topic.direction for topic in TOPICS}),
+        ("WhoAmI", "", "role", set(get_args(Role))),
         ("Config", "LogConfig", "level", {"debug", "info", "warning", "error"}),
     ],
 )  # fmt: skip
