@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Change settings of the robot that runs, all or none: limits, timeouts, covariances, publishing
 rates, the log's level. They are checked as the file is, told in the log and on the key `config`,
-and gone with the next start unless --write puts them into the configuration file too. A lower speed
-limit is reached by the deceleration. Without a setting: list those that there are. Exit 1 when it
-is refused.
+and gone with the next start unless --write puts them into the configuration file too (all but
+a source's timeout: [[commands.sources]] is yours to write). A lower speed limit is reached by the
+deceleration. Without a setting: list those that there are. Exit 1 when it is refused.
 """
 
 

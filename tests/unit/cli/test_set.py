@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
+from acsard.cli import parser
 from acsard.cli.set import pairs
 from acsard.host.errors import UsageError
 
@@ -44,3 +48,15 @@ def test_several_settings_are_pairs_one_after_the_other() -> None:
 def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
     with pytest.raises(UsageError, match=r"acsard set KEY VALUE"):
         pairs(["limits.linear_speed"])
+
+
+def test_the_help_and_the_ros_page_say_what_write_does_not_write(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A source's timeout is set and refused with --write."""
+    with pytest.raises(SystemExit):
+        parser().parse_args(["set", "--help"])
+    page = (Path(__file__).parents[3] / "deploy" / "ros2" / "README.md").read_text()
+    exception = r"--write`?[^.]*file[^.]* a source's timeout[^.]*\[\[commands\.sources"
+    for told in (capsys.readouterr().out, page):
+        assert re.search(exception, " ".join(told.split()))
