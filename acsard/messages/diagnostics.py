@@ -7,6 +7,8 @@ should know of; ERROR is what keeps it from driving.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from msgspec import Struct
 
 from acsard.config.settings import Config
@@ -37,8 +39,7 @@ REFUSED_S = 2.0
 MISSED_SHARE = 0.01
 """Of the last minute's periods; more are a warning."""
 
-
-NO_ROUTER = "a peer, no router"
+NO_ROUTER, NOT_YET = "a peer, no router", "not looked at yet"
 
 
 class Row(Struct, frozen=True):
@@ -62,7 +63,7 @@ def diagnostics(
         _commands(outputs, snapshot),
         _wheels(snapshot.doubt, snapshot.counters),
         *_gyro(config, snapshot.gyro),
-        *_routers(snapshot.routers),
+        *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
         *([Row("certificate", *certificate, {})] if certificate[1] else []),
     ]
@@ -153,12 +154,14 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
     return [Row("gyro", level, WORDS[gyro.does] + track, values)]
 
 
-def _routers(routers: RoutersStatus) -> list[Row]:
+def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
     """The row of what `bus.connect` names, none where it names nothing."""
     missing, peers = routers.missing, routers.peers
-    values = dict.fromkeys(routers.connected, "connected") | dict.fromkeys(missing, "not connected")
-    values |= dict.fromkeys(peers, NO_ROUTER)
+    values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
+    values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
     words = f"not connected to {', '.join(missing)}" if missing else "connected"
+    if NOT_YET in values.values():
+        words = NOT_YET
     if peers:
         words += f"; {', '.join(peers)} is no router: who connects here sees this robot only"
     return [Row("router", WARN if missing or peers else OK, words, values)] if values else []

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, ControlConfig, McuConfig, RobotConfig
+from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 from acsard.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.messages.schema import DiagnosticStatus
-from acsard.values import GyroStatus, Measured, Outputs, Snapshot, Spread
+from acsard.values import GyroStatus, Measured, Outputs, RoutersStatus, Snapshot, Spread
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
@@ -60,6 +60,16 @@ def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
         *(one.name for one in rows()),
         "acsard: gyro",
     ]
+
+
+def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:
+    """That takes half a second, and the monitor would see a row come."""
+    config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
+    one = row("router", config)
+    assert (one.level, one.message) == (OK, "not looked at yet")
+    assert values(one) == {"tcp/a:7447": "not looked at yet"}
+    looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
+    assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
 
 
 # mode
