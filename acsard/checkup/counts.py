@@ -51,6 +51,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         counts, how = named, "by its identification; not measured"
     elif not named:
         near = abs(measured - configured) <= AGREES * configured
+        if board.lost and not near:
+            return manual.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
         how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
     elif abs(measured - named) > AGREES * named:

@@ -188,7 +188,7 @@ FAIL wheel map: twice
 SKIPPED encoder counts: none
     the firmware sends no counts
 SKIPPED encoder counts: damaged
-    {share:.0%} of the lines are lost: what the rest says of the counts is no measure
+    {share:.1%} of the lines are lost: what the rest says of the counts is no measure
 SKIPPED encoder counts: not turned
     too little was turned to measure them
 FAIL encoder counts: backward | {measured:.0f} per turn

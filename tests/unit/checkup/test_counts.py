@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from acsard.checkup import counts
+from acsard.checkup import counts, loss
 from acsard.checkup.dialect import check, identity
 from acsard.checkup.motion import Reply
 from acsard.checkup.turning import turn
@@ -106,3 +106,25 @@ def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None
                          for n, r in enumerate(replies(3200))]  # fmt: skip
         finding = counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})
+
+
+@pytest.mark.parametrize(
+    ("configured", "verdict", "keys"),
+    [
+        (0, "SKIPPED", {}),
+        (1600, "SKIPPED", {}),
+        (3210, "PASS", {"mcu.encoder_counts": 3210}),
+    ],
+)
+def test_where_lines_are_lost_no_counts_are_proposed_but_those_that_are_configured(
+    configured: int, verdict: str, keys: dict[str, object]
+) -> None:
+    with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
+        board.sampled, board.lost = True, loss.MOST / 4
+        board.replies = replies(3200)
+        finding = counts.finding(board, [0])
+        assert (finding.verdict, finding.keys) == (verdict, keys)
+        if verdict == "SKIPPED":
+            assert "0.5% of the lines are lost" in finding.text
+        board.identity = {"counts": "3200"}  # what the board names itself is no measure
+        assert counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
