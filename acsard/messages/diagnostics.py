@@ -39,7 +39,7 @@ REFUSED_S = 2.0
 MISSED_SHARE = 0.01
 """Of the last minute's periods; more are a warning."""
 
-NO_ROUTER, NOT_YET = "a peer, no router", "not looked at yet"
+NO_ROUTER, NOT_YET = "a peer, no router", "not connected yet"
 
 
 class Row(Struct, frozen=True):

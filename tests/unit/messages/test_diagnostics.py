@@ -66,8 +66,8 @@ def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() ->
     """That takes half a second, and the monitor would see a row come."""
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
     one = row("router", config)
-    assert (one.level, one.message) == (OK, "not looked at yet")
-    assert values(one) == {"tcp/a:7447": "not looked at yet"}
+    assert (one.level, one.message) == (OK, "not connected yet")
+    assert values(one) == {"tcp/a:7447": "not connected yet"}
     looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
     assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
 
