@@ -35,6 +35,8 @@ from tests.system.harness import (
     Daemon,
     Finished,
     Program,
+    Tables,
+    client_config,
     free_endpoint,
     kept_waiting,
     silences,
@@ -408,6 +410,40 @@ def test_a_drive_without_its_daemon_raises(tmp_path: Path) -> None:
             with pytest.raises(NoAnswerError, match="no word from the daemon"):
                 robot.drive(0.3, seconds=30.0)
             killing.result()
+
+
+@pytest.mark.slow
+def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_path: Path) -> None:
+    endpoint, last = free_endpoint(), list[zenoh.Sample]()
+
+    def answer(query: zenoh.Query) -> None:
+        answered.append(True)
+        for one in last[-1:]:
+            query.reply(one.key_expr, one.payload, encoding=one.encoding, timestamp=one.timestamp)
+
+    answered: list[bool] = []
+    with ExitStack() as stack:
+        router = stack.enter_context(zenoh.open(client_config(endpoint, "router")))
+        kept: list[Any] = [
+            router.declare_subscriber("acsard/acsar/state", last.append),
+            router.declare_queryable("acsard/acsar/state", answer),
+        ]
+        listen: Tables = {"bus": {"listen": [free_endpoint()], "connect": [endpoint]}}
+        daemon = stack.enter_context(Daemon(tmp_path, config=listen))
+        until(lambda: bool(last), 10.0, "connected")
+        robot, bus = stack.enter_context(connect(endpoint)), stack.enter_context(Bus(endpoint))
+
+        def kill() -> None:
+            until(lambda: bus.state()["linear"] > 0.1, 10.0, "driving")
+            daemon.signal(signal.SIGKILL)
+
+        killing = stack.enter_context(ThreadPoolExecutor(1)).submit(kill)
+        with pytest.raises(NoAnswerError, match="no word from the daemon"):
+            robot.drive(0.3, seconds=4.0)
+        killing.result()
+        assert answered
+        for one in kept:
+            one.undeclare()
 
 
 def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
