@@ -6,6 +6,7 @@ Write the table anew with `python -m tests.test_readme`.
 from __future__ import annotations
 
 import re
+import tomllib
 from argparse import _SubParsersAction
 from pathlib import Path
 
@@ -34,6 +35,15 @@ def test_every_verb_named_in_the_readme_exists() -> None:
     (verbs,) = [a.choices for a in parser()._actions if isinstance(a, _SubParsersAction)]
     named = set(re.findall(r"^\$ acsard ([a-z]+)|`acsard ([a-z]+)[ `]", README.read_text(), re.M))
     assert {a or b for a, b in named} <= set(verbs)
+
+
+def test_every_extra_is_named_on_a_page() -> None:
+    """Who reads learns of what it brings."""
+    root = README.parent
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    pages = "".join(page.read_text() for page in (README, *root.glob("deploy/*/README.md")))
+    for extra in extras["optional-dependencies"]:
+        assert re.search(rf"`{extra}`|\[(\w+,)*{extra}(,\w+)*\]", pages), extra
 
 
 def test_no_placeholder_waits_for_its_text() -> None:
