@@ -206,7 +206,8 @@ class _Watch:
             self._unreadable = True
             return
         if asked and not newer(state, self.state):
-            self.state = self.state or state  # the first may be a storage's: the next tells
+            if self.state is None:  # the first may be a storage's: another, at once, tells
+                self.state, self._asked = state, self.heard
             return
         self.state, self.heard = state, time.monotonic()
         self.objection = objection(state, self._robot.source, self._robot.sender)

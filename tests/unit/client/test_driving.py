@@ -141,7 +141,7 @@ def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
 def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.published = False
-    assert world.drive(monkeypatch) < 2.6
+    assert world.drive(monkeypatch) < 2.0
     assert world.sent.count(0.5) in (20, 21)
     assert world.asked < 12
 
