@@ -242,6 +242,23 @@ def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Pho
     page.shows("told", "another button is down")
 
 
+COARSE = """(() => {
+    const now = performance.now.bind(performance);
+    performance.now = () => Math.floor(now() / 100) * 100;
+})();1"""
+"""The clock of a browser that tells nobody the time exactly."""
+
+
+def test_a_browser_whose_clock_stands_for_a_tenth_of_a_second_drives_and_lets_go(
+    page: Phone,
+) -> None:
+    page.browser.js(COARSE)
+    page.hold()
+    page.browser.touch("End")
+    page.bus.at_rest()
+    assert not page.server.refused().get("replayed", 0)
+
+
 JAM = """(() => {
     const send = WebSocket.prototype.send;
     window.sent = [];
