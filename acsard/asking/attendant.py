@@ -124,18 +124,10 @@ class Person:
 @contextmanager
 def attending() -> Iterator[Person]:
     """A person whose keys come one by one; the terminal is left as it was."""
-    import termios
-    import tty
+    from acsard.host.one_by_one import one_by_one
 
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin)
-    try:
+    with one_by_one():
         yield Person()
-    finally:
-        try:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-        except (OSError, termios.error):
-            pass  # the terminal has been closed
 
 
 @contextmanager

@@ -194,6 +194,10 @@ class _Steps:
                 break
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
+            if ends and board.armed:
+                # Of this computer's making or not: nobody turns a motor again behind that.
+                found, board.known = told, known
+                break
         else:
             found, board.known = told, known
         if found is not None and ends:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -44,6 +45,20 @@ TIMED_OUT = "Timeout"
 """What Zenoh says in the place of one who heard the question and did not answer in time."""
 
 
+class _Puts:
+    """Of one connection: the daemon takes 1000 commands a second of it on a key, so a zero on the
+    heels of another command, be it of somebody else who shares it, would be lost."""
+
+    def __init__(self) -> None:
+        self._lock, self._last_s = threading.Lock(), 0.0
+
+    def wait(self) -> None:
+        """Until one may go."""
+        with self._lock:
+            time.sleep(max(0.0, self._last_s + SPACING_S - time.monotonic()))
+            self._last_s = time.monotonic()
+
+
 class Client:
     """A connection to one robot; make it with `connect`."""
 
@@ -60,7 +75,7 @@ class Client:
         self.name = own_name()
         """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
-        self._put_s = 0.0
+        self._puts = _Puts()
         self.sender, self._sequence = _name(session), 0
         started = clock.now()
         # The wall clock may be set while we drive; stamps that jump would be refused as stale.
@@ -69,7 +84,7 @@ class Client:
     def like(self, robot_id: str) -> Client:
         """The same connection, to another robot behind it."""
         other = Client(self.session, robot_id, self.source, self._tls, self._endpoint)
-        other.name = self.name
+        other.name, other._puts = self.name, self._puts
         return other
 
     def key(self, name: str) -> str:
@@ -174,10 +189,7 @@ class Client:
             raise _no_key(name) from None
 
     def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
-        # The daemon takes 1000 commands a second on a key: a zero on the heels of another command
-        # would be lost.
-        time.sleep(max(0.0, self._put_s + SPACING_S - time.monotonic()))
-        self._put_s = time.monotonic()
+        self._puts.wait()
         if stamp_ns is None:
             stamp_ns = clock.mono_ns() + self._wall_offset_ns
         message = schema.TwistStamped(

@@ -202,8 +202,8 @@ class Voice(Struct, frozen=True):
 def voice(arrival: Arrival) -> Voice:
     """By our attachment, else rmw's, else Zenoh's timestamp, else just the key.
 
-    All that have nothing but a key are one, and so are all ROS nodes behind a bridge, which says
-    nothing of them. Raises `DecodeError`.
+    All that have nothing but a key are one, so are all ROS nodes behind a bridge, which says
+    nothing of them, and all that a router stamps. Raises `DecodeError`.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -213,7 +213,8 @@ def voice(arrival: Arrival) -> Voice:
         stamp_ns = arrival.stamp_ns if told.stamp is None else told.stamp
         return Voice(told.sender, stamp_ns, told.sequence)
     if arrival.sender:
-        return Voice(arrival.sender, arrival.stamp_ns, shared=arrival.via == "bridge")
+        # A router stamps what has no time; so does a program of its own: who can tell?
+        return Voice(arrival.sender, arrival.stamp_ns, shared=True)
     key = arrival.key.partition("/")[2]
     return Voice(f"{arrival.via}/{key}", arrival.stamp_ns, shared=True)
 

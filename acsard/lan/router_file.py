@@ -17,6 +17,9 @@ from acsard.values import ROLES, Role
 EXAMPLE = "robot1"
 """The robot that the file is for as it is."""
 
+IS_FOR = "// It is for {}. For yours:\n"
+"""What its head says."""
+
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
@@ -35,6 +38,7 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
         )
     # A function, since an id or a name may look like a reference to a group.
     text = _BLOCK.sub(lambda block: "".join(_for(one, block[1]) for one in robots), template)
+    text = text.replace(IS_FOR.format(EXAMPLE), IS_FOR.format(", ".join(robots)))
     for role in ROLES:
         listed = ", ".join(json.dumps(name) for name in (role, *people.get(role, ())))
         text = text.replace(f'cert_common_names: ["{role}"]', f"cert_common_names: [{listed}]")

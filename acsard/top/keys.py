@@ -7,11 +7,11 @@ import os
 import select
 import signal
 import sys
-import termios
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from acsard.host.one_by_one import one_by_one
 
 LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -64,12 +64,5 @@ def keys() -> Iterator[Callable[[float], str | None]]:
     if not sys.stdin.isatty():
         yield nobody
         return
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin)
-    try:
+    with one_by_one():
         yield read
-    finally:
-        try:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-        except (OSError, termios.error):
-            pass  # the terminal has been closed

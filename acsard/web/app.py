@@ -22,7 +22,7 @@ from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
-from acsard.web.limits import Seats, Tries
+from acsard.web.limits import REQUESTS_HZ, Paces, Seats, Tries
 from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports
 from acsard.web.requests import (
@@ -49,6 +49,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 OPEN = ("/", "/token", "/favicon.ico")
 """For everybody: a page has to be there before it can say who shows it."""
+
+STOP = "/api/srv/stop"
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """What aiohttp refuses by itself; anything else is malformed."""
@@ -78,7 +80,7 @@ class Page:
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
         self._files, self._reports = Files(page), Reports()
         self._programs = Programs(robots, calls, counts, self._reports)
-        self._tries = Tries()
+        self._tries, self._paces = Tries(), Paces()
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
         self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
@@ -150,6 +152,9 @@ class Page:
                 who = here if spot == "here" else await self._known(asked.peer, shown)
                 if isinstance(who, Refusal):
                     return self.refused(who, asked.peer)
+                if self._hurries(request, who):
+                    text = f"over {REQUESTS_HZ:g} requests a second: /ws tells what changes"
+                    return self.refused(Refusal("too_fast", text), who.origin)
                 request[WHO] = who
             return await handler(request)
         except TimeoutError:
@@ -163,6 +168,12 @@ class Page:
             origin = asked.peer if known is None else known.origin
             self._counts.refuse(REASONS.get(error.status, "malformed"), origin)
             return problem(error.status, _WORDS.get(error.status, error.reason))
+
+    def _hurries(self, request: web.Request, who: Who) -> bool:
+        """He asks for more than he may have; whoever is at the machine may, and a stop always."""
+        if not who.token or request.path == STOP:
+            return False
+        return not self._paces.take(who.token, clock.mono_ns())
 
     async def _known(self, peer: str, shown: Sequence[str]) -> Who | Refusal:
         """Whose the first of these tokens is that counts; raises `TimeoutError` where they cannot

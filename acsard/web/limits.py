@@ -13,6 +13,9 @@ MESSAGES_HZ, MESSAGES_AT_ONCE = 200.0, 400.0
 OVERRUNS = 600
 """So many messages too many end a connection."""
 
+REQUESTS_HZ, REQUESTS_AT_ONCE = 50.0, 200.0
+"""Of one token, by HTTP; a page asks for twenty when it opens, and then now and then."""
+
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
 """WebSockets of who comes from elsewhere: in all, of one address, with one token from wherever,
 and with one token from one address. So a program that opens one after the other shuts out nobody
@@ -46,6 +49,20 @@ class Bucket:
             return False
         self._left -= 1.0
         return True
+
+
+class Paces:
+    """A bucket for each token."""
+
+    def __init__(self) -> None:
+        self._buckets: dict[str, Bucket] = {}
+
+    def take(self, token: str, now_ns: int) -> bool:
+        """One more request: is there room?"""
+        bucket = self._buckets.get(token)
+        if bucket is None:
+            bucket = self._buckets[token] = Bucket(REQUESTS_HZ, REQUESTS_AT_ONCE, now_ns)
+        return bucket.take(now_ns)
 
 
 class Tries:

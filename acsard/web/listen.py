@@ -75,6 +75,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     address before a name: not every phone asks by mDNS.
     """
     found: list[str] = []
+    older_ports = _older_ports(listen)
     for one in listen:
         if not one.secure:
             continue
@@ -83,7 +84,8 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
             certified = names_in(tls)
             own = [at for at in own_addresses() if at in certified]
             # Not every network has IPv6, and 0.0.0.0 is not reached by it.
-            older = [at for at in own if ":" not in at]
+            both = one.host != EVERYWHERE_6 or one.port not in older_ports
+            older = [at for at in own if ":" not in at and both]
             newer = [at for at in own if ":" in at and one.host == EVERYWHERE_6]
             hosts = [*older, *newer, own_name()]
         found += [one.url_at(host) for host in hosts]
@@ -109,8 +111,13 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """A socket at each, or at one of the next ports; raises `InUseError`."""
-    older = {one.port for one in listen if ":" not in one.host}
-    return [_bound(one, next_port, one.port not in older) for one in listen]
+    older_ports = _older_ports(listen)
+    return [_bound(one, next_port, one.port not in older_ports) for one in listen]
+
+
+def _older_ports(listen: Sequence[Listen]) -> set[int]:
+    """Those that somebody has by IPv4: `::` has them by IPv6 alone."""
+    return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:

@@ -30,6 +30,10 @@ KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
 
 DECLARE_S = 3.0
 
+STATE = "state"
+"""Comes by itself, all the time. Asked for it, a router's storage has the last one of a robot that
+is off for a week."""
+
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """A bus that is stuck, or a session that has ended: later there may be a way again."""
 
@@ -122,6 +126,8 @@ class Streams:
 
         def declare() -> Any:
             heard = client.listen(key, own(stream.take))
+            if key == STATE:
+                return heard
             try:
                 client.ask(key, own(stream.answered))  # what is published seldom is there at once
             except zenoh.ZError:

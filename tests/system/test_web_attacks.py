@@ -6,6 +6,7 @@ With `-s` all of it is printed as a table.
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import time
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
 pytestmark = pytest.mark.network
 
 MOVED_M = 0.005
+"""Or rad."""
 
 
 class Table:
@@ -52,8 +54,9 @@ class Table:
             yield
             after, more = bus.comes_to("ready"), self._refused(bus, reason, by) - counted
         assert more >= times
-        moved = abs(after["x"] - before["x"])
-        assert moved < MOVED_M or not stands
+        moved = math.hypot(after["x"] - before["x"], after["y"] - before["y"])
+        turned = abs(math.remainder(after["yaw"] - before["yaw"], math.tau))
+        assert max(moved, turned) < MOVED_M or not stands
         told = f"{more:.0f} x {reason}"
         missed = Periods.between(before, after).missed
         self.rows.append(
@@ -188,6 +191,30 @@ def test_who_asks_for_what_he_may_not_have_is_refused(
 
     with table.attack(what, str(status), reason):
         assert asyncio.run(asked()) == status
+
+
+def test_who_asks_without_end_is_slowed_down_and_may_stop(
+    table: Table, bus: Bus, tokens: dict[str, str]
+) -> None:
+    async def asked() -> tuple[set[int], int]:
+        async with table.page.client(tokens["viewer"]) as session:
+
+            async def one(_: int) -> int:
+                async with session.get(f"{table.page.away}/api/state") as answer:
+                    return answer.status
+
+            seen = set[int]()
+            for _ in range(16):
+                seen |= set(await asyncio.gather(*map(one, range(50))))
+            async with session.post(f"{table.page.away}/api/srv/stop") as answer:
+                return seen, answer.status
+
+    with table.attack("800 questions at once", "429", "too_fast", 100):
+        seen, stopped = asyncio.run(asked())
+        assert bus.get("srv/clear")["success"]
+    assert seen <= {200, 429, 503}
+    assert {200, 429} <= seen
+    assert stopped == 200
 
 
 STOP = "POST /api/srv/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n"

@@ -119,10 +119,12 @@ class Riding:
     def step(self, now: float) -> Twist:
         """What is to be commanded at this time."""
         held_up, self._stepped = now - self._stepped, now
-        if not self.over and now - self._heard > SILENT_S:
-            # Who was not let run cannot tell whether the other spoke.
-            late = held_up > SILENT_S / 2
-            self._halt(HELD_UP if late else "no word from the daemon")
+        # Who was not let run cannot tell whether the daemon spoke; and the robot has braked, the
+        # time of a move may be over, and what comes next would not begin where it should.
+        if held_up > SILENT_S / 2 and self.phase is Phase.MOVING:
+            self._halt(HELD_UP)
+        elif now - self._heard > SILENT_S:
+            self._halt("no word from the daemon" if held_up <= SILENT_S / 2 else HELD_UP)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:

@@ -22,6 +22,7 @@ export class Drive {
   #push = [0, 0];
   #pressed = new Set();
   #pointer = null;
+  #stamp = 0; // of the last command, ms since 1970
   #padHeld = false;
   #padStrange = false; // and that was said
   state = null;
@@ -85,9 +86,11 @@ export class Drive {
     this.#told(why);
   }
 
-  /** What lets go goes whatever waits before it. */
+  /** What lets go goes whatever waits before it. Some browsers' clocks stand for 100 ms: of two
+   *  with one stamp the second, a zero maybe, would be taken for a repetition. */
   #send(cmd) {
-    const message = { cmd, stamp: performance.timeOrigin + performance.now() };
+    this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
+    const message = { cmd, stamp: this.#stamp };
     if (this.held) this.#link.send(message);
     else this.#link.urge(message);
   }

@@ -697,6 +697,32 @@ def test_a_board_that_falls_silent_is_not_excused() -> None:
     assert checked.failed == ["link"]
 
 
+def test_no_motor_is_turned_again_behind_a_silence() -> None:
+    """However late this computer was in it."""
+
+    class Sags(Busy):
+        silences = 0
+        silent_ns = 0
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            got = super().listen(until_ns)
+            if any(abs(speed) > 1.0 for speed in self.mcu.vehicle.speeds):
+                self.silences += self.now_ns() > self.silent_ns
+                self.silent_ns = self.now_ns() + 400 * MS
+            return [] if self.now_ns() < self.silent_ns else got
+
+    verdicts = []
+    turned = []
+    for late_s in (0.0, 0.03):
+        robot = Sags("plain_only", late_s=late_s, every=5)
+        checked = Checked(robot)
+        turned.append(robot.silences)
+        verdicts.append(checked["link"].verdict)
+        assert "watchdog" not in [found.name for found in checked.findings]
+    assert turned[0] == turned[1]
+    assert verdicts == ["FAIL", "WARN"]
+
+
 @pytest.mark.slow
 def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))

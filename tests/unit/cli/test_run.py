@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 import pytest
 
@@ -83,3 +84,16 @@ def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
     assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
     told = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
     assert f"acsard call stop{options} " in told
+
+
+def test_where_a_person_looks_on_the_page_is_served_unless_it_is_not_wanted_or_not_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("INVOCATION_ID", raising=False)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    words = run.page(Config(), "nowhere.toml")
+    assert words is not None
+    assert words[:3] == ["web", "--id", "acsar"]
+    assert run.page(Config(web=WebConfig(page=False)), "nowhere.toml") is None
+    monkeypatch.setattr(run, "find_spec", lambda name: None)  # the extra is not installed
+    assert run.page(Config(), "nowhere.toml") is None

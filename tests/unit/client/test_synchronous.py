@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from acsard import client
 from acsard.client import Client, NoAnswerError
 from acsard.client.driving import UnheardError
+from acsard.client.synchronous import SPACING_S
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.incoming.commands import Arrival, Receiver
@@ -62,6 +64,17 @@ def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Se
     assert before_ns <= stamps[0] + 1_000_000
     assert stamps == sorted(stamps)
     assert stamps[-1] <= time.time_ns() + 1_000_000
+
+
+def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -> None:
+    """What comes to the daemon within a millisecond of another on its key is left out."""
+    one = client_of(session)
+    other = one.like("acsar")
+    puts: list[float] = []
+    for each in (one, other) * 5:
+        each.send(0.0)
+        puts.append(time.monotonic())
+    assert min(b - a for a, b in itertools.pairwise(puts)) > SPACING_S / 2
 
 
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:

@@ -36,6 +36,10 @@ def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
 
 def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
     one, ten = made(["robot1"]), made(TEN)
+    for robots in (["robot1"], TEN):
+        assert f"// It is for {', '.join(robots)}. For yours:\n" in router_file(
+            TEMPLATE, robots, {}
+        )
     own = [rule for rule in one["rules"] if "robot1" in rule["id"]]
     assert len(ten["rules"]) == len(one["rules"]) + 9 * len(own)
     rules = {rule["id"]: rule for rule in ten["rules"]}

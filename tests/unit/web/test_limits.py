@@ -11,9 +11,11 @@ from acsard.web.limits import (
     CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
     CONNECTIONS_OF_TOKEN,
+    REQUESTS_AT_ONCE,
     TRIES,
     TRIES_OF_ONE,
     Bucket,
+    Paces,
     Places,
     Seats,
     Shares,
@@ -137,3 +139,11 @@ def test_the_page_tells_the_places_that_there_are() -> None:
         f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
     ) in told
     assert f"At the machine there is room for {CONNECTIONS_HERE}, " in told
+
+
+def test_each_token_has_a_pace_of_its_own() -> None:
+    paces = Paces()
+    taken = [paces.take("one", 0) for _ in range(int(REQUESTS_AT_ONCE) + 1)]
+    assert taken == [True] * int(REQUESTS_AT_ONCE) + [False]
+    assert paces.take("another", 0)
+    assert paces.take("one", NS_PER_S)

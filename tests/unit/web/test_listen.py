@@ -67,6 +67,12 @@ def test_an_invitation_has_the_own_certified_addresses_that_are_listened_at(
     assert told == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
 
 
+def test_nobody_is_invited_by_ipv4_where_another_has_that_port(tls: str) -> None:
+    told = invitations([Listen(False, "127.0.0.1", 8443), Listen(True, "::", 8443)], tls)
+    assert told
+    assert not any(f"https://{at}:" in url for at in OWN if ":" not in at for url in told)
+
+
 def test_the_page_says_that_it_is_opened_by_what_is_invited_to(tls: str) -> None:
     away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
     assert opened_by(away, tls) == invitations([away], tls)

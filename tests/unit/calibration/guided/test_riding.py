@@ -161,6 +161,16 @@ def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon(
     assert world.riding.halted == HELD_UP
 
 
+def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
+    """Ctrl-Z, Ctrl-S, a machine without a core: what came meanwhile is heard when it goes on."""
+    world = World(LEG).until_moving()
+    world.now += 1.5
+    world.run(TICK)
+    assert world.said[-1] == REST
+    assert world.riding.halted == HELD_UP
+    assert set(world.run(3.0).said[-100:]) == {REST}
+
+
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
