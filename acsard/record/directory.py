@@ -201,9 +201,9 @@ class Ring:
         self._sync()
         return writing
 
-    def end(self, writing: Writing, kind: Kind) -> Path:
-        """Finish a file; where it is now."""
-        writing.finish()
+    def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
+        """Finish a file, as `Writing.finish`; where it is now."""
+        writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
         self._run.numbers.add(_number(path) or 0)

@@ -1,9 +1,10 @@
 """One recording as an MCAP file: written chunk by chunk, read whatever became of it.
 
-Three channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
-`state.py` writes it, first of all where the file does not begin with the daemon). A metadata
-record says whose it is, an attachment is its `acsard.toml`. A file that was cut has no end: what is
-whole of it is read all the same, and `rewrite` makes a finished file of it.
+Four channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
+`state.py` writes it, first of all where the file does not begin with the daemon), `unfinished`
+(what came into the step that a fault of the daemon's own ended). A metadata record says whose it
+is, an attachment is its `acsard.toml`. A file that was cut has no end: what is whole of it is read
+all the same, and `rewrite` makes a finished file of it.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ MODE = 0o640
 FORMATS = (earlier.FORMAT, FORMAT)
 """Of the messages in it: those that are read here."""
 
-Topic = Literal["steps", "events", "state"]
+Topic = Literal["steps", "events", "state", "unfinished"]
 
-CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
+CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
 """In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
 
 
@@ -87,9 +88,10 @@ class Writing:
         )
         schema = msgspec.json.encode(msgspec.json.schema(Told))
         of_events = self._writer.register_schema("acsard.Told", "jsonschema", schema)
-        kinds = {"steps": ("acsard-steps", 0), "state": ("acsard-state", 0)}
         self._channels = {
-            topic: self._writer.register_channel(topic, *kinds.get(topic, ("json", of_events)))
+            topic: self._writer.register_channel(
+                topic, *(("json", of_events) if topic == "events" else (f"acsard-{topic}", 0))
+            )
             for topic in CHANNELS
         }
         self.flush()
@@ -118,9 +120,10 @@ class Writing:
         if not os.fstat(self._file.fileno()).st_nlink:  # the disk takes it, and nobody will find it
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
-    def finish(self, cut: str = "") -> None:
-        """Write the end of the file and close it; `cut` says why it comes late."""
-        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news), cut)
+    def finish(self, cut: str = "", why: str = "") -> None:
+        """Write the end of the file and close it; `cut`, a word of `CUTS`, and `why` say how the
+        daemon ended, where not as it was told to."""
+        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news), cut, why)
         self._writer.add_metadata(END, fields(last))
         self._writer.finish()
         self._file.flush()
@@ -150,7 +153,11 @@ class Recording:
         self.damaged = 0
         """Places in the midst of others, a chunk mostly, that could not be read."""
         self.cut = ""
-        """A word of `CUTS` where somebody else than the daemon has finished it."""
+        """A word of `CUTS` where the daemon has not ended as it was told to."""
+        self.why = ""
+        """By which fault of its own."""
+        self.unfinished: bytes | None = None
+        """The step that was ended by it."""
         self.about = self._about()
 
     @property
@@ -159,19 +166,23 @@ class Recording:
         return self.ended and not self.damaged
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Topic, wall-clock time in ns and bytes of each; sets `ended`, `damaged`, `cut`."""
-        self.ended, self.damaged, self.cut = False, 0, ""
+        """Topic, wall-clock time in ns and bytes of each; sets what there is to say of all."""
+        self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
+        self.unfinished = None
         topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
         for found in walk(self._data):
             record = found.record
             if isinstance(record, Footer):
                 self.ended = True
             elif isinstance(record, Metadata) and record.name == END:
-                self.cut = record.metadata.get("cut", "")
+                self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
             self.damaged += found.damaged
             for one in found.inside:
                 if isinstance(one, Message) and one.channel_id in topics:
-                    yield topics[one.channel_id], one.log_time, one.data
+                    topic = topics[one.channel_id]
+                    if topic == "unfinished":
+                        self.unfinished = one.data
+                    yield topic, one.log_time, one.data
 
     def _about(self) -> About:
         found: dict[str, str] = {}
@@ -212,7 +223,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
             else:
                 writing.add(topic, wall_ns, data)
             count += 1
-        writing.finish(recording.cut or ("" if recording.ended else cut))
+        writing.finish(recording.cut or ("" if recording.ended else cut), recording.why)
     except (OSError, RecordingError):
         writing.close()
         path.unlink()

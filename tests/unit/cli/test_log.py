@@ -304,9 +304,9 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     seen: list[bool] = []
     finish = Writing.finish
 
-    def looked(writing: Writing, cut: str = "") -> None:
+    def looked(writing: Writing, *how: str) -> None:
         seen.append(new.exists())
-        finish(writing, cut)
+        finish(writing, *how)
 
     monkeypatch.setattr(Writing, "finish", looked)
     assert log(capsys, where, "recover", str(cut), str(new))[0] == 0

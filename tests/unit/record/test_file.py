@@ -243,7 +243,7 @@ def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_pat
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
-    tally, trouble = live(Recording(path))
+    tally, trouble, _ = live(Recording(path))
     assert tally.steps == 2 * BATCH
     assert tally.same
     assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"

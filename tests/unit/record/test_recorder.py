@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import resource
@@ -18,14 +19,18 @@ from mcap.reader import make_reader
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, RecordConfig
+from acsard.incoming.commands import Arrival
+from acsard.mcu.gate import Offered
 from acsard.record import recorder as module
-from acsard.record.closing import closing
+from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import KEPT, Ring, listed
 from acsard.record.export import export
-from acsard.record.file import About, Recording, Writing
+from acsard.record.file import About, Recording, Writing, rewrite
 from acsard.record.recorder import MOST, Recorder
 from acsard.record.replayed import live, steps
-from acsard.values import Event
+from acsard.record.steps import unfinished
+from acsard.robot import Robot
+from acsard.values import Event, Inputs, Instant, Outputs
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -222,6 +227,122 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     again.write()
     kept = [not path.name.endswith("Z.mcap") for path in again.end()]
     assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
+
+
+BUG = "a fault of our own"
+
+
+def ends_by(bench: Bench, error: Exception) -> list[Path]:
+    """As the daemon does that such a fault ends, out of the task of the loop."""
+    bench.recorder.close(ExceptionGroup("unhandled errors in a TaskGroup", [error]))
+    return listed(bench.where)
+
+
+def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop is beyond it."""
+    whole = Robot.step
+
+    def step(robot: Robot, inputs: Inputs) -> Outputs:
+        if inputs.requests:
+            raise ZeroDivisionError(BUG)
+        return whole(robot, inputs)
+
+    monkeypatch.setattr(Robot, "step", step)
+
+
+@pytest.mark.parametrize("broken", ["robot", "port"])
+def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_it_ended(
+    broken: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+
+    def offer(line: bytes, now: Instant) -> Offered:
+        raise ZeroDivisionError(BUG)
+
+    with monkeypatch.context() as patched:
+        if broken == "robot":
+            break_robot(patched)
+        else:
+            patched.setattr(bench.world.port, "offer", offer)
+        with pytest.raises(ZeroDivisionError) as raised:
+            bench.world.call("stop")
+        (path,) = ends_by(bench, raised.value)
+        ended = live(Recording(path)).again
+    last, number = closing(path), bench.world.steps
+    why = f"in step {number}, ZeroDivisionError: {BUG}"
+    assert path.name.endswith(KEPT)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", why)
+    assert how_it_ends(last.cut, last.why) == f"cut: the daemon ended by a fault of its own: {why}"
+    recording = Recording(path)
+    lived = live(recording)
+    assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
+    assert (recording.whole, recording.cut, recording.why) == (True, "bug", why)
+    assert recording.unfinished is not None
+    step = unfinished(recording.unfinished)
+    assert step.number == number
+    assert [one.verb for one in step.inputs.requests] == ["stop"]
+    assert step.inputs.now.mono_ns <= bench.world.now_ns
+    assert "does not end the robot of this version" in lived.again
+    assert ("ends this version too, by ZeroDivisionError" in ended) is (broken == "robot")
+    rewrite(recording, new := path.with_name("new.mcap"))
+    assert closing(new) == last
+    assert live(Recording(new)) == lived
+
+
+def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
+    bench.world.run(1.0)
+    bench.write()
+    (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
+    last = closing(path)
+    assert last is not None
+    told = how_it_ends(last.cut, last.why)
+    assert told.startswith("cut: the daemon ended by a fault of its own: ValueError: ")
+    assert (told.isprintable(), len(told) < 300) == (True, True)
+
+
+def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench) -> None:
+    class MuteError(Exception):
+        def __str__(self) -> str:
+            raise ValueError
+
+    bench.world.run(1.0)
+    (path,) = ends_by(bench, MuteError())
+    last = closing(path)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", "MuteError")
+
+
+@pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
+def test_an_end_that_was_asked_for_is_no_fault_of_our_own(
+    error: BaseException | None, bench: Bench
+) -> None:
+    bench.world.run(1.0)
+    bench.recorder.close(error)
+    assert cuts(listed(bench.where)) == [("mcap", "")]
+
+
+def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.world.bus.arrivals.append(Arrival("stop", True, b"", "", bench.world.now_ns, None, ""))
+    break_robot(monkeypatch)
+    with pytest.raises(ZeroDivisionError) as raised:
+        bench.world.run(1.0)
+    (path,) = ends_by(bench, raised.value)
+    recording = Recording(path)
+    ((topic, _, data),) = recording.messages()
+    assert (topic, unfinished(data).number, recording.cut) == ("unfinished", 0, "bug")
+
+
+def test_the_minute_before_a_fault_of_our_own_is_kept(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(6.0)
+    told = cuts(ends_by(bench, ValueError(BUG)))
+    assert len(told) > 2
+    assert told == [("near.mcap", "")] * (len(told) - 1) + [("kept.mcap", "bug")]
 
 
 @pytest.mark.slow
