@@ -15,6 +15,7 @@ import math
 import os
 import stat
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -209,6 +210,13 @@ class Ring:
         self._run.numbers.add(_number(path) or 0)
         self._sync()
         return path
+
+    def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
+        """What ended less than a minute ago by the wall clock, and when by the other one, ns."""
+        for one in self._ended():
+            ago_ns = now.wall_ns - int(one.at_s * NS_PER_S)
+            if 0 <= ago_ns < AROUND_NS:
+                yield self._directory / one.name, one.kind, now.mono_ns - ago_ns
 
     def keep(self, path: Path) -> None:
         """Something happened close to what is in this finished file."""

@@ -205,6 +205,8 @@ class _Disk:
         self._kind: Kind = "plain"
         """What the file is that is being written."""
         self._told = self._refused = False
+        self._looked_back = False
+        """At what the run before this one has left."""
         self._run = Run()
         self._cut_ns: int | None = None
         """When a crash has cut what was before this run, wall clock, once that is whole; looked at
@@ -280,6 +282,8 @@ class _Disk:
 
     def _begin(self, ring: Ring, start: _Start, now: Instant) -> None:
         ring.trim(now)
+        if not self._looked_back:
+            self._look_back(ring, now)
         about = About(
             robot=self._config.robot.id,
             version=__version__,
@@ -297,6 +301,15 @@ class _Disk:
         self._kind = "near" if now.mono_ns - self._happened_ns < AROUND_NS else "plain"
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)
+
+    def _look_back(self, ring: Ring, now: Instant) -> None:
+        """The minute before what happens, and after what happened, goes on over a restart."""
+        for path, kind, ended_ns in ring.just_ended(now):
+            if kind == "plain":
+                self._recent.append((path, ended_ns))
+            elif kind == "kept":
+                self._happened_ns = max(self._happened_ns, ended_ns)
+        self._looked_back = True
 
     def _happened(self, ring: Ring, now: Instant) -> None:
         """This file stays, and what is less than a minute before it."""

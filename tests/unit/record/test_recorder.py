@@ -229,6 +229,38 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
 
 
+@pytest.mark.parametrize("fault_before", [True, False])
+@pytest.mark.parametrize(
+    ("after_s", "near"),
+    [(20.0, True)] + [pytest.param(s, False, marks=pytest.mark.slow) for s in (70.0, -20.0)],
+)
+def test_the_minute_before_and_after_what_happened_is_kept_over_a_restart(
+    after_s: float,
+    near: bool,
+    fault_before: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fault and then an orderly restart, or the other way round."""
+    before = Bench(tmp_path, monkeypatch)
+    before.world.drive(0.5, 0.2, seconds=1.0)
+    if fault_before:
+        before.world.call("stop")
+    (ended,) = before.end()
+    ended_s = START.wall_ns / 1e9 - after_s
+    os.utime(ended, (0, ended_s))
+    again = Bench(tmp_path, monkeypatch)
+    again.world.drive(0.5, 0.2, seconds=0.5)
+    if not fault_before:
+        again.world.call("stop")
+    again.write()
+    other = "near" if near else ""
+    kinds = ["kept", other] if fault_before else [other, "kept"]
+    assert [name.partition("Z.")[2] for name in map(str, again.end())] == [
+        f"{kind}.mcap".lstrip(".") for kind in kinds
+    ]
+
+
 BUG = "a fault of our own"
 
 
