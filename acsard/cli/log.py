@@ -106,20 +106,16 @@ def _row(path: Path, last: Closing) -> str:
 
 def _row_of_all(recording: Recording) -> str:
     """Of one without an end: all of it has to be read."""
-    import msgspec
+    from acsard.host.errors import RecordingError
+    from acsard.record.file import Gist, event_of
 
-    from acsard.record.closing import Closing
-    from acsard.record.story import Told, summary
-
-    events: list[Told] = []
-    first = last = recording.about.wall_ns
+    gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
-        last = max(last, wall_ns)
+        gist.message(topic, wall_ns, data)
         if topic == "events":
-            with suppress(msgspec.MsgspecError):  # what it tells is left out, not all of it
-                events.append(msgspec.json.decode(data, type=Told))
-    row = _row(recording.path, Closing(first, last, summary(events)))
-    return row + _state(recording)
+            with suppress(RecordingError):  # what it tells is left out, not all of it
+                gist.event(event_of(recording, data))
+    return _row(recording.path, gist.closing()) + _state(recording)
 
 
 def _bracketed(text: str) -> str:

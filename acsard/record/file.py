@@ -22,6 +22,7 @@ from msgspec import Struct
 
 from acsard.host.errors import RecordingError
 from acsard.record import earlier
+from acsard.record.batch import first_of
 from acsard.record.closing import END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
 from acsard.record.story import NEWS, Told, summary
@@ -60,13 +61,37 @@ class About(Struct, frozen=True):
     """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
 
 
+class Gist:
+    """What a list says of a recording, taken from its messages one by one."""
+
+    def __init__(self, about: About) -> None:
+        self._wall_ns = self._last_ns = about.wall_ns
+        self._news: list[Told] = []
+        self._starts = False
+
+    def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
+        """Any; what an event tells comes by `event`."""
+        self._last_ns = max(self._last_ns, wall_ns)
+        self._starts = self._starts or (topic == "steps" and first_of(data) == 0)
+
+    def event(self, told: Told) -> None:
+        """What happened."""
+        if told.name in NEWS:
+            self._news.append(told)
+
+    def closing(self, cut: str = "", why: str = "") -> Closing:
+        """All of it; `cut`, a word of `CUTS`, and `why` say how the daemon ended, where not as it
+        was told to."""
+        said = summary(self._news, self._starts)
+        return Closing(self._wall_ns, self._last_ns, said, cut, why)
+
+
 class Writing:
     """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
-        self._about, self._last_ns = about, about.wall_ns
-        self._news: list[Told] = []
+        self._gist = Gist(about)
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -103,15 +128,14 @@ class Writing:
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
         """Write a message; it is in the file when its chunk is full, or by `flush`."""
-        self._last_ns = max(self._last_ns, wall_ns)
+        self._gist.message(topic, wall_ns, data)
         self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
 
     def event(self, told: Told) -> None:
         """Write an event, and remember what a list says of it."""
         wall_ns = int(told.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(told))
-        if told.name in NEWS:
-            self._news.append(told)
+        self._gist.event(told)
 
     def flush(self) -> None:
         """What was added is a whole chunk, and on the disk."""
@@ -121,10 +145,8 @@ class Writing:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it; `cut`, a word of `CUTS`, and `why` say how the
-        daemon ended, where not as it was told to."""
-        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news), cut, why)
-        self._writer.add_metadata(END, fields(last))
+        """Write the end of the file and close it; `cut` and `why` as for `Gist.closing`."""
+        self._writer.add_metadata(END, fields(self._gist.closing(cut, why)))
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())

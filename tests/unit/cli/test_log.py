@@ -16,9 +16,10 @@ from acsard.cli.log import SERVICE
 from acsard.config.settings import Config, RecordConfig
 from acsard.record.directory import Ring
 from acsard.record.file import Writing
+from acsard.record.recovery import recover
 from acsard.record.steps import Taken
 from acsard.values import Event
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 
 
@@ -53,8 +54,33 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
-    assert first.endswith("1 change of who drives, 1 stop (stopped by unnamed (native))")
-    assert second.endswith("[no end: cut, or being written]")
+    assert first.endswith("start, 1 change of who drives, 1 stop (stopped by unnamed (native))")
+    assert second.endswith("start, 1 change of who drives  [no end: cut, or being written]")
+
+
+def test_the_list_tells_a_start_from_a_file_that_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whole, cut, and made whole beside it or in its place."""
+    tape = Tape(every=200)
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=4.0)
+    for number, first in enumerate((0, 200)):
+        whole = tmp_path / f"00000{number}-20270115T080000Z.mcap"
+        tape.write(whole, Config(), first)
+        data = whole.read_bytes()
+        for place, name in enumerate((".mcap.part", "a.mcap", "b.mcap"), start=1):
+            part = tmp_path / f"0000{place}{number}-20270115T080000Z{name}"
+            part.write_bytes(data[: chunks(data)[-2][1]])
+            if place > 1:
+                cut = part.rename(tmp_path / "cut")
+                assert recover(cut, part, "crash", room=place == 2) == ""
+    rows = log(capsys, tmp_path)[1].splitlines()
+    assert len(rows) == 8
+    for row in rows:
+        starts = row.partition("-")[0].endswith("0")
+        assert ("  start, 1 change of who drives" in row) is starts
+        assert ("start" in row) is starts
 
 
 def test_where_nothing_was_ever_recorded_it_says_what_records(

@@ -257,7 +257,7 @@ def test_a_finished_file_says_at_its_end_what_happened(
     assert said is not None
     assert (said.wall_ns, said.said) == (
         first.wall_ns,
-        "1 change of who drives, 1 stop (stopped by unnamed (native))",
+        "start, 1 change of who drives, 1 stop (stopped by unnamed (native))",
     )
     assert 0 <= last.wall_ns - said.last_ns < 2e9
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
