@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 import shutil
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from msgspec.structs import replace
 from acsard.cli import main
 from acsard.cli.log import SERVICE
 from acsard.config.settings import Config, RecordConfig
+from acsard.host.exits import Exit
 from acsard.record.directory import Ring
 from acsard.record.file import Writing
 from acsard.record.recovery import recover
@@ -21,6 +24,12 @@ from acsard.record.steps import Taken
 from acsard.values import Event
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
+
+HARMED = 40
+"""Files, of which each verb sees all."""
+
+NEW = {"show": "", "replay": "", "export": ".mcap", "report": ".html", "recover": ".new.mcap"}
+"""The verbs that take a file, and what they make of it."""
 
 
 @pytest.fixture(scope="module")
@@ -344,6 +353,48 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
     assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
+
+
+def harmed(data: bytes, dice: random.Random) -> bytes:
+    """Cut, before its first chunk or behind, or damaged in one place or in many."""
+    begin = chunks(data)[0][0]
+    kind = dice.randrange(4)
+    if kind < 2:
+        return data[: dice.randrange(begin, len(data)) if kind else dice.randrange(begin)]
+    bad = bytearray(data)
+    for _ in range(1 if kind == 2 else dice.randint(2, 20)):
+        bad[dice.randrange(begin if kind == 2 else 8, len(bad))] ^= dice.randrange(1, 256)
+    return bytes(bad)
+
+
+@pytest.mark.slow
+def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Recordings of a start, and those that begin with a robot."""
+    tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.call("stop")
+    world.run(0.5)
+    sound = [tmp_path / "start", tmp_path / "state"]
+    for first, path in zip((0, 200), sound, strict=True):
+        tape.write(path, Config(), first)
+    where = tmp_path / "record"
+    where.mkdir()
+    for number in range(HARMED):
+        path = where / f"{number:06}-20270115T080000Z.mcap"
+        path.write_bytes(harmed(sound[number % 2].read_bytes(), dice))
+        for verb, new in NEW.items():
+            words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
+            code, out, err = log(capsys, where, *words)
+            assert code in (Exit.OK, Exit.FAILURE), (words, out, err)
+            assert (bool(out or err), bool(err) or code == Exit.OK) == (True, True), words
+            assert "Traceback" not in err
+            ends[code] += 1
+    code, out, _ = log(capsys, where)
+    assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
+    assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
 
 
 def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -115,15 +115,31 @@ def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
     (first, _), *_ = ends = chunks(data)
     every = numbers(whole)
     for _ in range(cuts):
-        size = dice.randrange(len(data))
+        size = dice.randrange(first, len(data))
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
         path.write_bytes(data[:size] + tail)
         kept = sum(end <= size for _, end in ends)
-        if size < first:
-            continue
         got = numbers(path)
         assert got == every[: len(got)]
         assert len(got) >= kept * BATCH or got == every
+
+
+@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
+    whole: Path, tmp_path: Path, cuts: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
+    (first, _), *_ = chunks(data)
+    for _ in range(cuts):
+        size = dice.randrange(first)
+        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
+        path.write_bytes(data[:size] + tail)
+        with pytest.raises(RecordingError) as refused:
+            live(Recording(path))
+        told = str(refused.value)
+        assert (str(path) in told, told.isprintable()) == (True, True)
+        if not tail:
+            assert "its beginning is missing, or it is another program's MCAP" in told
 
 
 @pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
