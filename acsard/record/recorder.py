@@ -68,8 +68,10 @@ class _Bug(NamedTuple):
     """The fault of its own that the daemon ends by."""
 
     why: str
-    unfinished: Unfinished | None
-    """The step that it ended, if it was in one."""
+    at: Instant | None
+    """Of the step that it ended, if it was in one."""
+    unfinished: bytes
+    """That step; empty where it cannot be written."""
 
 
 class Recorder:
@@ -150,11 +152,13 @@ class Recorder:
     def _bug(self, error: Exception) -> _Bug:
         why = type(error).__name__
         with suppress(Exception):  # one that cannot be told is one all the same
-            why = f"{why}: {error}"[:MOST_TEXT]
+            why = f"{why}: {error}"[:MOST_TEXT].encode(errors="replace").decode()
         if self._died is None:
-            return _Bug(why, None)
-        step = Unfinished(self._number, self._died)
-        return _Bug(f"in step {step.number}, {why}", step)
+            return _Bug(why, None, b"")
+        number, data = self._number, b""
+        with suppress(Exception):  # what ended a step may be what no file takes
+            data = Unfinished(number, self._died).encode()
+        return _Bug(f"in step {number}, {why}", self._died.now, data)
 
     # the thread's side
 
@@ -321,14 +325,13 @@ class _Disk:
 
     def _die(self, ring: Ring, bug: _Bug) -> None:
         """What came into the last step, and that the file stays, as after a crash."""
-        step = bug.unfinished
-        if step is not None and self._writing is None and self._start is not None:
-            self._begin(ring, self._start, step.inputs.now)
+        if bug.at is not None and self._writing is None and self._start is not None:
+            self._begin(ring, self._start, bug.at)
         if self._writing is None:
             return
-        if step is not None:
-            self._last = step.inputs.now
-            self._writing.add("unfinished", self._last.wall_ns, step.encode())
+        self._last = bug.at or self._last
+        if bug.unfinished:
+            self._writing.add("unfinished", self._last.wall_ns, bug.unfinished)
         self._happened(ring, self._last)
 
     def _flush(self, ring: Ring, over: bool) -> None:

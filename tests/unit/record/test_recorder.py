@@ -346,6 +346,20 @@ def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench
     assert (last.cut, last.why) == ("bug", "MuteError")
 
 
+def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench) -> None:
+    bench.world.run(1.0)
+    tape = Tape()
+    World(recorder=tape).run(0.1)
+    bench.recorder.died(replace(tape.taken[0].inputs, missed=1 << 80))
+    (path,) = ends_by(bench, OverflowError("a name that is none: \udc80"))
+    last, recording = closing(path), Recording(path)
+    assert last is not None
+    told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
+    assert (last.cut, last.why.startswith(told)) == ("bug", True)
+    assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
+    assert (live(recording).tally.same, recording.whole) == (True, True)
+
+
 @pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
 def test_an_end_that_was_asked_for_is_no_fault_of_our_own(
     error: BaseException | None, bench: Bench
@@ -462,9 +476,18 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.parametrize("happened", [False, True])
-def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
+@pytest.mark.parametrize(
+    ("happened", "error", "told"),
+    [
+        (False, None, ("mcap", "late")),
+        (True, None, ("kept.mcap", "late")),
+        (False, ValueError(BUG), ("kept.mcap", "crash")),
+    ],
+)
+def test_an_end_that_the_disk_was_too_slow_for_is_no_crash_unless_it_was_one(
     happened: bool,
+    error: Exception | None,
+    told: tuple[str, str],
     eager: Bench,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
@@ -473,6 +496,7 @@ def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
         eager.world.call("stop")
         rounds(eager)
     goes, sync = threading.Event(), os.fsync
+    synced = listed(eager.where)[0].stat().st_size
 
     def hangs(handle: int) -> None:
         goes.wait(20.0)
@@ -481,17 +505,16 @@ def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
     monkeypatch.setattr(module, "CLOSE_S", 0.01)
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", hangs)
-        eager.recorder.close()
+        eager.recorder.close(error)
         # As it is on the disk when the process is gone.
         shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
     goes.set()
     eager.recorder._thread.join(20.0)
     (part,) = listed(where)
-    part.write_bytes(part.read_bytes()[:-40])
+    part.write_bytes(part.read_bytes()[:synced])
     again = Bench(where, monkeypatch)
     rounds(again)
-    kind = "kept.mcap" if happened else "mcap"
-    assert cuts(again.end()) == [(kind, "late"), ("mcap", "")]
+    assert cuts(again.end()) == [told, ("mcap", "")]
     assert not list(where.glob(".0*"))
 
 
