@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +26,7 @@ from acsard.record import earlier
 from acsard.record.batch import first_of
 from acsard.record.closing import END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
+from acsard.record.steps import UnfinishedError, unfinished
 from acsard.record.story import NEWS, Told, summary
 from acsard.record.walk import walk
 from acsard.values import NS_PER_S
@@ -72,7 +74,11 @@ class Gist:
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
         """Any; what an event tells comes by `event`."""
         self._last_ns = max(self._last_ns, wall_ns)
-        self._starts = self._starts or (topic == "steps" and first_of(data) == 0)
+        if topic == "steps":
+            self._starts = self._starts or first_of(data) == 0
+        elif topic == "unfinished":
+            with suppress(UnfinishedError):
+                self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, told: Told) -> None:
         """What happened."""

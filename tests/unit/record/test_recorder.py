@@ -378,6 +378,9 @@ def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.Monk
     recording = Recording(path)
     ((topic, _, data),) = recording.messages()
     assert (topic, unfinished(data).number, recording.cut) == ("unfinished", 0, "bug")
+    last = closing(path)
+    assert last is not None
+    assert last.said == "start"
 
 
 def test_the_minute_before_a_fault_of_our_own_is_kept(
