@@ -18,9 +18,9 @@ from acsard.cli.log import SERVICE
 from acsard.config.settings import Config, RecordConfig
 from acsard.host.exits import Exit
 from acsard.record.directory import Ring
-from acsard.record.file import Writing
+from acsard.record.file import Recording, Writing
 from acsard.record.recovery import recover
-from acsard.record.steps import Taken
+from acsard.record.steps import Taken, Unfinished
 from acsard.values import Event
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
@@ -371,20 +371,26 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Recordings of a start, and those that begin with a robot."""
+    """Recordings of a start, those that begin with a robot, those that a fault of our own ended."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
     world.drive(0.5, seconds=2.0)
     world.call("stop")
     world.run(0.5)
-    sound = [tmp_path / "start", tmp_path / "state"]
-    for first, path in zip((0, 200), sound, strict=True):
+    sound = [tmp_path / "start", tmp_path / "state", tmp_path / "fault"]
+    for first, path in zip((0, 200), sound, strict=False):
         tape.write(path, Config(), first)
+    begun, last = Recording(sound[0]), tape.taken[-1].inputs
+    ended = Writing(sound[2], begun.about)
+    for topic, wall_ns, data in begun.messages():
+        ended.add(topic, wall_ns, data)
+    ended.add("unfinished", last.now.wall_ns, Unfinished(len(tape.taken), last).encode())
+    ended.finish("bug", "a fault of our own")
     where = tmp_path / "record"
     where.mkdir()
     for number in range(HARMED):
         path = where / f"{number:06}-20270115T080000Z.mcap"
-        path.write_bytes(harmed(sound[number % 2].read_bytes(), dice))
+        path.write_bytes(harmed(sound[number % len(sound)].read_bytes(), dice))
         for verb, new in NEW.items():
             words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
             code, out, err = log(capsys, where, *words)
