@@ -101,25 +101,21 @@ def _row(path: Path, last: Closing) -> str:
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
     row = f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}"
-    return printable(row).rstrip() + _bracketed(how_it_ends(last.cut))
+    return printable(row).rstrip() + _bracketed(how_it_ends(last.cut, last.why))
 
 
 def _row_of_all(recording: Recording) -> str:
     """Of one without an end: all of it has to be read."""
-    import msgspec
+    from acsard.host.errors import RecordingError
+    from acsard.record.file import Gist, event_of
 
-    from acsard.record.closing import Closing
-    from acsard.record.story import Told, summary
-
-    events: list[Told] = []
-    first = last = recording.about.wall_ns
+    gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
-        last = max(last, wall_ns)
+        gist.message(topic, wall_ns, data)
         if topic == "events":
-            with suppress(msgspec.MsgspecError):  # what it tells is left out, not all of it
-                events.append(msgspec.json.decode(data, type=Told))
-    row = _row(recording.path, Closing(first, last, summary(events)))
-    return row + _state(recording)
+            with suppress(RecordingError):  # what it tells is left out, not all of it
+                gist.event(event_of(recording, data))
+    return _row(recording.path, gist.closing()) + _state(recording)
 
 
 def _bracketed(text: str) -> str:
@@ -133,10 +129,12 @@ def _state(recording: Recording) -> str:
 
 
 def _ending(recording: Recording) -> str:
-    """Why its end is not the daemon's."""
+    """Why it does not end as the daemon was told to."""
     from acsard.record.closing import how_it_ends
 
-    return how_it_ends(recording.cut) if recording.ended else "no end: cut, or being written"
+    if not recording.ended:
+        return "no end: cut, or being written"
+    return how_it_ends(recording.cut, recording.why)
 
 
 def show_one(args: argparse.Namespace) -> int:
@@ -188,13 +186,14 @@ def replay_one(args: argparse.Namespace) -> int:
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with telling(recording) as tell:
-        tally, trouble = live(recording, other, tell)
+        tally, trouble, again = live(recording, other, tell)
     print(f"{verdict(tally)}\n{compared(other is not None)}")
     began_ns, rows = recording.about.mono_ns, list[str]()
     if other is not None:
         rows = because(config_of(recording), other, tally, began_ns)
     if tally.first is not None:
         rows = [*differs(tally.first, began_ns), *rows, *otherwise(tally)]
+    rows += [again] if again else []
     for row in rows:
         print(printable(row))
     note = trouble or _state(recording).strip()

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import msgspec
+from msgspec import Struct
 
 from acsard.record import earlier
 from acsard.record.columns import pack, unpack
@@ -39,11 +40,18 @@ from acsard.values import (
 )
 
 
+class _First(Struct, frozen=True, array_like=True):
+    """All that is read of a batch where no more is asked."""
+
+    number: int
+
+
 class BatchError(AcsardError):
     """These bytes are no batch of steps."""
 
 
 _decoder = msgspec.msgpack.Decoder(Batch)
+_decoder_of_first = msgspec.msgpack.Decoder(_First)
 _decoder_of_1 = msgspec.msgpack.Decoder(earlier.Batch1)
 
 
@@ -174,6 +182,14 @@ def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
         return list(_steps(spread, reason))
     except (msgspec.DecodeError, ValueError, IndexError, StopIteration, RuntimeError) as error:
         raise BatchError(f"not a batch of steps: {error}") from None
+
+
+def first_of(data: bytes) -> int | None:
+    """The number of the first of the steps, of whatever format; None for bytes that are none."""
+    try:
+        return _decoder_of_first.decode(data).number
+    except msgspec.MsgspecError:
+        return None
 
 
 def _spread(batch: Batch) -> Spread:

@@ -12,6 +12,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from msgspec import Meta, Struct
 
+from acsard.messages.text import printable
+
 END = "acsard end"
 """The metadata that is the closing."""
 
@@ -25,12 +27,13 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """A time that calendars have."""
 
 CUTS = {
+    "bug": "cut: the daemon ended by a fault of its own",
     "crash": "cut: the daemon or the computer ended without a word",
     "disk": "cut: the disk took no more",
     "late": "cut: the daemon was told to end, and the disk was too slow for the rest",
     "open": "cut, or still being written, when it was recovered",
 }
-"""Why somebody else than the daemon finished a file."""
+"""Why a file does not end as the daemon was told to: all but the first were finished later."""
 
 
 class Closing(Struct, frozen=True):
@@ -43,12 +46,17 @@ class Closing(Struct, frozen=True):
     said: str
     """What happened, in a few words."""
     cut: str = ""
-    """Why it was finished later, a word of `CUTS`; "" where the daemon did it."""
+    """A word of `CUTS`; "" where the daemon ended as it was told to."""
+    why: str = ""
+    """Of a fault of its own: in which step, and what it says."""
 
 
-def how_it_ends(cut: str) -> str:
+def how_it_ends(cut: str, why: str = "") -> str:
     """In words; "" where there is nothing to say. A word of a later version is only a cut."""
-    return CUTS.get(cut, "cut") if cut else ""
+    if not cut:
+        return ""
+    words = CUTS.get(cut, "cut")
+    return f"{words}: {printable(why)}" if why else words
 
 
 def fields(last: Closing) -> dict[str, str]:

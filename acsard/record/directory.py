@@ -15,6 +15,7 @@ import math
 import os
 import stat
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -201,14 +202,21 @@ class Ring:
         self._sync()
         return writing
 
-    def end(self, writing: Writing, kind: Kind) -> Path:
-        """Finish a file; where it is now."""
-        writing.finish()
+    def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
+        """Finish a file, as `Writing.finish`; where it is now."""
+        writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
         self._run.numbers.add(_number(path) or 0)
         self._sync()
         return path
+
+    def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
+        """What ended less than a minute ago by the wall clock, and when by the other one, ns."""
+        for one in self._ended():
+            ago_ns = now.wall_ns - int(one.at_s * NS_PER_S)
+            if 0 <= ago_ns < AROUND_NS:
+                yield self._directory / one.name, one.kind, now.mono_ns - ago_ns
 
     def keep(self, path: Path) -> None:
         """Something happened close to what is in this finished file."""

@@ -1,9 +1,10 @@
 """One recording as an MCAP file: written chunk by chunk, read whatever became of it.
 
-Three channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
-`state.py` writes it, first of all where the file does not begin with the daemon). A metadata
-record says whose it is, an attachment is its `acsard.toml`. A file that was cut has no end: what is
-whole of it is read all the same, and `rewrite` makes a finished file of it.
+Four channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
+`state.py` writes it, first of all where the file does not begin with the daemon), `unfinished`
+(what came into the step that a fault of the daemon's own ended). A metadata record says whose it
+is, an attachment is its `acsard.toml`. A file that was cut has no end: what is whole of it is read
+all the same, and `rewrite` makes a finished file of it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -21,8 +23,10 @@ from msgspec import Struct
 
 from acsard.host.errors import RecordingError
 from acsard.record import earlier
+from acsard.record.batch import first_of
 from acsard.record.closing import END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
+from acsard.record.steps import UnfinishedError, unfinished
 from acsard.record.story import NEWS, Told, summary
 from acsard.record.walk import walk
 from acsard.values import NS_PER_S
@@ -36,9 +40,9 @@ MODE = 0o640
 FORMATS = (earlier.FORMAT, FORMAT)
 """Of the messages in it: those that are read here."""
 
-Topic = Literal["steps", "events", "state"]
+Topic = Literal["steps", "events", "state", "unfinished"]
 
-CHANNELS: tuple[Topic, ...] = ("steps", "state", "events")
+CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
 """In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
 
 
@@ -59,13 +63,41 @@ class About(Struct, frozen=True):
     """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
 
 
+class Gist:
+    """What a list says of a recording, taken from its messages one by one."""
+
+    def __init__(self, about: About) -> None:
+        self._wall_ns = self._last_ns = about.wall_ns
+        self._news: list[Told] = []
+        self._starts = False
+
+    def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
+        """Any; what an event tells comes by `event`."""
+        self._last_ns = max(self._last_ns, wall_ns)
+        if topic == "steps":
+            self._starts = self._starts or first_of(data) == 0
+        elif topic == "unfinished":
+            with suppress(UnfinishedError):
+                self._starts = self._starts or unfinished(data).number == 0
+
+    def event(self, told: Told) -> None:
+        """What happened."""
+        if told.name in NEWS:
+            self._news.append(told)
+
+    def closing(self, cut: str = "", why: str = "") -> Closing:
+        """All of it; `cut`, a word of `CUTS`, and `why` say how the daemon ended, where not as it
+        was told to."""
+        said = summary(self._news, self._starts)
+        return Closing(self._wall_ns, self._last_ns, said, cut, why)
+
+
 class Writing:
     """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
-        self._about, self._last_ns = about, about.wall_ns
-        self._news: list[Told] = []
+        self._gist = Gist(about)
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -87,9 +119,10 @@ class Writing:
         )
         schema = msgspec.json.encode(msgspec.json.schema(Told))
         of_events = self._writer.register_schema("acsard.Told", "jsonschema", schema)
-        kinds = {"steps": ("acsard-steps", 0), "state": ("acsard-state", 0)}
         self._channels = {
-            topic: self._writer.register_channel(topic, *kinds.get(topic, ("json", of_events)))
+            topic: self._writer.register_channel(
+                topic, *(("json", of_events) if topic == "events" else (f"acsard-{topic}", 0))
+            )
             for topic in CHANNELS
         }
         self.flush()
@@ -101,15 +134,14 @@ class Writing:
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
         """Write a message; it is in the file when its chunk is full, or by `flush`."""
-        self._last_ns = max(self._last_ns, wall_ns)
+        self._gist.message(topic, wall_ns, data)
         self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
 
     def event(self, told: Told) -> None:
         """Write an event, and remember what a list says of it."""
         wall_ns = int(told.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(told))
-        if told.name in NEWS:
-            self._news.append(told)
+        self._gist.event(told)
 
     def flush(self) -> None:
         """What was added is a whole chunk, and on the disk."""
@@ -118,10 +150,9 @@ class Writing:
         if not os.fstat(self._file.fileno()).st_nlink:  # the disk takes it, and nobody will find it
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
-    def finish(self, cut: str = "") -> None:
-        """Write the end of the file and close it; `cut` says why it comes late."""
-        last = Closing(self._about.wall_ns, self._last_ns, summary(self._news), cut)
-        self._writer.add_metadata(END, fields(last))
+    def finish(self, cut: str = "", why: str = "") -> None:
+        """Write the end of the file and close it; `cut` and `why` as for `Gist.closing`."""
+        self._writer.add_metadata(END, fields(self._gist.closing(cut, why)))
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -150,7 +181,11 @@ class Recording:
         self.damaged = 0
         """Places in the midst of others, a chunk mostly, that could not be read."""
         self.cut = ""
-        """A word of `CUTS` where somebody else than the daemon has finished it."""
+        """A word of `CUTS` where the daemon has not ended as it was told to."""
+        self.why = ""
+        """By which fault of its own."""
+        self.unfinished: bytes | None = None
+        """The step that was ended by it."""
         self.about = self._about()
 
     @property
@@ -159,19 +194,23 @@ class Recording:
         return self.ended and not self.damaged
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Topic, wall-clock time in ns and bytes of each; sets `ended`, `damaged`, `cut`."""
-        self.ended, self.damaged, self.cut = False, 0, ""
+        """Topic, wall-clock time in ns and bytes of each; sets what there is to say of all."""
+        self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
+        self.unfinished = None
         topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
         for found in walk(self._data):
             record = found.record
             if isinstance(record, Footer):
                 self.ended = True
             elif isinstance(record, Metadata) and record.name == END:
-                self.cut = record.metadata.get("cut", "")
+                self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
             self.damaged += found.damaged
             for one in found.inside:
                 if isinstance(one, Message) and one.channel_id in topics:
-                    yield topics[one.channel_id], one.log_time, one.data
+                    topic = topics[one.channel_id]
+                    if topic == "unfinished":
+                        self.unfinished = one.data
+                    yield topic, one.log_time, one.data
 
     def _about(self) -> About:
         found: dict[str, str] = {}
@@ -212,7 +251,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
             else:
                 writing.add(topic, wall_ns, data)
             count += 1
-        writing.finish(recording.cut or ("" if recording.ended else cut))
+        writing.finish(recording.cut or ("" if recording.ended else cut), recording.why)
     except (OSError, RecordingError):
         writing.close()
         path.unlink()

@@ -25,7 +25,7 @@ from acsard.record.file import About, Writing
 from acsard.record.recovery import FULL
 from acsard.record.room import AROUND_NS, Kind
 from acsard.record.state import freeze
-from acsard.record.steps import Taken
+from acsard.record.steps import Taken, Unfinished
 from acsard.record.story import told
 from acsard.robot import Robot
 from acsard.values import NS_PER_S, Event, Inputs, Instant, Outputs, Recording
@@ -48,6 +48,9 @@ LONGEST_NS = 3600 * NS_PER_S
 HAPPENED = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
 """Events whose minutes are kept."""
 
+MOST_TEXT = 200
+"""Characters of what a fault of our own says."""
+
 CLOSE_S = 0.5
 """How long the end waits for the last chunk."""
 
@@ -59,6 +62,16 @@ class _Start(NamedTuple):
     state: bytes
     config: Config
     """In force then: settings may have been changed since the daemon began."""
+
+
+class _Bug(NamedTuple):
+    """The fault of its own that the daemon ends by."""
+
+    why: str
+    at: Instant | None
+    """Of the step that it ended, if it was in one."""
+    unfinished: bytes
+    """That step; empty where it cannot be written."""
 
 
 class Recorder:
@@ -75,6 +88,8 @@ class Recorder:
         self._missing = 0
         """Steps that found the queue full."""
         self._full = False
+        self._died: Inputs | None = None
+        """What came into the step that did not end."""
         self._wants_state = False
         """Set by the thread, cleared by `step`: begin a new file."""
         self._disk = _Disk(config, self._say, self._ask, started_ns)
@@ -108,6 +123,10 @@ class Recorder:
             self._wants_state = False
             queue.append(_Start(self._number, freeze(robot, last), robot.config))
 
+    def died(self, inputs: Inputs) -> None:
+        """A fault of our own ended the step that these came into; the daemon ends by it."""
+        self._died = inputs
+
     @property
     def status(self) -> Recording:
         """How it goes, for `state` and `diagnostics`."""
@@ -116,12 +135,30 @@ class Recorder:
             trouble = "the recorder has ended by a fault of its own; the log has it"
         return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
 
-    def close(self) -> None:
-        """Write the last chunk and the end of the file, if the disk lets us in time."""
+    def close(self, error: BaseException | None = None) -> None:
+        """Write the last chunk and the end of the file, if the disk lets us in time.
+
+        `error` is what the daemon ends by; what is no `Exception` was asked for.
+        """
+        while isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        if isinstance(error, Exception):
+            self._disk.bug = self._bug(error)
         self._over.set()
         self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
+        if self._thread.is_alive() and self._disk.bug is None:
             self._disk.leave()
+
+    def _bug(self, error: Exception) -> _Bug:
+        why = type(error).__name__
+        with suppress(Exception):  # one that cannot be told is one all the same
+            why = f"{why}: {error}"[:MOST_TEXT].encode(errors="replace").decode()
+        if self._died is None:
+            return _Bug(why, None, b"")
+        number, data = self._number, b""
+        with suppress(Exception):  # what ended a step may be what no file takes
+            data = Unfinished(number, self._died).encode()
+        return _Bug(f"in step {number}, {why}", self._died.now, data)
 
     # the thread's side
 
@@ -172,10 +209,14 @@ class _Disk:
         self._kind: Kind = "plain"
         """What the file is that is being written."""
         self._told = self._refused = False
+        self._looked_back = False
+        """At what the run before this one has left."""
         self._run = Run()
         self._cut_ns: int | None = None
         """When a crash has cut what was before this run, wall clock, once that is whole; looked at
         once."""
+        self.bug: _Bug | None = None
+        """By which the daemon ends; looked at in the last round."""
         self._pause = 0
         self._handed = self._safe = 0
         """Steps of this round: given to the file, or counted as missing, and how many of them are
@@ -226,7 +267,7 @@ class _Disk:
                 self._handed += len(steps)
                 self._safe = self._handed
                 return
-            self._begin(ring, self._start, steps[0])
+            self._begin(ring, self._start, steps[0].inputs.now)
         assert self._writing is not None
         for at in range(0, len(steps), BATCH):
             batch = steps[at : at + BATCH]
@@ -239,11 +280,14 @@ class _Disk:
             self._last = batch[-1].inputs.now
             for _, outputs, _ in batch:
                 for event in outputs.events:
-                    self._event(ring, self._writing, event, outputs)
+                    self._writing.event(told(event, outputs.now.wall_ns))
+                    if event.name in HAPPENED:
+                        self._happened(ring, outputs.now)
 
-    def _begin(self, ring: Ring, start: _Start, first: Taken) -> None:
-        now = first.inputs.now
+    def _begin(self, ring: Ring, start: _Start, now: Instant) -> None:
         ring.trim(now)
+        if not self._looked_back:
+            self._look_back(ring, now)
         about = About(
             robot=self._config.robot.id,
             version=__version__,
@@ -262,19 +306,39 @@ class _Disk:
         if start.state:
             self._writing.add("state", now.wall_ns, start.state)
 
-    def _event(self, ring: Ring, writing: Writing, event: Event, outputs: Outputs) -> None:
-        now = outputs.now
-        writing.event(told(event, now.wall_ns))
-        if event.name in HAPPENED:
-            self._kind, self._happened_ns = "kept", now.mono_ns
-            for path, ended_ns in self._recent:
-                if now.mono_ns - ended_ns < AROUND_NS:
-                    ring.keep(path)
-            self._recent.clear()
+    def _look_back(self, ring: Ring, now: Instant) -> None:
+        """The minute before what happens, and after what happened, goes on over a restart."""
+        for path, kind, ended_ns in ring.just_ended(now):
+            if kind == "plain":
+                self._recent.append((path, ended_ns))
+            elif kind == "kept":
+                self._happened_ns = max(self._happened_ns, ended_ns)
+        self._looked_back = True
+
+    def _happened(self, ring: Ring, now: Instant) -> None:
+        """This file stays, and what is less than a minute before it."""
+        self._kind, self._happened_ns = "kept", now.mono_ns
+        for path, ended_ns in self._recent:
+            if now.mono_ns - ended_ns < AROUND_NS:
+                ring.keep(path)
+        self._recent.clear()
+
+    def _die(self, ring: Ring, bug: _Bug) -> None:
+        """What came into the last step, and that the file stays, as after a crash."""
+        if bug.at is not None and self._writing is None and self._start is not None:
+            self._begin(ring, self._start, bug.at)
+        if self._writing is None:
+            return
+        self._last = bug.at or self._last
+        if bug.unfinished:
+            self._writing.add("unfinished", self._last.wall_ns, bug.unfinished)
+        self._happened(ring, self._last)
 
     def _flush(self, ring: Ring, over: bool) -> None:
         if over:
-            self._finish(ring)
+            if self.bug is not None:
+                self._die(ring, self.bug)
+            self._finish(ring, *(("bug", self.bug.why) if self.bug else ()))
             ring.close()
         if self._writing is None:
             return
@@ -288,10 +352,10 @@ class _Disk:
         if long or self._writing.size > ring.file_bytes:
             self._ask()
 
-    def _finish(self, ring: Ring) -> None:
+    def _finish(self, ring: Ring, cut: str = "", why: str = "") -> None:
         if self._writing is None:
             return
-        path, last_ns = ring.end(self._writing, self._kind), self._last.mono_ns
+        path, last_ns = ring.end(self._writing, self._kind, cut, why), self._last.mono_ns
         self._writing, self._safe = None, self._handed
         recent = [(p, ns) for p, ns in self._recent if last_ns - ns < AROUND_NS]
         self._recent = recent if self._kind != "plain" else [*recent, (path, last_ns)]

@@ -17,8 +17,7 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.host.errors import RecordingError
 from acsard.record.closing import END, Closing, fields
-from acsard.record.file import Recording, event_of, rewrite
-from acsard.record.story import NEWS, Told, summary
+from acsard.record.file import Gist, Recording, event_of, rewrite
 from acsard.record.walk import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -87,14 +86,14 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
     """The end goes behind the last whole chunk, over what is torn; False where the disk does not
     take it: then the file is as it was. No chunk is given up for the room: some disks give none
     back, and all of them would go."""
-    news, last_ns = list[Told](), recording.about.wall_ns
+    gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
-        last_ns = max(last_ns, wall_ns)
-        if topic == "events" and (told := event_of(recording, data)).name in NEWS:
-            news.append(told)
+        gist.message(topic, wall_ns, data)
+        if topic == "events":
+            gist.event(event_of(recording, data))
     if recording.ended:
         return True
-    end = _end(Closing(recording.about.wall_ns, last_ns, summary(news), cut))
+    end = _end(gist.closing(cut))
     before = part.read_bytes()
     at = max((found.end for found in walk(before) if found.inside), default=0)
     if not at:  # somebody else has changed it since

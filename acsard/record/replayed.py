@@ -17,7 +17,7 @@ from acsard.record.file import Recording
 from acsard.record.merge import adopt
 from acsard.record.replay import Difference, Replay, Seen, Tally, fastest
 from acsard.record.state import State, StateError, short, thaw
-from acsard.record.steps import MICRO, Step
+from acsard.record.steps import MICRO, Step, UnfinishedError, unfinished
 from acsard.robot import Robot
 from acsard.values import Outputs
 
@@ -46,6 +46,8 @@ class Lived(NamedTuple):
     tally: Tally
     trouble: str
     """Why it was not lived to the end of the file, "" when it was."""
+    again: str = ""
+    """What becomes of the step that a fault of the daemon's own ended, "" where none did."""
 
 
 def config_of(recording: Recording) -> Config:
@@ -81,6 +83,8 @@ class Course:
         """What it begins with."""
         self.trouble = ""
         """Why it was not gone to the end of the file, "" when it was."""
+        self.number: int | None = None
+        """Of the step that was gone last."""
         self._recording = recording
         self._state, begins = _state(recording), Robot(self.config)
         self.robot, self.last = self._state or (begins, b"")
@@ -98,17 +102,18 @@ class Course:
 
     def steps(self) -> Iterator[Step]:
         """One after the other, while none is missing; raises `RecordingError`."""
-        path, number = self._recording.path, None
+        path = self._recording.path
         for step in steps(self._recording):
+            number = self.number
             if number is None and self._state is None and step.number > 0:
                 raise RecordingError(f"{path}: its first steps are missing or damaged")
             if number is not None and step.number != number + 1:
                 missing = step.number - number - 1
                 self.trouble = f"{missing} steps are missing after step {number}"
                 return
-            number = step.number
+            self.number = step.number
             yield step
-        if number is None:
+        if self.number is None:
             raise RecordingError(f"{path} has no whole second of steps")
 
 
@@ -121,7 +126,26 @@ def live(recording: Recording, other: Config | None = None, progress: Progress =
             if number % EVERY == 0:
                 progress(step.inputs.now.wall_ns)
             replay.step(step)
-    return Lived(replay.tally, course.trouble)
+    again = "" if course.trouble else _again(recording, replay.robot, course.number)
+    return Lived(replay.tally, course.trouble, again)
+
+
+def _again(recording: Recording, robot: Robot, last: int | None) -> str:
+    """What becomes now of the step that ended the daemon, if it comes after the last one."""
+    if recording.unfinished is None:
+        return ""
+    try:
+        step = unfinished(recording.unfinished)
+    except UnfinishedError as error:
+        return str(error)
+    name = f"step {step.number}, which ended the daemon,"
+    if last is None or step.number != last + 1:
+        return f"{name} does not follow on the last one"
+    try:
+        robot.step(step.inputs)
+    except Exception as error:  # noqa: BLE001 - whatever a fault of our own may be
+        return f"{name} ends this version too, by {type(error).__name__}: {short(error)}"
+    return f"{name} does not end the robot of this version"
 
 
 class Onlooker:

@@ -11,10 +11,11 @@ import zlib
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+import msgspec
 from msgspec import Struct
 
 from acsard.robot import Robot
-from acsard.values import Estimate, Event, Inputs, Outputs, Recording
+from acsard.values import AcsardError, Estimate, Event, Inputs, Outputs, Recording
 
 MICRO = 1e6
 
@@ -44,6 +45,9 @@ class BlackBox(Protocol):
     ) -> None:
         """Take a step that is over; `left` is what went of it, `last` the line that went last."""
 
+    def died(self, inputs: Inputs) -> None:
+        """A fault of our own ended the step that these came into; the daemon ends by it."""
+
     @property
     def status(self) -> Recording:
         """How it does."""
@@ -70,6 +74,32 @@ class Step(Struct, frozen=True):
     said: Said
     begins: bool = False
     """The first of its batch: `checksum` begins anew."""
+
+
+class UnfinishedError(AcsardError):
+    """These bytes are no step that was not finished."""
+
+
+class Unfinished(Struct, frozen=True):
+    """A step that a fault of the daemon's own ended: what came into it. Nothing came out of it."""
+
+    number: int
+    inputs: Inputs
+
+    def encode(self) -> bytes:
+        """With the names of its parts: a later version may add some."""
+        return msgspec.msgpack.encode(self)
+
+
+_unfinished = msgspec.msgpack.Decoder(Unfinished)
+
+
+def unfinished(data: bytes) -> Unfinished:
+    """That step again; raises `UnfinishedError` for bytes that are none."""
+    try:
+        return _unfinished.decode(data)
+    except msgspec.MsgspecError as error:
+        raise UnfinishedError(f"not a step that was not finished: {error}") from None
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:

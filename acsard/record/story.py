@@ -127,8 +127,9 @@ def _several(word: str) -> str:
     return f"{first}s of {rest}" if rest else f"{word}s"
 
 
-def summary(events: Iterable[Told]) -> str:
-    """What happened, in a few words: who stopped it, and how often the rest was."""
+def summary(events: Iterable[Told], starts: bool = False) -> str:
+    """What happened, in a few words: that the daemon `starts`, who stopped it, and how often the
+    rest was."""
     counts: Counter[str] = Counter()
     stopped: list[str] = []
     losses = Losses()
@@ -139,6 +140,7 @@ def summary(events: Iterable[Told]) -> str:
         if event.name == "stop" and event.by and event.by not in stopped:
             stopped.append(event.by)
         counts[word] += event.count
-    said = [f"{count} {_several(word) if count > 1 else word}" for word, count in counts.items()]
+    said = ["start"] if starts else []
+    said += [f"{count} {_several(word) if count > 1 else word}" for word, count in counts.items()]
     text = ", ".join(said)
     return f"{text} (stopped by {', '.join(stopped)})" if stopped else text

@@ -155,23 +155,33 @@ class ControlLoop:
         )
         self._others.clear()
         self._turn_rates.clear()
-        outputs = self.outputs = self.robot.step(inputs)
-        adopts = self.robot.config is not self._config
-        if adopts:
-            self._adopt(self.robot.config)
-        went = self._send(outputs, now, inputs.tick)
-        if self._recorder is not None:
-            left = self._last if went else None
-            self._recorder.step(inputs, outputs, left, self.robot, self._last)
+        before = self._config
+        outputs, went = self._decided(inputs)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
-        if adopts and self._adopted:  # once the log has told of it
+        if self._config is not before and self._adopted:  # once the log has told of it
             self._adopted(self._config)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
         # Last of all: who sends needs the interpreter, and gets it when the loop waits again.
         self._bus.flush()
         return outputs
+
+    def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
+        """What comes of it, and whether its line went; the black box has it, however it ends."""
+        try:
+            outputs = self.outputs = self.robot.step(inputs)
+            if self.robot.config is not self._config:
+                self._adopt(self.robot.config)
+            went = self._send(outputs, inputs.now, inputs.tick)
+        except Exception:
+            if self._recorder is not None:
+                self._recorder.died(inputs)
+            raise
+        if self._recorder is not None:
+            left = self._last if went else None
+            self._recorder.step(inputs, outputs, left, self.robot, self._last)
+        return outputs, went
 
     def _adopt(self, config: Config) -> None:
         """Go by the configuration that the robot goes by since this step."""

@@ -140,7 +140,7 @@ def _recorder(
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
-    stack.callback(recorder.close)
+    stack.push(lambda kind, error, trace: recorder.close(error))
     return recorder
 
 

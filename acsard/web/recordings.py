@@ -53,7 +53,7 @@ def _row(path: Path) -> Listed:
         return Listed(path.name, _begun(path), None, size, str(error))
     if last is None:
         return Listed(path.name, _begun(path), None, size, "no end: cut")
-    events = "; ".join(filter(None, [last.said, how_it_ends(last.cut)]))
+    events = "; ".join(filter(None, [last.said, how_it_ends(last.cut, last.why)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
     return Listed(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
 

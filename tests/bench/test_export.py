@@ -57,6 +57,8 @@ class Streamed:
             self._number += BATCH
             self._taken.clear()
 
+    def died(self, inputs: Inputs) -> None: ...
+
 
 def recorded(path: Path, seconds: float) -> Path:
     """Driving at 20 commands a second, another speed every half minute."""

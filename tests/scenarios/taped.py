@@ -54,6 +54,8 @@ class Tape:
             self.cut = False
             self.states[len(self.taken)] = freeze(robot, last)
 
+    def died(self, inputs: Inputs) -> None: ...
+
     def steps(self, first: int = 0) -> list[Step]:
         """What a recording from that step on says."""
         starts = range(first, len(self.taken), BATCH)

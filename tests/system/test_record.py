@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.system import bystander
-from tests.system.harness import Bus, Daemon, acsard, finish, until
+from tests.system.harness import ROOT, Bus, Daemon, acsard, environment, finish, until
 
 LOST_S = 1.5
 """What a kill or a power cut may cost at most."""
@@ -84,6 +84,40 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
     listed = finish(acsard("log", "--directory", str(tmp_path / "record")), tmp_path)
     assert whole.name in listed.out.splitlines()[0]
     assert "[cut: the daemon or the computer ended without a word]" in listed.out.splitlines()[0]
+
+
+BUG = """\
+from acsard.robot import Robot
+whole = Robot.step
+def step(robot, inputs):
+    if inputs.requests:
+        raise ZeroDivisionError("a fault of our own")
+    return whole(robot, inputs)
+Robot.step = step
+"""
+"""Put into the daemon: a stop is beyond it."""
+
+
+@pytest.mark.slow
+def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_the_file(
+    tmp_path: Path,
+) -> None:
+    (bug := tmp_path / "bug").mkdir()
+    (bug / "sitecustomize.py").write_text(BUG)
+    env = environment(PYTHONPATH=f"{bug}:{ROOT}")
+    with recording(tmp_path, env=env) as (daemon, bus), bus.commanding(0.3):
+        until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")
+        bus.put("stop", "")
+        assert daemon.ended(5.0) != 0
+    (path,) = files(tmp_path)
+    assert path.name.endswith(".kept.mcap")
+    for words in ((), ("show",)):
+        said = finish(acsard("log", *words, "--directory", str(path.parent)), tmp_path).out
+        assert "the daemon ended by a fault of its own: in step " in said
+        assert "ZeroDivisionError: a fault of our own" in said
+    assert replayed(tmp_path, path) > 3
+    again = finish(acsard("log", "replay", str(path)), tmp_path)
+    assert "which ended the daemon, does not end the robot of this version" in again.out
 
 
 @pytest.mark.soak

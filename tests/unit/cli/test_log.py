@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 import shutil
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,12 +16,20 @@ from msgspec.structs import replace
 from acsard.cli import main
 from acsard.cli.log import SERVICE
 from acsard.config.settings import Config, RecordConfig
+from acsard.host.exits import Exit
 from acsard.record.directory import Ring
-from acsard.record.file import Writing
-from acsard.record.steps import Taken
+from acsard.record.file import Recording, Writing
+from acsard.record.recovery import recover
+from acsard.record.steps import Taken, Unfinished
 from acsard.values import Event
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
+
+HARMED = 40
+"""Files, of which each verb sees all."""
+
+NEW = {"show": "", "replay": "", "export": ".mcap", "report": ".html", "recover": ".new.mcap"}
+"""The verbs that take a file, and what they make of it."""
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +63,33 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
-    assert first.endswith("1 change of who drives, 1 stop (stopped by unnamed (native))")
-    assert second.endswith("[no end: cut, or being written]")
+    assert first.endswith("start, 1 change of who drives, 1 stop (stopped by unnamed (native))")
+    assert second.endswith("start, 1 change of who drives  [no end: cut, or being written]")
+
+
+def test_the_list_tells_a_start_from_a_file_that_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whole, cut, and made whole beside it or in its place."""
+    tape = Tape(every=200)
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=4.0)
+    for number, first in enumerate((0, 200)):
+        whole = tmp_path / f"00000{number}-20270115T080000Z.mcap"
+        tape.write(whole, Config(), first)
+        data = whole.read_bytes()
+        for place, name in enumerate((".mcap.part", "a.mcap", "b.mcap"), start=1):
+            part = tmp_path / f"0000{place}{number}-20270115T080000Z{name}"
+            part.write_bytes(data[: chunks(data)[-2][1]])
+            if place > 1:
+                cut = part.rename(tmp_path / "cut")
+                assert recover(cut, part, "crash", room=place == 2) == ""
+    rows = log(capsys, tmp_path)[1].splitlines()
+    assert len(rows) == 8
+    for row in rows:
+        starts = row.partition("-")[0].endswith("0")
+        assert ("  start, 1 change of who drives" in row) is starts
+        assert ("start" in row) is starts
 
 
 def test_where_nothing_was_ever_recorded_it_says_what_records(
@@ -304,9 +339,9 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     seen: list[bool] = []
     finish = Writing.finish
 
-    def looked(writing: Writing, cut: str = "") -> None:
+    def looked(writing: Writing, *how: str) -> None:
         seen.append(new.exists())
-        finish(writing, cut)
+        finish(writing, *how)
 
     monkeypatch.setattr(Writing, "finish", looked)
     assert log(capsys, where, "recover", str(cut), str(new))[0] == 0
@@ -318,6 +353,54 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
     assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
+
+
+def harmed(data: bytes, dice: random.Random) -> bytes:
+    """Cut, before its first chunk or behind, or damaged in one place or in many."""
+    begin = chunks(data)[0][0]
+    kind = dice.randrange(4)
+    if kind < 2:
+        return data[: dice.randrange(begin, len(data)) if kind else dice.randrange(begin)]
+    bad = bytearray(data)
+    for _ in range(1 if kind == 2 else dice.randint(2, 20)):
+        bad[dice.randrange(begin if kind == 2 else 8, len(bad))] ^= dice.randrange(1, 256)
+    return bytes(bad)
+
+
+@pytest.mark.slow
+def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Recordings of a start, those that begin with a robot, those that a fault of our own ended."""
+    tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.call("stop")
+    world.run(0.5)
+    sound = [tmp_path / "start", tmp_path / "state", tmp_path / "fault"]
+    for first, path in zip((0, 200), sound, strict=False):
+        tape.write(path, Config(), first)
+    begun, last = Recording(sound[0]), tape.taken[-1].inputs
+    ended = Writing(sound[2], begun.about)
+    for topic, wall_ns, data in begun.messages():
+        ended.add(topic, wall_ns, data)
+    ended.add("unfinished", last.now.wall_ns, Unfinished(len(tape.taken), last).encode())
+    ended.finish("bug", "a fault of our own")
+    where = tmp_path / "record"
+    where.mkdir()
+    for number in range(HARMED):
+        path = where / f"{number:06}-20270115T080000Z.mcap"
+        path.write_bytes(harmed(sound[number % len(sound)].read_bytes(), dice))
+        for verb, new in NEW.items():
+            words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
+            code, out, err = log(capsys, where, *words)
+            assert code in (Exit.OK, Exit.FAILURE), (words, out, err)
+            assert (bool(out or err), bool(err) or code == Exit.OK) == (True, True), words
+            assert "Traceback" not in err
+            ends[code] += 1
+    code, out, _ = log(capsys, where)
+    assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
+    assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
 
 
 def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.config.settings import Config
-from acsard.record.batch import BatchError, decode, encode
+from acsard.record.batch import BatchError, decode, encode, first_of
 from acsard.record.steps import Taken, microposes, status_of
 from acsard.robot import Robot
 from acsard.values import (
@@ -143,3 +143,10 @@ def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
     for other in (b"", b"\x90", msgspec.msgpack.encode({"first": 1})):
         with pytest.raises(BatchError):
             decode(other)
+
+
+def test_the_number_of_the_first_step_is_read_alone() -> None:
+    tape = Tape()
+    World(recorder=tape).run(0.5)
+    assert [first_of(encode(number, tape.taken)) for number in (0, 7)] == [0, 7]
+    assert first_of(b"none") is None

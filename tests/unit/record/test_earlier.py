@@ -42,7 +42,7 @@ def test_every_step_is_as_the_code_of_then_read_it() -> None:
 
 
 def test_it_is_lived_to_its_end() -> None:
-    tally, trouble = live(Recording(FORMAT_1))
+    tally, trouble, _ = live(Recording(FORMAT_1))
     assert (tally.steps, trouble) == (COUNT, "")
 
 

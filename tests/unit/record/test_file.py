@@ -115,15 +115,31 @@ def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
     (first, _), *_ = ends = chunks(data)
     every = numbers(whole)
     for _ in range(cuts):
-        size = dice.randrange(len(data))
+        size = dice.randrange(first, len(data))
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
         path.write_bytes(data[:size] + tail)
         kept = sum(end <= size for _, end in ends)
-        if size < first:
-            continue
         got = numbers(path)
         assert got == every[: len(got)]
         assert len(got) >= kept * BATCH or got == every
+
+
+@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
+    whole: Path, tmp_path: Path, cuts: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
+    (first, _), *_ = chunks(data)
+    for _ in range(cuts):
+        size = dice.randrange(first)
+        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
+        path.write_bytes(data[:size] + tail)
+        with pytest.raises(RecordingError) as refused:
+            live(Recording(path))
+        told = str(refused.value)
+        assert (str(path) in told, told.isprintable()) == (True, True)
+        if not tail:
+            assert "its beginning is missing, or it is another program's MCAP" in told
 
 
 @pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
@@ -243,7 +259,7 @@ def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_pat
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
-    tally, trouble = live(Recording(path))
+    tally, trouble, _ = live(Recording(path))
     assert tally.steps == 2 * BATCH
     assert tally.same
     assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
@@ -257,7 +273,7 @@ def test_a_finished_file_says_at_its_end_what_happened(
     assert said is not None
     assert (said.wall_ns, said.said) == (
         first.wall_ns,
-        "1 change of who drives, 1 stop (stopped by unnamed (native))",
+        "start, 1 change of who drives, 1 stop (stopped by unnamed (native))",
     )
     assert 0 <= last.wall_ns - said.last_ns < 2e9
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import resource
@@ -18,14 +19,18 @@ from mcap.reader import make_reader
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, RecordConfig
+from acsard.incoming.commands import Arrival
+from acsard.mcu.gate import Offered
 from acsard.record import recorder as module
-from acsard.record.closing import closing
+from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import KEPT, Ring, listed
 from acsard.record.export import export
-from acsard.record.file import About, Recording, Writing
+from acsard.record.file import About, Recording, Writing, rewrite
 from acsard.record.recorder import MOST, Recorder
 from acsard.record.replayed import live, steps
-from acsard.values import Event
+from acsard.record.steps import unfinished
+from acsard.robot import Robot
+from acsard.values import Event, Inputs, Instant, Outputs
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -224,6 +229,171 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
 
 
+@pytest.mark.parametrize("fault_before", [True, False])
+@pytest.mark.parametrize(
+    ("after_s", "near"),
+    [(20.0, True)] + [pytest.param(s, False, marks=pytest.mark.slow) for s in (70.0, -20.0)],
+)
+def test_the_minute_before_and_after_what_happened_is_kept_over_a_restart(
+    after_s: float,
+    near: bool,
+    fault_before: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fault and then an orderly restart, or the other way round."""
+    before = Bench(tmp_path, monkeypatch)
+    before.world.drive(0.5, 0.2, seconds=1.0)
+    if fault_before:
+        before.world.call("stop")
+    (ended,) = before.end()
+    ended_s = START.wall_ns / 1e9 - after_s
+    os.utime(ended, (0, ended_s))
+    again = Bench(tmp_path, monkeypatch)
+    again.world.drive(0.5, 0.2, seconds=0.5)
+    if not fault_before:
+        again.world.call("stop")
+    again.write()
+    other = "near" if near else ""
+    kinds = ["kept", other] if fault_before else [other, "kept"]
+    assert [name.partition("Z.")[2] for name in map(str, again.end())] == [
+        f"{kind}.mcap".lstrip(".") for kind in kinds
+    ]
+
+
+BUG = "a fault of our own"
+
+
+def ends_by(bench: Bench, error: Exception) -> list[Path]:
+    """As the daemon does that such a fault ends, out of the task of the loop."""
+    bench.recorder.close(ExceptionGroup("unhandled errors in a TaskGroup", [error]))
+    return listed(bench.where)
+
+
+def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop is beyond it."""
+    whole = Robot.step
+
+    def step(robot: Robot, inputs: Inputs) -> Outputs:
+        if inputs.requests:
+            raise ZeroDivisionError(BUG)
+        return whole(robot, inputs)
+
+    monkeypatch.setattr(Robot, "step", step)
+
+
+@pytest.mark.parametrize("broken", ["robot", "port"])
+def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_it_ended(
+    broken: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+
+    def offer(line: bytes, now: Instant) -> Offered:
+        raise ZeroDivisionError(BUG)
+
+    with monkeypatch.context() as patched:
+        if broken == "robot":
+            break_robot(patched)
+        else:
+            patched.setattr(bench.world.port, "offer", offer)
+        with pytest.raises(ZeroDivisionError) as raised:
+            bench.world.call("stop")
+        (path,) = ends_by(bench, raised.value)
+        ended = live(Recording(path)).again
+    last, number = closing(path), bench.world.steps
+    why = f"in step {number}, ZeroDivisionError: {BUG}"
+    assert path.name.endswith(KEPT)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", why)
+    assert how_it_ends(last.cut, last.why) == f"cut: the daemon ended by a fault of its own: {why}"
+    recording = Recording(path)
+    lived = live(recording)
+    assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
+    assert (recording.whole, recording.cut, recording.why) == (True, "bug", why)
+    assert recording.unfinished is not None
+    step = unfinished(recording.unfinished)
+    assert step.number == number
+    assert [one.verb for one in step.inputs.requests] == ["stop"]
+    assert step.inputs.now.mono_ns <= bench.world.now_ns
+    assert "does not end the robot of this version" in lived.again
+    assert ("ends this version too, by ZeroDivisionError" in ended) is (broken == "robot")
+    rewrite(recording, new := path.with_name("new.mcap"))
+    assert closing(new) == last
+    assert live(Recording(new)) == lived
+
+
+def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
+    bench.world.run(1.0)
+    bench.write()
+    (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
+    last = closing(path)
+    assert last is not None
+    told = how_it_ends(last.cut, last.why)
+    assert told.startswith("cut: the daemon ended by a fault of its own: ValueError: ")
+    assert (told.isprintable(), len(told) < 300) == (True, True)
+
+
+def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench) -> None:
+    class MuteError(Exception):
+        def __str__(self) -> str:
+            raise ValueError
+
+    bench.world.run(1.0)
+    (path,) = ends_by(bench, MuteError())
+    last = closing(path)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", "MuteError")
+
+
+def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench) -> None:
+    bench.world.run(1.0)
+    tape = Tape()
+    World(recorder=tape).run(0.1)
+    bench.recorder.died(replace(tape.taken[0].inputs, missed=1 << 80))
+    (path,) = ends_by(bench, OverflowError("a name that is none: \udc80"))
+    last, recording = closing(path), Recording(path)
+    assert last is not None
+    told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
+    assert (last.cut, last.why.startswith(told)) == ("bug", True)
+    assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
+    assert (live(recording).tally.same, recording.whole) == (True, True)
+
+
+@pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
+def test_an_end_that_was_asked_for_is_no_fault_of_our_own(
+    error: BaseException | None, bench: Bench
+) -> None:
+    bench.world.run(1.0)
+    bench.recorder.close(error)
+    assert cuts(listed(bench.where)) == [("mcap", "")]
+
+
+def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.world.bus.arrivals.append(Arrival("stop", True, b"", "", bench.world.now_ns, None, ""))
+    break_robot(monkeypatch)
+    with pytest.raises(ZeroDivisionError) as raised:
+        bench.world.run(1.0)
+    (path,) = ends_by(bench, raised.value)
+    recording = Recording(path)
+    ((topic, _, data),) = recording.messages()
+    assert (topic, unfinished(data).number, recording.cut) == ("unfinished", 0, "bug")
+    last = closing(path)
+    assert last is not None
+    assert last.said == "start"
+
+
+def test_the_minute_before_a_fault_of_our_own_is_kept(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(6.0)
+    told = cuts(ends_by(bench, ValueError(BUG)))
+    assert len(told) > 2
+    assert told == [("near.mcap", "")] * (len(told) - 1) + [("kept.mcap", "bug")]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
 def test_a_clock_that_is_set_costs_no_recording(
@@ -309,9 +479,18 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.parametrize("happened", [False, True])
-def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
+@pytest.mark.parametrize(
+    ("happened", "error", "told"),
+    [
+        (False, None, ("mcap", "late")),
+        (True, None, ("kept.mcap", "late")),
+        (False, ValueError(BUG), ("kept.mcap", "crash")),
+    ],
+)
+def test_an_end_that_the_disk_was_too_slow_for_is_no_crash_unless_it_was_one(
     happened: bool,
+    error: Exception | None,
+    told: tuple[str, str],
     eager: Bench,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
@@ -320,6 +499,7 @@ def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
         eager.world.call("stop")
         rounds(eager)
     goes, sync = threading.Event(), os.fsync
+    synced = listed(eager.where)[0].stat().st_size
 
     def hangs(handle: int) -> None:
         goes.wait(20.0)
@@ -328,17 +508,16 @@ def test_an_end_that_the_disk_was_too_slow_for_is_no_crash(
     monkeypatch.setattr(module, "CLOSE_S", 0.01)
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", hangs)
-        eager.recorder.close()
+        eager.recorder.close(error)
         # As it is on the disk when the process is gone.
         shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
     goes.set()
     eager.recorder._thread.join(20.0)
     (part,) = listed(where)
-    part.write_bytes(part.read_bytes()[:-40])
+    part.write_bytes(part.read_bytes()[:synced])
     again = Bench(where, monkeypatch)
     rounds(again)
-    kind = "kept.mcap" if happened else "mcap"
-    assert cuts(again.end()) == [(kind, "late"), ("mcap", "")]
+    assert cuts(again.end()) == [told, ("mcap", "")]
     assert not list(where.glob(".0*"))
 
 

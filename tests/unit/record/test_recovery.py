@@ -87,7 +87,7 @@ def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
     last = closing(whole)
     assert last is not None
     assert last.cut == "crash"
-    assert last.said == "1 change of who drives, 1 stop (stopped by unnamed (native))"
+    assert last.said == "start, 1 change of who drives, 1 stop (stopped by unnamed (native))"
 
 
 def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(

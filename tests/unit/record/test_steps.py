@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 from msgspec.structs import replace
 
-from acsard.record.steps import checksum, microposes
+from acsard.record.steps import Unfinished, UnfinishedError, checksum, microposes, unfinished
 from acsard.values import Estimate, Pose
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -30,3 +31,16 @@ def test_a_checksum_goes_on_and_sees_every_bit() -> None:
     assert checksum([*every[:-1], nudged], 0) != checksum(every, 0)
     turned = replace(last, positions=(0.0, *last.positions[1:]))
     assert checksum([*every[:-1], turned], 0) != checksum(every, 0)
+
+
+def test_what_came_into_a_step_that_did_not_end_comes_back_whole() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=0.5)
+    world.call("stop")
+    for number, taken in enumerate(tape.taken):
+        step = Unfinished(number, taken.inputs)
+        assert unfinished(step.encode()) == step
+    for data in (b"", b"none", Unfinished(1, taken.inputs).encode()[:-1]):
+        with pytest.raises(UnfinishedError, match="not a step"):
+            unfinished(data)

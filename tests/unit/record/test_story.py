@@ -94,3 +94,5 @@ def test_a_list_says_who_stopped_it_and_how_often_what_happened() -> None:
         "(stopped by joe)"
     )
     assert summary([]) == ""
+    assert summary([], starts=True) == "start"
+    assert summary([Told(1.0, "fault", "a wheel")], starts=True) == "start, 1 fault"
