@@ -18,10 +18,12 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 from msgspec import Struct, field
 
 from acsard.config.settings import RECORD, RecordConfig
+from acsard.record.closing import CUTS
 from acsard.record.file import MODE, About, Writing
 from acsard.record.recovery import recover
 from acsard.record.room import AROUND_NS, Bounds, Disk, Ended, Kind, Steady, share, too_much
@@ -77,25 +79,33 @@ def _stem(path: Path) -> str:
     return path.name.partition(".")[0]
 
 
-def leave(part: Path, kind: Kind) -> None:
-    """The daemon ends and the disk is too slow for the end of this file: no crash has cut it.
+def leave(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
+    """The disk is too slow for the end of this file, or takes no more: no crash has cut it.
 
     A mark beside it says so, and what the file is. Raises `OSError`.
     """
-    _mark(part).write_text(kind)
+    mark = _mark(part)
+    try:
+        mark.write_text(f"{kind} {cut}")
+    except OSError:
+        if kind != "plain":  # as a crash's it is kept
+            mark.unlink(missing_ok=True)
+        raise
 
 
 def _mark(part: Path) -> Path:
     return part.with_name(f".{part.name}.left")
 
 
-def _left(part: Path) -> Kind | None:
-    """What the file is whose daemon has ended in order, None where it has not."""
+def _left(part: Path) -> tuple[Kind, str] | None:
+    """What the file is that no crash has cut, and what has; None where a crash may have."""
     try:
-        said = _mark(part).read_bytes()
+        said = _mark(part).read_bytes().decode("ascii", "replace").split()
     except FileNotFoundError:
         return None
-    return next((kind for kind in ENDINGS if kind.encode() == said), None)
+    # A full disk takes a name, and no words.
+    first, cut = (*said, "late")[:2] if said else ("plain", "disk")
+    return next(((kind, cut) for kind in ENDINGS if kind == first and cut in CUTS), None)
 
 
 class Run(Struct):
@@ -154,11 +164,12 @@ class Ring:
 
     def _recover(self) -> None:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
-            seen, disk = part.stat(), self._disk()
+            try:
+                seen, left, disk = part.stat(), _left(part), self._disk()
+            except FileNotFoundError:
+                continue  # somebody removes it just now
             ours = self._run.cut.get(part.name)
-            ended = _left(part)
-            kind: Kind = ours or ended or "kept"
-            cut = "disk" if ours else "late" if ended else "crash"
+            kind, cut = (ours, "disk") if ours else left or ("kept", "crash")
             whole = part.with_name(_stem(part) + ENDINGS[kind])
             try:
                 said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
@@ -167,7 +178,7 @@ class Ring:
             self.said += [said] if said else []
             if ours:
                 self._run.numbers.add(_number(part) or 0)
-            elif whole.exists() and not ended:
+            elif whole.exists() and not left:
                 self.cut_ns = seen.st_mtime_ns
                 self._near(part, seen.st_mtime_ns)
 
@@ -220,8 +231,9 @@ class Ring:
 
     def keep(self, path: Path) -> None:
         """Something happened close to what is in this finished file."""
-        if path.exists() and path.name.endswith(WHOLE) and _kind(path) == "plain":
-            path.rename(path.with_name(_stem(path) + NEAR))
+        if path.name.endswith(WHOLE) and _kind(path) == "plain":
+            with suppress(FileNotFoundError):  # somebody has removed it
+                path.rename(path.with_name(_stem(path) + NEAR))
             self._sync()
 
     def tend(self, now: Instant) -> None:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from acsard import __version__
 from acsard.config.parsing import effective
@@ -51,8 +51,8 @@ HAPPENED = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
 MOST_TEXT = 200
 """Characters of what a fault of our own says."""
 
-CLOSE_S = 0.5
-"""How long the end waits for the last chunk."""
+CLOSE_S, MARK_S = 0.5, 0.1
+"""How long the end waits for the last chunk; and for a mark in its place."""
 
 
 class _Start(NamedTuple):
@@ -147,7 +147,10 @@ class Recorder:
         self._over.set()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive() and self._disk.bug is None:
-            self._disk.leave()
+            # A disk that hangs must not hold up the end of the daemon as well.
+            marking = threading.Thread(target=self._disk.leave, args=["late"], daemon=True)
+            marking.start()
+            marking.join(MARK_S)
 
     def _bug(self, error: Exception) -> _Bug:
         why = type(error).__name__
@@ -242,12 +245,13 @@ class _Disk:
         if self._start is None and self._writing is None and self._pause == 0:
             self._ask()
 
-    def leave(self) -> None:
-        """The daemon ends while the thread still waits for the disk; called beside it."""
+    def leave(self, cut: Literal["late", "disk"]) -> None:
+        """Whatever becomes of the file that is being written, no crash has cut it. Called in a
+        thread of its own where the daemon ends while this one still waits for the disk."""
         writing = self._writing
         if writing is not None:
             with suppress(OSError):  # then the next start takes it for a crash's
-                leave(writing.path, self._kind)
+                leave(writing.path, self._kind, cut)
 
     def _take(self) -> Ring:
         """The directory, and what is told of it."""
@@ -367,6 +371,8 @@ class _Disk:
             self._say(Event("recording", f"{text}; driving goes on", "warning"))
         if self._writing is not None:
             self._run.cut[self._writing.path.name] = self._kind
+            if self.bug is None:
+                self.leave("disk")
         for open_one in (self._writing, self._ring):
             if open_one is not None:
                 open_one.close()

@@ -602,6 +602,54 @@ def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
     assert cuts(eager.end()) == [("mcap", "disk"), ("mcap", "")]
 
 
+@pytest.mark.parametrize(
+    ("happened", "error", "told"),
+    [
+        (False, None, ("mcap", "disk")),
+        (True, None, ("kept.mcap", "disk")),
+        (False, ValueError(BUG), ("kept.mcap", "crash")),
+    ],
+)
+def test_a_disk_that_refuses_the_end_is_no_crash_to_the_next_daemon(
+    happened: bool,
+    error: Exception | None,
+    told: tuple[str, str],
+    eager: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if happened:
+        eager.world.call("stop")
+        rounds(eager)
+    (part,) = listed(eager.where)
+    synced = part.stat().st_size
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        eager.recorder.close(error)
+    part.write_bytes(part.read_bytes()[:synced])
+    again = Bench(eager.where, monkeypatch)
+    rounds(again)
+    assert cuts(again.end())[0] == told
+    assert not list(eager.where.glob(".0*"))
+
+
+def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def hangs(*_: object) -> None:
+        goes.wait(60.0)
+
+    monkeypatch.setattr(module, "CLOSE_S", 0.01)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", hangs)
+        patched.setattr(module, "leave", hangs)
+        eager.recorder.close()
+        assert eager.recorder._thread.is_alive()
+    goes.set()
+    eager.recorder._thread.join(20.0)
+
+
 def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
