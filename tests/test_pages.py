@@ -288,7 +288,7 @@ READS_KEYS = {"error_budget/feed.py", "web/page/main.js"}
     [
         ("key", LISTS_KEYS, "messages/report.py", READS_KEYS),
         ("key", r"\bInterfaces\b", "incoming/queries.py", set()),
-        ("simulated fault", "stuck_encoder", "sim/named_faults.py", set()),
+        ("simulated fault", "stuck_encoder", "config/named_faults.py", set()),
         ("setting", "angular_jerk", "config/motion_rules.py", {"drive/limits.py"}),
         ("ROS topic", "cmd_vel_teleop", "ros/transports.py", set()),
         ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/definitions.py", set()),

@@ -7,11 +7,10 @@ import sys
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
+from acsard.config.named_faults import FAULTS, RESET, NamedFault, forms, named
 from acsard.config.settings import Config
 from acsard.host.exits import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import FAULTS
-from acsard.sim.named_faults import RESET, NamedFault, forms, named
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,7 +42,7 @@ def fault(text: str) -> NamedFault:
     try:
         return named(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+        raise argparse.ArgumentTypeError(f"{text}: {error}") from None
 
 
 def main(args: argparse.Namespace) -> int:
@@ -95,14 +94,14 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
             if fault.name == RESET:
                 _reset_again(mcu, fault.values[0])
             else:
-                stack.enter_context(fault.on(mcu))
+                stack.enter_context(mcu.having(fault))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:
             link = Path(args.link)
             _make_link(link, device)
             stack.callback(link.unlink, missing_ok=True)
         print(f"acsard run --port {args.link or device}", flush=True)
-        faults = ", ".join(fault.name for fault in args.fault) or "none"
+        faults = ", ".join((*config.sim.faults, *(fault.name for fault in args.fault))) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
     print(f"heard {mcu.valid_lines} valid lines", file=sys.stderr)

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import get_args, get_type_hints
 
 from acsard.config.live import flat, live
+from acsard.config.named_faults import ARGUMENTS, FAULTS
 from acsard.config.parsing import effective
 from acsard.config.settings import Config, LogConfig
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
-from acsard.sim.faults import ARGUMENTS, FAULTS
 
 NUMBERS = "acsard log 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
 """The recordings by their numbers; the files here are offered beside them."""

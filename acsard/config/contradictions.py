@@ -1,7 +1,7 @@
 """The rules between the keys of a configuration: what contradicts, and what will surprise.
 
 Each contradiction is a line with key, value and mend; each warning a sentence. Those about motion
-are in `motion_rules.py`.
+are in `motion_rules.py`, about the simulator's faults in `named_faults.py`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import ipaddress
 import math
 
-from acsard.config import motion_rules
+from acsard.config import motion_rules, named_faults
 from acsard.config.partial import Rule, told
 from acsard.config.settings import BusConfig, Config, McuConfig
 from acsard.config.validation import show
@@ -52,22 +52,19 @@ def warnings(config: Config) -> list[str]:
     if config.access.wildcards:
         found.append("access.wildcards = true: everyone with a certificate can stall the bus")
     hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
-    if config.robot.id == Config().robot.id and not all(_is_loopback(h) for h in hosts if h):
+    outside = not all(_is_loopback(host) for host in hosts if host)
+    if outside and config.robot.id == Config().robot.id:
         found.append(
             f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
             "a second robot there would share its keys; give each its own id"
         )
     ros = config.ros
-    if (
-        (ros.bridge or ros.rmw)
-        and not ros.namespace
-        and not all(_is_loopback(h) for h in hosts if h)
-    ):
+    if outside and (ros.bridge or ros.rmw) and not ros.namespace:
         found.append(
             'ros.namespace = "" on a bus that leaves this machine: a second robot there would '
             "share its ROS topics; give each its own namespace"
         )
-    return found
+    return found + named_faults.warnings(config)
 
 
 def _count_warnings(config: Config) -> list[str]:
@@ -297,5 +294,6 @@ RULES: tuple[Rule, ...] = (
     lambda config: _endpoint_problems(config, "connect"),
     _access_problems,
     _ros_problems,
+    *named_faults.RULES,
 )
 """Each by itself: one that looks at a key without a valid value says nothing."""

@@ -62,6 +62,13 @@ WebAddress = Annotated[
         extra={"unit": "http(s)://, an address, a port", "example": "http://127.0.0.1:8080"},
     ),
 ]
+FaultName = Annotated[
+    str,
+    Meta(
+        pattern=r"^[\x20-\x7e]{1,64}\Z",
+        extra={"unit": "a fault of `acsard sim --fault` in quotes", "example": "ftdi"},
+    ),
+]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
 Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
 Angle = Annotated[float, Meta(ge=-6.2832, le=6.2832, extra={"unit": "rad"})]
@@ -316,6 +323,7 @@ class SimConfig(Struct, frozen=True):
     gyro_noise: Annotated[float, Meta(ge=0.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
     gyro_delay: Annotated[float, Meta(ge=0.0, le=0.2, extra={"unit": "s"})] = 0.0
     seed: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 1
+    faults: tuple[FaultName, ...] = ()
 
 
 class Config(Struct, frozen=True):

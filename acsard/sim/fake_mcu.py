@@ -3,7 +3,7 @@
 Bytes in, bytes out, the time given. It keeps the MCU contract by default: boots stopped, acts on
 whole valid lines only, stops the motors when no valid line came for 300 ms, answers a checked line
 checked. It shares no parser with the host, so that an error in one does not hide in the other. Its
-faults are in `faults.py`, each a `with` block:
+faults are in `faults.py`, each a `with` block; those of `[sim] faults` last:
 
     with mcu.mute(): ...
 """
@@ -14,9 +14,10 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import count, cycle
 
+from acsard.config.named_faults import named
 from acsard.config.settings import Config, WheelMap
 from acsard.config.wire_time import wire_ns
 from acsard.sim import protocol
@@ -66,6 +67,9 @@ class FakeMcu(Faults):
         self.watchdog_trips = 0
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
+        self._lasting = ExitStack()
+        for text in config.sim.faults:
+            self._lasting.enter_context(self.having(named(text)))
 
     # time
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
+from acsard.config.named_faults import NamedFault
 from acsard.sim import protocol
 from acsard.values import NS_PER_S
 
@@ -82,6 +83,11 @@ class Faults:
             return data
         place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
+
+    def having(self, fault: NamedFault) -> Fault:
+        """The `with` block of the fault that a person named."""
+        block: Fault = getattr(self, fault.name)(*fault.values)
+        return block
 
     def mute(self) -> Fault:
         """Hears and drives, but answers nothing."""
@@ -223,24 +229,6 @@ class Faults:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns
         return max(now_ns, began_ns + self.stall_ns)
-
-
-FAULTS = (
-    "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
-    "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
-    "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
-    "ftdi",
-)  # fmt: skip
-"""The faults that need no argument, by method name: what `acsard sim --fault` offers."""
-
-ARGUMENTS = {
-    "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
-    "reversed_encoder": "m",
-    "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
-    "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
-    "pushed": "n", "stalls": "nn",
-}  # fmt: skip
-"""The faults that need arguments: `m` a motor, 0 to 3 for a to d; `n` a number."""
 
 
 def _swapped(order: list[int], one: int, other: int) -> list[int]:

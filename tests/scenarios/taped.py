@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+from acsard.config.named_faults import FAULTS
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
@@ -18,7 +19,7 @@ from acsard.record.steps import Step, Taken
 from acsard.record.story import told
 from acsard.robot import Robot
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import FAULTS, Fault
+from acsard.sim.faults import Fault
 from acsard.values import Inputs, Outputs, Recording
 from tests.scenarios.world import START, World
 

@@ -6,9 +6,10 @@ from contextlib import AbstractContextManager
 
 import pytest
 
-from acsard.config.settings import Config, ControlConfig, McuConfig
+from acsard.config.named_faults import named
+from acsard.config.settings import Config, ControlConfig, McuConfig, SimConfig
+from acsard.messages.schema import RobotState
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.named_faults import named
 from acsard.values import NS_PER_S
 from tests.scenarios.world import World
 
@@ -324,7 +325,7 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
 def test_a_link_that_loses_lines_is_told_once(fault: str) -> None:
     world = World()
-    with named(fault).on(world.mcu):
+    with world.mcu.having(named(fault)):
         world.run(25.0)
     told = [event for event in world.events if event.name == "lines_lost"]
     assert [event.level for event in told] == ["warning"]
@@ -340,9 +341,17 @@ def test_a_sound_link_is_not_said_to_lose_lines() -> None:
 
 def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
     world = World()
-    with named("stalls=1:0.3").on(world.mcu):
+    with world.mcu.having(named("stalls=1:0.3")):
         world.run(5.5)
     assert world.state.counters["link_lost"] == 5
+
+
+def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
+    world = World(Config(sim=SimConfig(faults=("mute",))))
+    world.run(10.0)
+    states = [one for one in world.bus.published["state"] if isinstance(one, RobotState)]
+    assert {state.link for state in states} == {"booting"}
+    assert world.mcu.valid_lines > 0
 
 
 @pytest.mark.parametrize(
@@ -357,7 +366,7 @@ def test_a_silent_or_garbled_board_is_told_by_what_was_heard(
     fault: str, heard: str, mend: str
 ) -> None:
     world = World()
-    with named(fault).on(world.mcu):
+    with world.mcu.having(named(fault)):
         world.run(2.9)
         assert "first good lines" in world.state.reason
         states = len(world.bus.published["state"])

@@ -152,3 +152,23 @@ def test_a_gyro_of_ros_is_heard_on_either_transport(tmp_path: Path, peer: Peer) 
         until(lambda: bus.count("imu_absurd") == 1, 5.0, "the bridge's is heard")
         bus.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
         until(lambda: bus.count("imu_absurd") == 2, 5.0, "rmw_zenoh's is heard")
+
+
+# faults that the file names
+
+
+@pytest.mark.slow
+def test_a_simulator_that_the_file_makes_mute_never_links_and_the_log_says_why(
+    tmp_path: Path,
+) -> None:
+    with (
+        Daemon(tmp_path, config={"sim": {"faults": ["mute"]}}) as daemon,
+        Bus(daemon.endpoint) as bus,
+        bus.follow("state") as states,
+    ):
+        states.find(lambda state: "nothing at all heard" in state["reason"], 20.0, "no reply")
+        assert bus.get("sim/pose")["header"]["frame_id"] == "sim"
+        assert "up" not in {seen.value["link"] for seen in list(states.seen)}
+        told = daemon.events("configuration")
+    assert [one["level"] for one in told] == ["warning"]
+    assert 'sim.faults = ["mute"]' in told[0]["text"]

@@ -12,9 +12,9 @@ import msgspec
 from acsard.checkup import advice, procedure
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
+from acsard.config.named_faults import named
 from acsard.config.settings import Config
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.named_faults import named
 from acsard.sim.virtual_wire import VirtualWire
 
 MS = 1_000_000
@@ -51,7 +51,7 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                stack.enter_context(named(text).on(self.mcu))
+                stack.enter_context(self.mcu.having(named(text)))
             yield
 
     @contextmanager

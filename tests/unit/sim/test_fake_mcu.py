@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.config.named_faults import FAULTS
 from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.sim.fake_mcu import MS, RESET_NS, WATCHDOG_NS, FakeMcu
-from acsard.sim.faults import FAULTS
 from tests.each import each
 
 LINE = b"ap12.50,bn08.75,cp15.00,dn10.25\r\n"

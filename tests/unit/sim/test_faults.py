@@ -6,8 +6,10 @@ import inspect
 
 import pytest
 
+from acsard.config.named_faults import ARGUMENTS, FAULTS, named
+from acsard.config.settings import Config, SimConfig
 from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import FAULTS, Faults
+from acsard.sim.faults import Faults
 
 
 def switches(faults: Faults) -> dict[str, object]:
@@ -59,3 +61,31 @@ def test_no_data_cannot_be_damaged() -> None:
     faults = Faults()
     with faults.bit_errors(every=1):
         assert faults._damaged(b"") == b""
+
+
+EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1"}
+EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
+
+
+def test_each_fault_can_be_turned_on_and_back() -> None:
+    mcu = FakeMcu(Config())
+    before = dict(vars(mcu))
+    for text in EACH:
+        with mcu.having(named(text)):
+            assert vars(mcu) != before, text
+        assert vars(mcu) == before, text
+
+
+def test_what_the_configuration_names_it_has_from_its_start_on() -> None:
+    for text in EACH:
+        mcu, told = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
+        with mcu.having(named(text)):
+            for switch in switches(Faults()):
+                assert getattr(told, switch) == getattr(mcu, switch), (text, switch)
+
+
+def test_it_has_all_of_them_at_once() -> None:
+    told = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
+    assert (told.latency_ns, told.stall_every_ns, told.stall_ns) == (
+        16_000_000, 5_000_000_000, 150_000_000,
+    )  # fmt: skip
