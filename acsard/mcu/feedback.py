@@ -77,6 +77,9 @@ class Told(Struct, frozen=True, gc=False):
     place: float = 0.0
     """Its slot, of the clock found as the `found`th."""
     found: int = 0
+    early: bool = False
+    """It came before it was due: `due_ns` is when it came, and the next one is as far from that as
+    it is due later."""
 
 
 class Timeline:
@@ -190,7 +193,7 @@ class Timeline:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay is that of a first answer read late, in a stall that the
                     # line before has counted: this one is no further from it than it came.
-                    return Told("prompts", came_ns)
+                    return Told("prompts", came_ns, early=True)
                 return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
         else:
             answered = None
@@ -221,7 +224,7 @@ class Timeline:
         dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
         self._told = replace(told, due_ns=max(told.due_ns, last.due_ns))
         if told.dt is not None and told.clock == last.clock:
-            return told.dt, told.bridged
+            return dt if last.early else told.dt, told.bridged
         period = self._usual_ns / NS_PER_S
         missing = dt > 1.5 * period and self._habit.speaks is not False
         return dt, dt - period if missing else 0.0

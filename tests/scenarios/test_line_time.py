@@ -86,12 +86,15 @@ def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
     assert drive.error() <= 1.05 * drive.floor + 0.0005
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [1.0, 2.0])
-def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(every: float) -> None:
+@pytest.mark.variations(2)
+@pytest.mark.parametrize(("every", "stall"), [(2.0, 0.12), (1.0, 0.09), (1.0, 0.15), (2.0, 0.09)])
+def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
+    every: float, stall: float
+) -> None:
+    """Also where the link is lost in each stall, and the answers come before they are due."""
     drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)
-    drive.faults.enter_context(drive.world.mcu.stalls(every, 0.09))
-    assert drive.error() < 0.005
+    drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
+    assert drive.error() < 0.010
 
 
 def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:
