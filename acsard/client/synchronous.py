@@ -50,13 +50,15 @@ class _Puts:
     heels of another command, be it of somebody else who shares it, would be lost."""
 
     def __init__(self) -> None:
-        self._lock, self._last_s = threading.Lock(), 0.0
+        # A signal's handler may send as well, while the same thread is in here.
+        self._lock, self._next_s = threading.RLock(), 0.0
 
     def wait(self) -> None:
         """Until one may go."""
         with self._lock:
-            time.sleep(max(0.0, self._last_s + SPACING_S - time.monotonic()))
-            self._last_s = time.monotonic()
+            at_s = max(self._next_s, time.monotonic())
+            self._next_s = at_s + SPACING_S
+        time.sleep(max(0.0, at_s - time.monotonic()))
 
 
 class Client:

@@ -44,6 +44,9 @@ NEAR = ".near.mcap"
 WHOLE = ".mcap"
 PART = ".mcap.part"
 
+LEFT = ".left"
+"""The ending of the mark of a file that no crash has cut."""
+
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
@@ -79,33 +82,28 @@ def _stem(path: Path) -> str:
     return path.name.partition(".")[0]
 
 
+def _stem_of(mark: Path) -> str:
+    """Of the file that it is a mark of."""
+    return mark.name[1:].partition(PART)[0]
+
+
 def leave(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
     """The disk is too slow for the end of this file, or takes no more: no crash has cut it.
 
-    A mark beside it says so, and what the file is. Raises `OSError`.
+    A mark beside it says so, and what the file is: by its name, which a full disk takes, and whole
+    or not at all. Raises `OSError`.
     """
-    mark = _mark(part)
-    try:
-        mark.write_text(f"{kind} {cut}")
-    except OSError:
-        if kind != "plain":  # as a crash's it is kept
-            mark.unlink(missing_ok=True)
-        raise
-
-
-def _mark(part: Path) -> Path:
-    return part.with_name(f".{part.name}.left")
+    part.with_name(f".{part.name}.{kind}.{cut}{LEFT}").touch()
 
 
 def _left(part: Path) -> tuple[Kind, str] | None:
     """What the file is that no crash has cut, and what has; None where a crash may have."""
-    try:
-        said = _mark(part).read_bytes().decode("ascii", "replace").split()
-    except FileNotFoundError:
-        return None
-    # A full disk takes a name, and no words.
-    first, cut = (*said, "late")[:2] if said else ("plain", "disk")
-    return next(((kind, cut) for kind in ENDINGS if kind == first and cut in CUTS), None)
+    for mark in part.parent.glob(f".{part.name}.*{LEFT}"):
+        first, _, cut = mark.name.removeprefix(f".{part.name}.").removesuffix(LEFT).partition(".")
+        for kind in ENDINGS:
+            if kind == first and cut in CUTS:
+                return kind, cut
+    return None
 
 
 class Run(Struct):
@@ -153,8 +151,8 @@ class Ring:
                 left.unlink()  # a copy that did not become whole
             self.trim(None, refused)  # first: what is made whole needs room
             self._recover()
-            for mark in self._directory.glob(f".*{PART}.left"):
-                if not mark.with_name(mark.name[1 : -len(".left")]).exists():
+            for mark in self._directory.glob(f".*{PART}.*{LEFT}"):
+                if not mark.with_name(f"{_stem_of(mark)}{PART}").exists():
                     mark.unlink()  # what it was of is whole now
         except OSError:
             self.close()

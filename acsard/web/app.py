@@ -50,7 +50,9 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 OPEN = ("/", "/token", "/favicon.ico")
 """For everybody: a page has to be there before it can say who shows it."""
 
-STOP = "/api/srv/stop"
+UNHURRIED = ("/api/srv/stop", "/api/whoami", "/ws")
+"""A stop always goes; and a page that comes back must not be kept out by another program that has
+its token: how many connections there are is limited elsewhere."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """What aiohttp refuses by itself; anything else is malformed."""
@@ -170,8 +172,8 @@ class Page:
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     def _hurries(self, request: web.Request, who: Who) -> bool:
-        """He asks for more than he may have; whoever is at the machine may, and a stop always."""
-        if not who.token or request.path == STOP:
+        """He asks for more than he may have; whoever is at the machine may."""
+        if not who.token or request.path in UNHURRIED:
             return False
         return not self._paces.take(who.token, clock.mono_ns())
 

@@ -14,7 +14,7 @@ OVERRUNS = 600
 """So many messages too many end a connection."""
 
 REQUESTS_HZ, REQUESTS_AT_ONCE = 50.0, 200.0
-"""Of one token, by HTTP; a page asks for twenty when it opens, and then now and then."""
+"""Of one token, by HTTP; a page asks now and then. Its files are for everybody."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
 """WebSockets of who comes from elsewhere: in all, of one address, with one token from wherever,

@@ -31,8 +31,8 @@ KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Comes by itself, all the time. Asked for it, a router's storage has the last one of a robot that
-is off for a week."""
+"""Comes by itself, all the time. Asked for another robot's, a router's storage has the last one of
+a robot that is off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """A bus that is stuck, or a session that has ended: later there may be a way again."""
@@ -96,7 +96,7 @@ class Streams:
         try:
             async with stream.lock:
                 if stream.declared is None:
-                    stream.declared = await self._declare(client.like(robot), key, stream)
+                    stream.declared = await self._declare(client, robot, key, stream)
         except BaseException:
             await self.leave(robot, key)
             raise
@@ -117,19 +117,22 @@ class Streams:
             except (TimeoutError, zenoh.ZError):
                 pass  # the bus is stuck, or gone: what comes goes nowhere
 
-    async def _declare(self, client: Client, key: str, stream: Stream) -> Any:
+    async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
+        client = own.like(robot)
+        asks = key != STATE or own.key(key) == client.key(key)
+
         def late(subscriber: Any) -> None:
             subscriber.undeclare()
 
-        def own(take: Take) -> Take:
+        def of_it(take: Take) -> Take:
             return lambda sample: take(sample) if on(client.key(key), sample) else None
 
         def declare() -> Any:
-            heard = client.listen(key, own(stream.take))
-            if key == STATE:
+            heard = client.listen(key, of_it(stream.take))
+            if not asks:
                 return heard
             try:
-                client.ask(key, own(stream.answered))  # what is published seldom is there at once
+                client.ask(key, of_it(stream.answered))  # what is published seldom is there at once
             except zenoh.ZError:
                 heard.undeclare()
                 raise

@@ -206,6 +206,8 @@ def test_who_asks_without_end_is_slowed_down_and_may_stop(
             seen = set[int]()
             for _ in range(16):
                 seen |= set(await asyncio.gather(*map(one, range(50))))
+            async with session.get(f"{table.page.away}/api/whoami") as answer:
+                assert answer.status == 200  # a page that comes back is not kept out
             async with session.post(f"{table.page.away}/api/srv/stop") as answer:
                 return seen, answer.status
 

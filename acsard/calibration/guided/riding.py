@@ -88,6 +88,8 @@ class Riding:
         """A key was pressed; the hand that has just pressed Enter may still lie on it."""
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
+        if self.phase is Phase.MOVING and now - self._stepped > SILENT_S / 2:
+            self._halt(HELD_UP)  # it may have been pressed because the robot had stopped
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
             self._settle(now)

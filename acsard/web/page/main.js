@@ -139,14 +139,14 @@ function limited() {
 
 /** For how long a state is fresh, ms: one that is published seldom for longer. */
 function lasts() {
-  return Math.max(500, OTHER ? 2500 * period : 2500 / (hello?.state_rate || 10));
+  return Math.max(500, OTHER ? 2500 * (period || 1) : 2500 / (hello?.state_rate || 10));
 }
 
 function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen);
-  if (state && old > lasts()) views.unheard(silent);
+  if (state && performance.now() - heard > lasts()) views.unheard(silent);
   if (old > 2 * lasts()) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
   for (const plot of Object.values(plots)) plot.draw(performance.now());
@@ -156,7 +156,7 @@ function stated({ detail }) {
   // What was true long before this page came is nothing that it has measured.
   if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
-  if (since > 0) period = Math.min(since, 2);
+  if (since > 0) period = Math.min(since, 10);
   // What was said of a stop is not true any more once that is cleared.
   if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
   seen = true;

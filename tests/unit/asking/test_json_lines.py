@@ -51,8 +51,8 @@ class Program:
             yield person
 
     def hang_up(self) -> None:
-        os.close(self._to_child)
-        self._to_child = -1
+        end, self._to_child = self._to_child, -1
+        os.close(end)
 
     def close(self) -> None:
         for end in (self._asked, self._told):
@@ -170,8 +170,10 @@ def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
     os.write(writer, b"x" * 4096)
     with os.fdopen(reader), os.fdopen(writer, "w") as full:
         with redirect_stdout(full), JsonPerson() as person:
-            threading.Timer(0.3, program.hang_up).start()
+            hangs_up = threading.Timer(0.3, program.hang_up)
+            hangs_up.start()
             interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+            hangs_up.join()
         os.read(reader, 4096)
 
 

@@ -77,6 +77,23 @@ def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -
     assert min(b - a for a, b in itertools.pairwise(puts)) > SPACING_S / 2
 
 
+@pytest.mark.timeout(10)
+def test_a_signal_s_handler_sends_while_the_same_thread_waits_for_its_turn(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, sleep = client_of(session), time.sleep
+    client.send(0.0)
+
+    def interrupted(seconds: float) -> None:
+        monkeypatch.setattr(time, "sleep", sleep)
+        client.send(0.0)
+        sleep(seconds)
+
+    monkeypatch.setattr(time, "sleep", interrupted)
+    client.send(0.5)
+    assert len(session.heard) == 3
+
+
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
     other = Session("fedcba9876543210")
     for one in (session, other):

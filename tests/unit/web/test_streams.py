@@ -48,24 +48,25 @@ def test_an_answer_that_was_overtaken_is_left_out(samples: list[zenoh.Sample]) -
     assert stream.value()[:2] == (1, b"2")
 
 
-def test_what_comes_by_itself_is_not_asked_for(session: zenoh.Session) -> None:
+def test_what_comes_by_itself_is_not_asked_for_of_another_robot(session: zenoh.Session) -> None:
     """A router's storage has the last state of a robot that is off, and it would look like now."""
 
-    async def story(key: str) -> bytes:
+    async def story(robot: str, key: str) -> bytes:
         streams = Streams()
-        stream = await streams.follow(Client(session, "acsar", "app"), "acsar", key)
+        stream = await streams.follow(Client(session, "acsar", "app"), robot, key)
         for _ in range(300):
             if stream.number:
                 break
             await asyncio.sleep(0.001)
-        await streams.leave("acsar", key)
+        await streams.leave(robot, key)
         return stream.value()[1]
 
     def old(query: zenoh.Query) -> None:
         query.reply(query.key_expr, b"1", encoding="application/json")
 
-    storage = session.declare_queryable("acsard/acsar/*", old)
-    assert [asyncio.run(story(key)) for key in ("events", "state")] == [b"1", b"null"]
+    storage = session.declare_queryable("acsard/*/*", old)
+    asked = [("acsar", "state"), ("other", "events"), ("other", "state")]
+    assert [asyncio.run(story(*one)) for one in asked] == [b"1", b"1", b"null"]
     storage.undeclare()
 
 

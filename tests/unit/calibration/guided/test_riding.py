@@ -171,6 +171,13 @@ def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> N
     assert set(world.run(3.0).said[-100:]) == {REST}
 
 
+def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
+    world = World(TURN).until_moving()
+    world.now += 1.5
+    world.riding.key(" ", world.now)
+    assert world.riding.halted == HELD_UP
+
+
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
