@@ -62,7 +62,7 @@ class ZenohBus:
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
         self._inbox = Inbox(prefix, self._replies, sources, waker)
-        self._outlets, self._links = Outlets(), Links(bus)
+        self._outlets, self._links = Outlets(), Links(bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
         """Declared entities: Zenoh undeclares what is no longer referred to."""

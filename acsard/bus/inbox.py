@@ -56,6 +56,8 @@ class Inbox:
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
         """The id this session stamps unstamped samples with: no stamp of theirs."""
+        self.routers: frozenset[str] = frozenset()
+        """The ids that routers stamp them with: when they came by there, and nobody's name."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, deque[Arrival]] = {
             key: deque(maxlen=ARRIVALS) for key in (*source_keys(sources), OTHERS)
@@ -114,6 +116,8 @@ class Inbox:
             stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
             if stamp.get_id() == self.own_id:
                 stamp_ns, sender, received_ns = None, "", stamp_ns
+            elif via == "native" and sender in self.routers:
+                sender = ""
         arrival = Arrival(
             key,
             put,

@@ -10,6 +10,7 @@ from threading import Event, Thread
 
 import zenoh
 
+from acsard.bus.inbox import Inbox
 from acsard.config.settings import BusConfig
 from acsard.values import RoutersStatus
 
@@ -22,8 +23,9 @@ STOP_S = 0.05
 class Links:
     """Looks after the links of one session."""
 
-    def __init__(self, bus: BusConfig) -> None:
-        self._bus = bus
+    def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
+        """The inbox is told which routers there are."""
+        self._bus, self._inbox = bus, inbox
         self._status: RoutersStatus | None = None
         self._news = False
         """Set behind the status, so that none is overlooked."""
@@ -39,10 +41,9 @@ class Links:
         return self._status
 
     def start(self, session: zenoh.Session) -> None:
-        """Begin to ask, if there is anything to be connected to."""
+        """Begin to ask: also where we connect to nothing, a router may have connected to us."""
         self._session = session
-        if self._bus.connect:
-            self._thread.start()
+        self._thread.start()
 
     def stop(self) -> None:
         """Ask no more; whoever looks up a name is not waited for."""
@@ -51,10 +52,14 @@ class Links:
             self._thread.join(STOP_S)
 
     def _run(self) -> None:
-        while not self._over.wait(EVERY_S):  # first it has time to connect
+        connects = False  # first it has time to
+        while True:
             status = self._look()
-            if status != self._status:
+            if connects and status != self._status:
                 self._status, self._news = status, True
+            connects = bool(self._bus.connect)
+            if self._over.wait(EVERY_S):
+                return
 
     def _look(self) -> RoutersStatus:
         endpoints = self._bus.connect
@@ -64,6 +69,8 @@ class Links:
             kinds = {str(one.zid): one.whatami for one in info.transports()}
         except zenoh.ZError:  # it is being closed
             return self._status or RoutersStatus()
+        routers = (zid for zid, kind in kinds.items() if kind == zenoh.WhatAmI.ROUTER)
+        self._inbox.routers = frozenset(routers)
         missing = unreached(self._bus.mode, endpoints, set(far))
         connected = tuple(one for one in endpoints if one not in missing)
         ends = {end for end, zid in far.items() if kinds.get(zid) == zenoh.WhatAmI.PEER}

@@ -53,7 +53,7 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp, when it is the sender's."""
     sender: str
-    """Whose that is; "" without one."""
+    """Whose that is; "" without one, and of a router's."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
@@ -213,8 +213,7 @@ def voice(arrival: Arrival) -> Voice:
         stamp_ns = arrival.stamp_ns if told.stamp is None else told.stamp
         return Voice(told.sender, stamp_ns, told.sequence)
     if arrival.sender:
-        # A router stamps what has no time; so does a program of its own: who can tell?
-        return Voice(arrival.sender, arrival.stamp_ns, shared=True)
+        return Voice(arrival.sender, arrival.stamp_ns, shared=arrival.via == "bridge")
     key = arrival.key.partition("/")[2]
     return Voice(f"{arrival.via}/{key}", arrival.stamp_ns, shared=True)
 

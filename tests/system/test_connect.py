@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
-from tests.system.harness import Bus, Daemon, Program, Tables, acsard, finish, free_endpoint, until
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Program,
+    Tables,
+    acsard,
+    client_config,
+    finish,
+    free_endpoint,
+    twist,
+    until,
+)
 from tests.system.strangers import ROUTER, words
 from tests.system.test_doctor import examined
 
@@ -100,3 +114,25 @@ def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         assert row(bus) is None
         assert daemon.events("router_missing") == []
+
+
+def test_what_a_router_stamps_is_nobody_s_name(tmp_path: Path) -> None:
+    """All programs that say nothing of themselves look like one, behind it too."""
+    meeting = free_endpoint()
+    with (
+        router(tmp_path, meeting),
+        Daemon(tmp_path, config={"bus": {"connect": [meeting]}}) as daemon,
+        Bus(daemon.endpoint) as bus,
+        zenoh.open(client_config(meeting)) as plain,
+    ):
+        told(daemon, "router_found", 1)
+        bus.linked()
+        begun = time.monotonic()
+
+        def driven() -> Any:
+            """Zeros first, until their delays are known and they count."""
+            wish = twist(0.1 if time.monotonic() > begun + 2.0 else 0.0)
+            plain.put("acsard/acsar/cmd/app", json.dumps(wish))
+            return bus.state()["sender"]
+
+        assert until(driven, 10.0, "it drives") == "native/app"

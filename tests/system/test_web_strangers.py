@@ -310,7 +310,7 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
                 assert answer.status == 403
         async with hands(page, operator) as ours:
             for _ in range(2):
-                await ours.say(cmd={"linear_x": 0, "angular_z": 0}, stamp=1763700000000.0)
+                await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=1763700000000.0)
             await ours.find(lambda said: said.get("reason", "").startswith("stamp must"))
 
     run(story)
