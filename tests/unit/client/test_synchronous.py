@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from typing import Any
 
@@ -70,11 +69,10 @@ def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -
     """What comes to the daemon within a millisecond of another on its key is left out."""
     one = client_of(session)
     other = one.like("acsar")
-    puts: list[float] = []
+    begun = time.monotonic()
     for each in (one, other) * 5:
         each.send(0.0)
-        puts.append(time.monotonic())
-    assert min(b - a for a, b in itertools.pairwise(puts)) > SPACING_S / 2
+    assert time.monotonic() - begun > 8.9 * SPACING_S
 
 
 @pytest.mark.timeout(10)
