@@ -282,8 +282,8 @@ COMMANDS: dict[str, How] = {
         GUIDED, "test_the_simulator_is_calibrated_by_its_true_pose_without_a_person"
     ),
     "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
-    "acsard calibrate --log drive.csv --distance straight=4.03 --write": Elsewhere(
-        CALIBRATE, "test_a_distance_measures_the_wheels"
+    "acsard calibrate --log drive.csv --distance 4.03 --write": Elsewhere(
+        CALIBRATE, "test_of_two_logs_put_together_a_distance_is_the_straight_one_s"
     ),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     ".venv/bin/pytest tests/firmware": PYTEST,
@@ -295,7 +295,7 @@ COMMANDS: dict[str, How] = {
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
-    "acsard web --connect tls/router.local:7447 --tls clients/robot1 --id robot1": Elsewhere(
+    "acsard web --connect tcp/127.0.0.1:7447 --id robot1": Elsewhere(
         "tests/system/test_web_others.py",
         "test_another_robot_is_followed_and_stopped_and_only_that",
         "by a router on loopback",

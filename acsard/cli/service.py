@@ -6,7 +6,6 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.host.errors import MendableError
@@ -42,7 +41,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
             action.add_argument(
                 "--purge",
                 action="store_true",
-                help="also your configuration, certificates and drop-ins in its directories",
+                help="also your configuration, certificates, drop-ins, recordings and the page's "
+                "invitations",
             )
         action.set_defaults(main=main)
 
@@ -78,7 +78,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
         service.strangers(files, service.own_places()),
         force=args.force or args.purge,
         purge=args.purge,
-        recorded=Path(service.RECORDINGS).exists(),
+        stateful=[unit for unit, (where, _) in service.STATES.items() if where.exists()],
     )
     _do(steps, args.dry_run)
     print(f"\nkept as well: the program, in {sys.prefix}; removing that directory removes it")

@@ -49,6 +49,7 @@ def ros_table(config: Config) -> Topics:
     from acsard.messages.schema import TopicInfo, Topics
     from acsard.messages.topics import by_key
     from acsard.ros.names import full_name
+    from acsard.ros.parameters import SETTING
     from acsard.ros.transports import left_out, ros_names
 
     ros = config.ros
@@ -57,7 +58,8 @@ def ros_table(config: Config) -> Topics:
         native = by_key(row.native)
         note = f"as {row.native}" + (f": {native.note}" if native else "")
         if row.direction == "query":
-            note = "the configuration, read-only"
+            sets = row.name.endswith(SETTING)
+            note = "sets what `acsard set` lists" if sets else "the configuration as parameters"
         name = full_name(ros.namespace, row.name)
         rows.append(TopicInfo(name, row.direction, row.type, native.rate if native else "", note))
     return Topics(rows)

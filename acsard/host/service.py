@@ -25,8 +25,12 @@ UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
 LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
-RECORDINGS = "/var/lib/acsard"
 """Where `lan.conf` believes the certificates to be."""
+STATES = {
+    UNIT: (Path("/var/lib/acsard"), "what it has recorded"),
+    PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
+}
+"""Where units keep what they write, and what that is."""
 
 Found = Mapping[Path, bytes | None]
 """What is there now in the place of each file."""
@@ -146,12 +150,12 @@ def uninstalling(
     *,
     force: bool,
     purge: bool = False,
-    recorded: bool = False,
+    stateful: Iterable[str] = (),
 ) -> list[Step]:
     """The steps that undo it, and what stays with the reason.
 
-    What somebody has changed stays unless forced; a `kept` file, `others` and what the service has
-    `recorded` unless purged.
+    What somebody has changed stays unless forced; a `kept` file, `others` and the `STATES` of the
+    `stateful` units unless purged.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}
@@ -171,11 +175,11 @@ def uninstalling(
     for path in others:
         what = "certificates and their authority" if path == Path(TLS) else "not of the service"
         steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
-    if recorded:
-        where = Path(RECORDINGS)
-        kept = Keep(where, "what it has recorded; --purge removes it")
+    for unit in stateful:
+        where, what = STATES[unit]
         # systemd knows where it truly is; it must still know the unit.
-        steps.insert(0, Run(("systemctl", "clean", "--what=state", UNIT)) if purge else kept)
+        clean = Run(("systemctl", "clean", "--what=state", unit))
+        steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
     units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     return [*leaving, *steps, *GONE]

@@ -37,6 +37,13 @@ UNROUTED = (
 )
 """Why there are not more."""
 
+BY_NAME = (
+    "{endpoint} lets keys pass by their names alone, as all do by TLS: no other robot is seen. For "
+    "all of a router have this page's server at its own machine: acsard web --connect "
+    "tcp/127.0.0.1:7447 --id {robot}"
+)
+"""Why there are none but its own."""
+
 LONG = 40
 """Characters of a version that are shown."""
 
@@ -80,7 +87,7 @@ class Fleet:
         self._declared: list[Any] = []
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """What is to be known of the rows, in words; "" behind a router."""
+        """What is to be known of the rows, in words; "" where all of a router are seen."""
 
     def join(self, viewer: object) -> None:
         """This one looks from now on."""
@@ -168,13 +175,15 @@ class Fleet:
 
     async def _declare(self, client: Client) -> None:
         def declare() -> list[Any]:
-            session = client.session
-            routed = bool(session.info.routers_zid())
-            self.note = "" if routed else UNROUTED.format(robot=self._robots.id)
-            states = session.declare_subscriber(full_key(ALL, "state"), self._state)
+            session, robots = client.session, self._robots
+            by_name = robots.endpoint.startswith("tls/")
+            why = BY_NAME if by_name else "" if session.info.routers_zid() else UNROUTED
+            self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
+            whose = robots.id if by_name else ALL
+            states = session.declare_subscriber(full_key(whose, "state"), self._state)
             try:
                 tokens = session.liveliness().declare_subscriber(
-                    full_key(ALL, "alive"), self._token, history=True
+                    full_key(whose, "alive"), self._token, history=True
                 )
             except zenoh.ZError:
                 states.undeclare()

@@ -28,6 +28,7 @@ from acsard.host.exits import Exit
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, whoami_key
 from acsard.values import ROLES
+from tests.system.browser import Page, hands, run
 from tests.system.fleet_router import (
     ITS_NAME,
     ROBOT_FILE,
@@ -497,6 +498,22 @@ def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
     echo = finish(acsard("echo", "state", "-n", "1", *where), fleet.where)
     assert echo.code == 0, echo
     assert json.loads(echo.out)["mode"] == "ready"
+
+
+@pytest.mark.parametrize("name", ["viewer", "robot1"])
+def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_other(
+    fleet: Fleet, name: str, tmp_path: Path
+) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            await ours.say(subscribe="fleet")
+            seen = await ours.find(lambda said: said.get("fleet"))
+            assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
+            assert "keys pass by their names alone" in seen["note"]
+
+    by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
+    with Page(fleet.daemons[0], tmp_path, *by_tls) as page:
+        run(story)
 
 
 # the files

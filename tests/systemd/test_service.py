@@ -224,6 +224,7 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
 
     assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
     assert not bare.path(STATE).exists()
+    assert not bare.path(f"{STATE}-web").exists()  # a new one takes no old invitation
 
 
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:

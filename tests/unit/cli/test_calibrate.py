@@ -83,6 +83,22 @@ def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFi
     assert written.odometry.distance_scale_std == deviations["distance_scale_std"] > 0.0
 
 
+def test_of_two_logs_put_together_a_distance_is_the_straight_one_s(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
+    metres = 1.1 * abs(straight.where[-1])
+    header, *rows = straight.csv(places=False).splitlines()
+    later = [
+        ",".join([f"{float(t) + 300.0:.6f}", *rest])
+        for t, *rest in (row.split(",") for row in rows)
+    ]
+    log = "\n".join([GOOD.rstrip("\n"), header, *later, ""])
+    assert called(tmp_path, log, "--distance", f"{metres:.3f}", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
+
+
 def test_a_refusal_ends_with_failure_and_an_object(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

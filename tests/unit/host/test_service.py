@@ -12,7 +12,7 @@ from acsard.host.service import (
     GONE,
     INSTALLED,
     PAGE,
-    RECORDINGS,
+    STATES,
     STOP,
     UNIT,
     Found,
@@ -145,14 +145,14 @@ def test_a_purge_keeps_nothing() -> None:
 
 
 @pytest.mark.parametrize("purge", [False, True])
-def test_what_it_has_recorded_stays_unless_purged(purge: bool) -> None:
-    steps = uninstalling(ALL, there(), force=False, purge=purge, recorded=True)
-    kept = [str(step.path) for step in steps if isinstance(step, Keep)]
-    clean = Run(("systemctl", "clean", "--what=state", UNIT))
-    assert kept == ([] if purge else [RECORDINGS])
-    assert (clean in steps) is purge
-    if purge:  # while systemd still knows the unit, which does not run any more
-        assert steps.index(clean) == 1
+def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
+    steps = uninstalling(ALL, there(), force=False, purge=purge, stateful=STATES)
+    kept = {step.path for step in steps if isinstance(step, Keep)}
+    cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
+    assert kept == (set() if purge else {where for where, _ in STATES.values()})
+    assert cleans & {*steps} == (cleans if purge else set())
+    if purge:  # while systemd still knows the units, which do not run any more
+        assert {*steps[1:3]} == cleans
 
 
 def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
