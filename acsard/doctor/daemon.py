@@ -39,7 +39,8 @@ ANOTHER = (
 )
 
 ROUTER = "acsard: router"
-"""The row of its diagnostics."""
+LOOP = "acsard: control loop"
+"""Rows of its diagnostics."""
 
 SIGN = "commands signed as the README says need no common clock"
 
@@ -98,10 +99,19 @@ def daemon(running: Running) -> Iterator[Finding]:
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"
         yield Finding("door", "warning", text, "take his certificate from [access], or his program")
-    missed, lines = state.counters.get("missed_periods", 0), state.counters.get("lines_sent", 0)
+    yield from late(running)
+
+
+def late(running: Running) -> Iterator[Finding]:
+    """Does it keep its periods, since its start or, as its diagnostics say, of late?"""
+    counters = running.state.counters
+    missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
+    told = [row.message for row in running.rows if row.name == LOOP and row.level]
     if missed > 0.01 * max(1, lines):
+        told = [f"missed {missed} control periods"]
+    for text in told:
         mend = "what else runs here? `top`; the service runs real-time"
-        yield Finding("daemon", "warning", f"missed {missed} control periods", mend)
+        yield Finding("daemon", "warning", text, mend)
 
 
 def clocks(running: Running) -> Iterator[Finding]:

@@ -12,6 +12,8 @@ from acsard.mcu.whose_silence import BUSY, is_ours
 LOST = 0.02
 """Share of the lines; a sound link loses none."""
 
+DAY_S = 86400.0
+
 ENOUGH = 40
 """Lines sent between the looks from which on their share is no chance."""
 
@@ -31,15 +33,19 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
+    # Once a day, since months, is its story; what happens more often is a warning.
+    often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
     # The built-in simulator is late with the daemon, and never unplugged.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
         text = f"lost {late} times since the daemon's start because this computer did not run"
-        yield Finding("link", "warning", text, BUSY)
-    problems = [*lost(passed, config), *refused(state.counters)]
-    problems += [] if config.mcu.simulated else gone(state.counters)
+        yield Finding("link", "warning" if late > often else "ok", text, BUSY)
+    problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
         yield Finding("link", "warning", text, mend)
-    if not problems and not late:
+    went = [] if config.mcu.simulated else gone(state.counters)
+    for times, text in went:
+        yield Finding("link", "warning" if times > often else "ok", text, mend)
+    if not problems and not late and not went:
         yield Finding("link", "ok", "up, and no line is lost")
     if state.doubt:
         yield Finding("wheels", "warning", state.doubt, mend)
@@ -56,25 +62,27 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     )
 
 
-def refused(counters: Mapping[str, int]) -> Iterator[str]:
-    """Lines since the start that did not count."""
+def refused(counters: Mapping[str, int]) -> list[str]:
+    """Lines that did not count, if they are too many."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
         if name.startswith("line_") and count
     }
-    if sum(kinds.values()) > LOST * max(1, counters.get("lines", 0)):
-        told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
-        yield f"lines of the microcontroller that did not count: {told}"
+    if sum(kinds.values()) <= LOST * max(1, counters.get("lines", 0)):
+        return []
+    told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
+    return [f"lines of the microcontroller that did not count: {told}"]
 
 
-def gone(counters: Mapping[str, int]) -> Iterator[str]:
-    """A link that was there and went."""
-    if (times := counters.get("link_lost", 0) - counters.get("link_lost_late", 0)) > 0:
-        yield (
-            f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
-            "at times or was unplugged; the log says when (link_stale, link_down)"
-        )
+def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
+    """A link that was there and went, and how often."""
+    times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
+    text = (
+        f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
+        "at times or was unplugged; the log says when (link_stale, link_down)"
+    )
+    return [(times, text)] if times > 0 else []
 
 
 def check(running: Running) -> str:

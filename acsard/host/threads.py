@@ -17,7 +17,8 @@ T = TypeVar("T")
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever).
+    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever), and at once
+    where no thread is to be had.
 
     `late` gets (in the thread) a result that nobody waits for any more, to give it back.
     """
@@ -47,7 +48,11 @@ async def in_thread(
         if problem is None and late is not None:
             late(result)  # type: ignore[arg-type]
 
-    threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True).start()
+    thread = threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True)
+    try:
+        thread.start()
+    except RuntimeError:
+        raise TimeoutError("this process has no room for another thread") from None
     try:
         # Not wait_for: before Python 3.12 it swallows a cancel that meets the result.
         async with asyncio.timeout(timeout):

@@ -26,13 +26,15 @@ from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
 
 OPEN_TIMEOUT_S = 5.0
-"""A driver that takes longer has hung; the next try gets a new thread."""
+"""A driver that takes longer has hung: while it does, only another device is opened."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
 """Waits between attempts to reopen; the last one repeats. udev sets groups late, hence short."""
 
 PERMISSION_PATIENCE_S = 2.0
 """How long a start waits for udev to grant access before it gives up."""
+
+HUNG = "the driver did not answer"
 
 FAREWELL_S = 0.15
 """Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
@@ -64,6 +66,8 @@ class SerialPort:
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
+        self._opening = set[tuple[int, int]]()
+        """The devices that are being opened, in a thread each, by where the path led then."""
         self.trouble = ""
         """Why the port is closed, in words; "" while it is open."""
 
@@ -137,15 +141,23 @@ class SerialPort:
                     await asyncio.sleep(BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)])
 
     async def _open(self) -> None:
-        path, baud_rate = self._path, self._baud_rate
+        path, baud_rate, opening = self._path, self._baud_rate, self._opening
+        at = os.stat(path)
+        which = at.st_dev, at.st_ino
+        if which in opening:
+            raise OSError(errno.EIO, HUNG)
+        opening.add(which)
 
         def open_port() -> serial.Serial:
-            return open_raw(path, baud_rate)
+            try:
+                return open_raw(path, baud_rate)
+            finally:
+                opening.discard(which)
 
         try:
             device = await in_thread(open_port, OPEN_TIMEOUT_S, late=lambda late: late.close())
         except TimeoutError:
-            raise OSError(errno.EIO, "the driver did not answer") from None
+            raise OSError(errno.EIO, HUNG) from None
         self._lost.clear()
         self._fd = device.fileno()
         self._gate = Gate(baud_rate, self._stop, self._period_ns)

@@ -121,11 +121,19 @@ class Fleet:
         name = robot_of(str(sample.key_expr))
         with self._lock:
             if name not in self._known and name:
+                if len(self._known) >= MOST:
+                    self._forget_one()
                 if len(self._known) < MOST:
                     self._known[name] = _Known()
                 else:
                     self._left_out = True
             return self._known.get(name)
+
+    def _forget_one(self) -> None:
+        """Who is gone for longest makes room."""
+        gone = [(one.since, name) for name, one in self._known.items() if not one.here]
+        for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
+            del self._known[name]
 
     def _token(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)

@@ -94,12 +94,19 @@ def told(row: Row) -> tuple[str, ...]:
     return (
         name,
         printable(state.mode),
-        f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?",
+        _speed(state),
         printable(state.link),
         printable(row.version) or "-",
         _age(row.age),
         why,
     )
+
+
+def _speed(state: RobotState) -> str:
+    """m/s; without a link the last one that was measured is no news."""
+    if state.link != "up":
+        return "-"
+    return f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?"
 
 
 def _absence(row: Row) -> str:

@@ -27,7 +27,10 @@ def clean(text: str) -> str:
 
 
 def signed(value: float, decimals: int, width: int) -> str:
-    """A number with its sign, right-aligned; what is too long for `width` by its exponent."""
+    """A number with its sign, right-aligned; what is too long for `width` by its exponent; "-" for
+    none (NaN)."""
+    if math.isnan(value):
+        return "-".rjust(width)
     text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
     return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
 

@@ -6,9 +6,13 @@ comes on the bus. What does not fit is left out in this order: air, then sources
 
 from __future__ import annotations
 
+import math
+
+from msgspec.structs import replace
 from rich.console import Group
 from rich.text import Text
 
+from acsard.messages.schema import RobotState
 from acsard.top import sections as beside
 from acsard.top import stacked
 from acsard.top.sections import WIDEST
@@ -38,7 +42,7 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
         state = seen.state
         parts = stacked if width < stacked.BELOW else beside
         sections = [
-            parts.motion(state, width),
+            parts.motion(state if state.link == "up" else _unmeasured(state), width),
             parts.link(seen, state, width),
             parts.timing(state, width),
         ]
@@ -57,6 +61,11 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
         line.no_wrap = True
         line.truncate(width, overflow="ellipsis")
     return Group(*lines)
+
+
+def _unmeasured(state: RobotState) -> RobotState:
+    """Without the speeds of before the link was lost."""
+    return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
 def _header(seen: Seen, width: int) -> Text:

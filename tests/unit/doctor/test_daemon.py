@@ -8,9 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.settings import BusConfig, Config
-from acsard.doctor.daemon import clocks, door, gyro
+from acsard.doctor.daemon import clocks, door, gyro, late
 from acsard.doctor.running import Running
-from acsard.messages.schema import Time
+from acsard.messages.schema import DiagnosticStatus, Time
 from tests.unit.doctor.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000
@@ -50,6 +50,15 @@ def test_a_daemon_on_this_machine_has_its_clock() -> None:
 def test_stamps_that_were_replaced_are_told() -> None:
     (finding,) = clocks(seen(0.0, stamps_replaced=12))
     assert "12 commands" in finding.text
+
+
+def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
+    running = seen(0.0, lines_sent=345_600_000, missed_periods=600)
+    assert not list(late(running))
+    row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
+    (finding,) = late(replace(running, rows=(row,)))
+    assert finding.level == "warning"
+    assert "600 of 6000" in finding.text
 
 
 def test_a_door_is_told_where_it_listens() -> None:

@@ -84,8 +84,24 @@ def test_a_wheel_that_is_left_out_is_told() -> None:
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
 
+DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
+"""At 100 Hz."""
+
+
+def test_after_months_what_is_wrong_now_is_told_and_no_old_accident() -> None:
+    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 40})
+    assert finding.level == "ok"
+    assert "lost 40 times" in finding.text
+    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 41})
+    assert finding.level == "warning"
+    now = {"lines": DAYS_40["lines"] + 90, "lines_sent": DAYS_40["lines_sent"] + 100}
+    _, finding = found(DAYS_40, now | {"line_malformed": 10})
+    assert finding.level == "warning"
+    assert "10 malformed" in finding.text
+
+
 def test_a_link_that_went_is_told_with_how_often() -> None:
-    assert not list(gone({"lines": 9}))
+    assert not gone({"lines": 9})
     (finding,) = found({}, {"link_lost": 4})
     assert finding.level == "warning"
     assert "lost 4 times" in finding.text

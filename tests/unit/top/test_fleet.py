@@ -93,6 +93,18 @@ def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) ->
     assert "--id" in fleet.more
 
 
+def test_who_is_gone_for_longest_makes_room_for_who_comes(session: Session, clock: Clock) -> None:
+    fleet = fleet_of(session, ("robot0", "*"))
+    for number in range(3):
+        session.comes(f"robot{number}")
+    for name in ("robot0", "robot2", "robot1"):
+        clock.now += 1.0
+        session.comes(name, zenoh.SampleKind.DELETE)
+    session.comes("robot3")
+    assert sorted(row.robot_id for row in fleet.rows()) == ["robot0", "robot1", "robot3"]
+    assert fleet.more == ""
+
+
 def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
     fleet = fleet_of(session)
     session.comes("robot1")

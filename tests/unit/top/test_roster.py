@@ -21,6 +21,12 @@ def test_a_line_has_all_of_a_robot() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("link", ["stale", "down", "booting"])
+def test_without_a_link_the_last_speed_is_no_news(link: str) -> None:
+    (_, line) = table([replace(ROW, state=replace(STATE, link=link))], 120)
+    assert line.split()[2] == "-"
+
+
 def test_robots_are_in_the_order_of_their_names() -> None:
     rows = [replace(ROW, robot_id=name) for name in ("c", "a", "b")]
     assert [line[0] for line in table(rows, 80)[1:]] == ["a", "b", "c"]

@@ -59,7 +59,7 @@ def test_a_duration_never_takes_more_than_6_characters(us: float) -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
-     (math.inf, "   +inf"), (math.nan, "   +nan")],
+     (math.inf, "   +inf"), (math.nan, "      -")],
 )  # fmt: skip
 def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
     assert signed(value, 2, 7) == text

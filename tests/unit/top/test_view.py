@@ -89,6 +89,15 @@ def test_what_was_known_before_the_silence_stays_dimmed() -> None:
     assert re.search(r"\x1b\[2mx   \+1.250", painted(seen))
 
 
+@pytest.mark.parametrize("width", [40, 80])
+def test_without_a_link_no_old_speed_is_shown(width: int) -> None:
+    there, gone = ("\n".join(lines_of(of(link=link), width)) for link in ("up", "down"))
+    assert "m/s" in gone
+    assert not re.search(r"[+-]\d+\.\d+ (m/s|rad/s)", gone)
+    assert re.search(r"[+-]\d+\.\d+ m/s", there)
+    assert "▲" not in gone
+
+
 def test_messages_of_another_form_are_told_from_silence() -> None:
     (told,) = [
         line for line in lines_of(replace(SEEN, age=3.0, undecodable=9)) if "FOR 3 s" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.messages.schema import Figure, RobotState, Spread, Time
@@ -49,6 +50,12 @@ def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
     got = parsed(text("acsar", STATE, False, 0, {}, {}))
     assert got["acsard_up", frozenset({("robot", "acsar")})] == 0
     assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
+
+
+def test_without_a_link_no_old_speed_is_told() -> None:
+    got = parsed(text("acsar", replace(STATE, link="down"), True, 0, {}, {}))
+    assert not any("speed" in name for name, _ in got)
+    assert got["acsard_link", frozenset({("robot", "acsar"), ("state", "down")})] == 1
 
 
 def test_words_of_a_stranger_stay_within_their_label() -> None:
