@@ -19,6 +19,12 @@ mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC
 """The monotonic clock alone. Read a dozen times a period: no Python function around it."""
 
 
+def asleep_ns() -> int:
+    """How long this computer was suspended since it was switched on; all clocks stood meanwhile."""
+    awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
+
+
 TOGETHER_NS = 50_000
 """Two readings take 1 us, unless another process gets the core between them."""
 

@@ -19,6 +19,7 @@ import serial
 import serial_asyncio
 
 from acsard.host import clock
+from acsard.host.asleep import Asleep
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import in_thread
 from acsard.mcu.gate import Gate, Offered
@@ -55,8 +56,10 @@ class SerialPort:
         period_ns: int,
         wake: Callable[[], None],
         log: Callable[[Event], None],
+        asleep: Asleep | None = None,
     ) -> None:
         self.is_open = False
+        self._asleep = asleep or Asleep()
         self.opened = 0
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
         self._period_ns = period_ns
@@ -80,7 +83,13 @@ class SerialPort:
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """What was received since the last call; with the time of a step that comes late also what
-        lies there: the reader's turn may come behind the step's, which would read it as silence."""
+        lies there: the reader's turn may come behind the step's, which would read it as silence.
+
+        After a suspend the port is opened anew, whether the device has noticed or not: so all that
+        was before it is of another session, and every commander must be neutral again.
+        """
+        if self._asleep.was():
+            self._leave(OSError(errno.EIO, "this computer was suspended"))
         if late is not None and self._transport is not None:
             with suppress(serial.SerialException):  # lost: the reader finds out, and says so
                 data = self._transport.serial.read(AT_ONCE)

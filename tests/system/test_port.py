@@ -14,9 +14,10 @@ from collections.abc import Sequence
 import pytest
 
 from acsard.host import clock
+from acsard.host.asleep import Asleep
 from acsard.mcu.check import seal
 from acsard.serial.port import SerialPort
-from acsard.values import Instant, Received
+from acsard.values import Event, Instant, Received
 
 PERIOD_NS = 10_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -48,6 +49,38 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
         path = os.ttyname(slave)
         assert asyncio.run(offered()) == ["sent", "superseded", "sent", "sent"]
         assert os.read(master, 4096).count(GO) == 1
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_behind_a_suspend_the_port_is_opened_anew() -> None:
+    """As its clock shows it: this machine cannot be suspended."""
+    slept, told = [0], list[Event]()
+
+    async def opened() -> tuple[int, bool, int]:
+        asleep = Asleep(lambda: slept[0])
+        async with SerialPort(
+            path, 115200, STOP, PERIOD_NS, lambda: None, told.append, asleep
+        ) as port:
+            port.take()
+            before, slept[0] = port.opened, 8 * 3600 * 10**9
+            assert port.take() == ()
+            lost = not port.is_open and port.offer(GO, clock.now()) == "down"
+            keeping = asyncio.create_task(port.keep_open())
+            while not port.is_open:
+                await asyncio.sleep(0.001)
+            port.take()
+            keeping.cancel()
+            return before, lost, port.opened
+
+    master, slave = os.openpty()
+    try:
+        tty.setraw(master)
+        path = os.ttyname(slave)
+        assert asyncio.run(opened()) == (1, True, 2)
+        assert "suspended" in next(one.text for one in told if one.name == "port_lost")
+        assert GO not in os.read(master, 4096)
     finally:
         os.close(master)
         os.close(slave)
