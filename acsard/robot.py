@@ -324,14 +324,19 @@ class Robot:
             case "deactivate":
                 return life.deactivate()
             case "reset_odometry":
-                self._odometry.set_pose(Pose())
+                self._place(Pose())
                 return "pose is x 0, y 0, yaw 0"
             case "set_pose":
-                self._odometry.set_pose(request.pose or Pose())
+                self._place(request.pose or Pose())
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
             case "set":
                 return self._set(request.settings, now_ns)
+
+    def _place(self, pose: Pose) -> None:
+        """The robot is there from now on, and what was owed to the pose before is not owed."""
+        self._odometry.set_pose(pose)
+        self.session.snapping.forgive()
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         """Change settings in the middle of whatever the robot does."""

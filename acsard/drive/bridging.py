@@ -18,8 +18,9 @@ from acsard.mcu.feedback import Feedback
 from acsard.mcu.lattice import on
 from acsard.values import Pose, WheelSpeeds
 
-MAX_LOST_S = 0.05
-"""s of lines that could not be true, up to which the robot is held to have gone on as it did."""
+MAX_LOST_S, MAX_LOST = 0.05, 1
+"""s of lines that could not be true, up to which the robot is held to have gone on as it did; or so
+many lines, however far apart they are."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -51,10 +52,11 @@ class Rolling:
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
         """s of the lines passed over: without counts, unreported before them, with counts."""
-        self._turned = NOWHERE
+        self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
         """Pass over a line: of counts nothing is lost, else only its time is known."""
+        self._skipped += 1
         if line.turned is None:
             self._lost += line.dt
             self._gap += line.gap
@@ -66,11 +68,12 @@ class Rolling:
         """What the next line says; the last one that was believed said `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         # Of lost lines without counts: it went on at about this speed, or too long to guess.
-        lost, unknown = (self._lost, 0.0) if self._lost <= MAX_LOST_S else (0.0, self._lost)
+        guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
+        lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
-        if known > dt or unknown:
+        if self._skipped:
             self._lost = self._gap = self._counted = 0.0
-            self._turned = NOWHERE
+            self._turned, self._skipped = NOWHERE, 0
         if line.turned is not None:
             pieces, seen, seconds = _some(times(speeds, lost)), line.turned, dt
             turned, bridged = plus(turned, line.turned), 0.0

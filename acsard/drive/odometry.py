@@ -71,9 +71,9 @@ class Odometry:
         self._held = NOWHERE
         """rad of counts at rest, whose way is not clear yet."""
         self._steps_seen = NOWHERE
-        """Those of the lines of which the counts are known,"""
-        self._coarsest = 0.0
-        """and the largest of the last such line's, rad/s."""
+        """Those of the lines of which the counts are known;"""
+        self._steps_of, self._coarsest = NOWHERE, 0.0
+        """of the last line, and the largest of them that is known, rad/s."""
         self._path = Path()
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
@@ -158,6 +158,9 @@ class Odometry:
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
         rolled = self._rolling.take(feedback, self.speeds)
+        if feedback.steps is not self._steps_of:
+            self._steps_of = feedback.steps
+            self._coarsest = max([one for one in feedback.steps if one < math.inf], default=0.0)
         if feedback.counted is not None and feedback.steps is not self._steps_seen:
             self._see(feedback)
         turn, by_wheels = None, 0.0
@@ -198,7 +201,6 @@ class Odometry:
 
     def _see(self, line: Feedback) -> None:
         """The counts that a line shows are the covariance's; all four, once every wheel turns."""
-        self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
         self._uncertainty.show_count(count_of(line))
@@ -216,6 +218,7 @@ class Odometry:
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
         if turned == NOWHERE:
+            self._held = NOWHERE  # it has come back
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
@@ -292,10 +295,11 @@ class Odometry:
     def _twist_variances(
         self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None
     ) -> TwistVariances:
-        spread, step = self._twist_uncertainty, 0.0
-        if feedback.counted is not None:
-            step = self._coarsest
-        variances = spread.at_rest(self._still) if at_rest else spread.of(twist, feedback.dt, step)
+        spread, step = self._twist_uncertainty, self._coarsest
+        if at_rest:
+            variances = spread.at_rest(self._still, step)
+        else:
+            variances = spread.of(twist, feedback.dt - feedback.bridged, step)
         if self._slips(gyro):
             variances = spread.slipping(variances)
         if gyro is not None and feedback.dt > 0.0:

@@ -74,7 +74,8 @@ class TwistUncertainty:
         `step` is what one count more makes of a wheel's speed, rad/s, where the lines show it.
         """
         if dt > 0.0:
-            self._period += SMOOTHED * (dt - self._period)
+            # What comes late, or behind lines that are missing, makes no longer period.
+            self._period += SMOOTHED * (min(dt, 2 * self._period) - self._period)
         period, linear, angular = self._period, twist.linear, twist.angular
         quantum = max(DECIMAL, self._count / period, step) ** 2
         along, yaw, _ = self._noise.of(linear, angular, abs(angular))
@@ -88,9 +89,9 @@ class TwistUncertainty:
             max(LEAST, yaw + self._to_angular * quantum),
         )
 
-    def at_rest(self, seconds: float) -> TwistVariances:
-        """Of a robot of which no wheel has reported any speed for so long."""
-        quantum = (self._count / seconds) ** 2
+    def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
+        """Of a robot of which no wheel has reported any speed for so long; `step` as in `of`."""
+        quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
             max(LEAST, self._to_linear * quantum),
             LEAST,

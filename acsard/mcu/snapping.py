@@ -62,6 +62,11 @@ class Snapping:
         """s; what the firmware divides by, 0 while unknown; how much more the lines' times say,
         and the least of that in this glance."""
 
+    def forgive(self) -> None:
+        """What rounding has cost until now is of a pose that counts no more."""
+        for wheel in self._wheels:
+            wheel.forgive()
+
     @property
     def counts(self) -> tuple[int, ...]:
         """Counts per turn found of each wheel's encoder, in `WHEELS` order; 0 is not found."""

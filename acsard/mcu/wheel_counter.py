@@ -21,6 +21,9 @@ MOST_SEEN = 256
 MOST_TOLD = 512
 """Different speeds whose rounding is made good later: those of 10 000 counts a turn."""
 
+OWED_FOR = 3000
+"""Lines whose rounding is made good; what was owed before these belongs to another place."""
+
 LONGEST_WAIT = 128 * LEARNED_FROM
 """Changes until a stream without a lattice is looked at again: minutes of driving."""
 
@@ -36,7 +39,9 @@ class WheelCounter:
         self.lattice: Lattice | None = None
         self._search: Search | None = None
         self._told: dict[float, int] | None = {}
-        """How often each speed was told before the counts were known, forward less backward."""
+        """How often each speed was told before the counts were known, forward less backward;"""
+        self._owing = 0
+        """in so many lines."""
         self._last = 0.0
         self._seen: dict[float, int] = {}
         self._missing = self._patience = LEARNED_FROM
@@ -44,6 +49,9 @@ class WheelCounter:
 
     def learn(self, speed: float) -> None:
         """The next report of a wheel whose counts are unknown."""
+        self._owing += 1
+        if self._owing > OWED_FOR:
+            self.forgive()
         if speed and self._told is not None:
             size, way = abs(speed), 1 if speed > 0 else -1
             self._told[size] = self._told.get(size, 0) + way
@@ -92,6 +100,12 @@ class WheelCounter:
             for speed, times in told.items()
             if on(speed, self.quantum)
         )
+
+    def forgive(self) -> None:
+        """Nothing is owed for what was until now."""
+        self._owing = 0
+        if self._told is not None:
+            self._told = None if self.counts else {}
 
     def show(self, period: float) -> bool:
         """Whether it shows how many counts a turn it has, if its firmware divides by `period` s."""

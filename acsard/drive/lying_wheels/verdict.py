@@ -26,6 +26,9 @@ that turns slowly says one count or none."""
 PERIOD, SMOOTHED = 0.01, 0.05
 """s between two lines until that is known, and the share of a new one in their mean."""
 
+RECUR, SOUGHT = 3, 1000
+"""Times that so small an angle comes in so many lines where it is a count; damage makes one."""
+
 COMMANDED = 0.3
 """rad/s; a slower command says little of who is right."""
 
@@ -159,6 +162,8 @@ class Witness:
         self._kinematics, self._response = kinematics, response_time
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
+        self._least, self._looked = [COARSEST] * RECUR, 0
+        """rad; the least that front wheels turned in so many of the last lines."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._slow_left = self._slow_right = 0.0
         """rad/s of wheels that follow their command slowly."""
@@ -263,11 +268,16 @@ class Witness:
         return self._found is not None and self._found.lied(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """The least that a wheel turns in a line is a count, or more."""
+        """The least that a wheel turns in a line, time and again, is a count, or more."""
         self._period += SMOOTHED * (dt - self._period)
+        self._looked += 1
+        if self._looked > SOUGHT:
+            self._least, self._looked = [COARSEST] * RECUR, 1
         for speed in (abs(speeds.front_right), abs(speeds.front_left)):
-            if 0.0 < speed * self._period < self._count:
-                self._count = max(FINEST, speed * self._period)
+            if 0.0 < speed * self._period < self._least[-1]:
+                self._least[-1] = speed * self._period
+                self._least.sort()
+                self._count = min(self._count, max(FINEST, self._least[-1]))
                 self._seeking = self._count > FINEST
 
     def _known(

@@ -100,3 +100,19 @@ def test_gaps_before_lines_passed_over_stay_gaps() -> None:
     rolling.skip(Feedback(AT, TWO, 0.0, gap=0.5))
     rolled = rolling.take(Feedback(AT, FOUR, 0.0, gap=0.3), TWO)
     assert (rolled.known, rolled.unknown) == near(0.0, 0.8)
+
+
+def test_of_a_slow_link_one_line_passed_over_is_bridged_too() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, 0.1))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.1), TWO)
+    assert total(rolled) == pytest.approx(0.8)
+    assert (rolled.known, rolled.unknown) == near(0.2, 0.0)
+
+
+def test_counts_passed_over_behind_a_silence_are_added_once() -> None:
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, TWO, 0.0, gap=0.15, turned=turned))
+    first, second = (rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO) for _ in range(2))
+    assert first.turned == all_four(0.12)
+    assert second.turned == turned

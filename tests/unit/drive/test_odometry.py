@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.gyro import Turn
@@ -604,6 +605,36 @@ def test_a_count_to_and_fro_at_rest_moves_nothing() -> None:
         before.covariance,
         before.positions,
     )
+
+
+def test_a_count_that_has_come_back_is_not_driven_later() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for turned in (0.002, -0.002):
+        robot.fold(counted(turned))
+    assert robot.fold(counted(0.1, speed=10.0)).positions == pytest.approx((0.1,) * 4)
+
+
+def test_a_wheel_that_creeps_back_count_by_count_is_not_held() -> None:
+    robot = odometry()
+    at_rest(robot)
+    robot.fold(counted(0.002))
+    for _ in range(100):
+        estimate = robot.fold(counted(-0.002))
+    assert estimate.positions == pytest.approx((-0.198,) * 4, abs=0.01)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.21])
+def test_counts_that_only_the_steps_of_the_speeds_show_make_a_twist_doubtful(
+    seconds: float,
+) -> None:
+    robot, steps = odometry(), (31.4, 31.4, 31.4, math.inf)
+    zeros = replace(feedback(0.0, 0.0, 0.01), steps=steps)
+    for _ in range(1 + round(seconds / 0.01)):
+        variances = robot.fold(zeros).twist_variances
+    # one count of 20 in 10 ms, or in all of the rest: a side is the mean of two wheels
+    count = 0.05 * 31.4 * 0.01 / max(0.01, seconds)
+    assert variances.linear == pytest.approx(count**2 / 48, rel=0.1)
 
 
 def test_no_count_of_a_rest_is_lost() -> None:

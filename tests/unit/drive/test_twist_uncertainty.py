@@ -73,6 +73,16 @@ def test_lines_that_are_read_together_have_the_period_of_the_others() -> None:
     assert other.linear < 3 * one.linear
 
 
+def test_a_line_that_came_late_makes_no_longer_period() -> None:
+    usual, late = uncertainty(OdometryConfig()), uncertainty(OdometryConfig())
+    for _ in range(400):
+        usual.of(Twist(0.5, 0.0), 0.01)
+        late.of(Twist(0.5, 0.0), 0.01)
+    late.of(Twist(0.5, 0.0), 0.5)
+    after = late.of(Twist(0.5, 0.0), 0.01).linear
+    assert after == pytest.approx(usual.of(Twist(0.5, 0.0), 0.01).linear, rel=0.1)
+
+
 def test_at_rest_the_twist_is_certain() -> None:
     rest = uncertainty(OdometryConfig()).at_rest(0.21)
     assert (rest.linear, rest.lateral, rest.angular) == (1e-8,) * 3

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.mcu import wheel_counter
 from acsard.mcu.lattice import STEEP, Search
-from acsard.mcu.wheel_counter import LEARNED_FROM, MOST_TOLD, WheelCounter
+from acsard.mcu.wheel_counter import LEARNED_FROM, MOST_TOLD, OWED_FOR, WheelCounter
 
 PERIOD = 0.01
 
@@ -88,6 +88,24 @@ def test_what_rounding_cost_until_the_counts_were_known_is_made_good() -> None:
     assert wheel.owed(PERIOD) == pytest.approx(exact - folded, abs=1e-9)
     assert abs(exact - folded) > 1e-5
     assert wheel.owed(PERIOD) == 0.0
+
+
+def test_what_was_owed_to_another_pose_is_not_made_good() -> None:
+    wheel = learned(400)
+    wheel.forgive()
+    wheel.show(PERIOD)
+    assert wheel.owed(PERIOD) == 0.0
+
+
+def test_what_was_owed_long_ago_is_not_made_good() -> None:
+    wheel, speed = WheelCounter(), 12.57  # 12.566 in truth
+    for _ in range(20 * OWED_FOR):
+        wheel.learn(speed)
+    for _, varied in reports(400, 2000):
+        wheel.learn(varied)
+        wheel.go_on()
+    wheel.show(PERIOD)
+    assert abs(wheel.owed(PERIOD)) <= OWED_FOR * PERIOD * 0.005
 
 
 def test_of_too_many_different_speeds_nothing_is_owed() -> None:

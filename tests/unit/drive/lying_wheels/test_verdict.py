@@ -349,20 +349,31 @@ def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
     assert found <= within + 1e-9
 
 
-def healthy(seed: int, seconds: float, counts: int) -> tuple[int, bool]:
+def healthy(
+    seed: int, seconds: float, counts: int, before: tuple[WheelSpeeds, ...] = ()
+) -> tuple[int, bool]:
     """How often slip is told on a clean drive, and whether the pose is the plain mean's, bit for
-    bit."""
+    bit; behind the lines of `before`."""
     rng = np.random.default_rng(10_000 + seed)
     told = commands(rng, seconds)
     robot, plain, alarms, slips = odometry(), Plain(), 0, False
     speeds = said(rolled(told, Robot(counts, load=0.02), rng), counts)
+    for one in before:
+        robot.fold(Feedback(AT, one, PERIOD))
+        plain.fold(Feedback(AT, one, PERIOD))
     for line, wish in zip(lines(speeds), wishes(told), strict=True):
         robot.fold(line, None, wish)
         plain.fold(line)
         if line.speeds != STILL:
-            before, slips = slips, bool(robot.doubt.slipping)
-            alarms += slips and not before
+            was, slips = slips, bool(robot.doubt.slipping)
+            alarms += slips and not was
     return alarms, robot.pose == plain.pose
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_digit_that_flips_at_rest_makes_no_encoder_a_fine_one(seed: int) -> None:
+    flipped = only(1, 0.01, 0.0)
+    assert healthy(seed, 20.0, 96, (STILL, flipped, STILL, STILL, flipped, STILL)) == (0, True)
 
 
 @pytest.mark.parametrize(
