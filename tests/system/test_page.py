@@ -9,6 +9,7 @@ import re
 import signal
 import struct
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, suppress
 from importlib.resources import files
@@ -20,9 +21,10 @@ import pytest
 
 from acsard.lan.authority import Authority
 from acsard.web.limits import CONNECTIONS_HERE
+from acsard.web.viewer import HEARTBEAT_S
 from tests import pictures
 from tests.pictures import VIEWS
-from tests.system.browser import NAME, Hands, Page, hands, run
+from tests.system.browser import NAME, Hands, Page, answer, hands, run
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import Bus, Daemon, Program, until
 
@@ -284,6 +286,31 @@ def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
     page.browser.js("document.dispatchEvent(new Event('freeze'))")
     page.bus.at_rest()
     assert page.browser.js("document.getElementById('stick').matches('.held')") is False
+
+
+def viewers(page: Phone) -> int:
+    """Who looks, as the page's server knows it."""
+    _, told = asyncio.run(answer(f"{page.server.here}/metrics"))
+    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
+
+
+def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
+    page: Phone,
+) -> None:
+    """The browser keeps it, asleep, with all that it has open."""
+    browser = page.browser
+    assert viewers(page) == 1
+    left = time.monotonic()
+    browser.open("about:blank")
+    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    assert time.monotonic() - left < HEARTBEAT_S, "the server had to find out"
+    browser.js("history.back()")
+    page.shows("age", "live")
+    page.shows("mode", "READY")
+    assert viewers(page) == 1
+    page.hold()
+    browser.touch("End")
+    page.bus.at_rest()
 
 
 PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
