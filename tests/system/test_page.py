@@ -902,6 +902,57 @@ def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page:
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
 
 
+ABOVE = """(() => {
+    const canvas = document.getElementById('plot-speed'), paper = canvas.getContext('2d');
+    const {width, height} = canvas, look = getComputedStyle(document.documentElement);
+    const {data} = paper.getImageData(0, 0, width, height);
+    const is = (name) => {
+        paper.fillStyle = look.getPropertyValue(name).trim();
+        const [, ...rgb] = /#(..)(..)(..)/.exec(paper.fillStyle);
+        return (n) => rgb.every((one, at) => data[n + at] === parseInt(one, 16));
+    };
+    return ['--accent', '--wished'].map(is).map((colour) => {
+        let count = 0;
+        for (let n = 0; n < data.length / 2; n += 4) if (colour(n)) count++;
+        return count;
+    });
+})()"""
+"""Points of the measured and of the wished speed in the upper half of their plot."""
+
+
+def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
+    page: Phone,
+) -> None:
+    """It was driven before anybody looked, then while a page was open, and stands now."""
+    browser, bus = page.browser, page.bus
+    browser.open("about:blank")
+    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    with bus.commanding(0.4, 0.0):
+        until(lambda: bus.state()["x"] > 1.5, 10.0, "for some seconds")
+    bus.at_rest()
+
+    def looked() -> tuple[int, int]:
+        """Comes anew."""
+        browser.open(page.server.here)
+        page.shows("mode", "READY")
+        browser.tap("tab-status")
+        page.shows("unknown", "Nothing is known of before")
+        measured, wished = browser.js(ABOVE)
+        return measured, wished
+
+    measured, wished = looked()
+    assert measured > 20
+    assert wished == 0
+    page.shows("unknown", "What was wished before")
+    with bus.commanding(0.4, 0.0):
+        until(lambda: bus.state()["linear"] > 0.35, 10.0, "it drives")
+    bus.at_rest()
+    measured, wished = looked()
+    assert measured > 20
+    assert wished > 0
+    assert browser.said == []
+
+
 SEEN = """(() => {
     const canvas = document.getElementById('plot-wheels'), paper = canvas.getContext('2d');
     const {width, height} = canvas, style = getComputedStyle(document.documentElement);

@@ -120,7 +120,7 @@ export class Link extends EventTarget {
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "minute", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {
