@@ -64,8 +64,12 @@ PURE_AMONG_SHELLS = (
     "web.errands",
     "web.frames",
     "web.limits",
+    "web.lines",
     "web.metrics",
+    "web.minute",
     "web.openapi",
+    "web.socket_schemas",
+    "web.told",
     "web.trail",
     "web.who",
 )

@@ -27,6 +27,7 @@ from acsard.calibration.guided.steps import Ask
 from acsard.host.config_file import writable
 from acsard.host.errors import MendableError
 from acsard.host.files import change, require_changeable
+from acsard.web.lines import Doing, Found, Progress, Question, Result, Subject, Told
 
 if TYPE_CHECKING:
     from acsard.checkup.findings import Finding
@@ -55,26 +56,6 @@ CHECK_STEPS = 16
 """Findings of a check that comes to its end, about: its progress is told by them."""
 
 KEY = " "
-
-
-class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """What is asked: one of the answers, or a number where there are none."""
-
-    question: int
-    """Its answer has this number."""
-    words: str
-    answers: Sequence[str] = ()
-    unit: str = ""
-    least: float | None = None
-    most: float | None = None
-    usual: float | None = None
-    """What no value stands for."""
-    leg: bool = False
-    """With its answer the robot drives; a key stops it."""
-    by_key: bool = False
-    """A key is how the leg is meant to end."""
-    wrong: str = ""
-    """What the answer before has to be and is not."""
 
 
 class Line(Struct, frozen=True):
@@ -111,20 +92,20 @@ class JsonLines:
 
     def begin(self, subject: str, *, simulated: bool) -> None:
         """What it is about, first of all."""
-        self._tell({"subject": subject, "simulated": simulated})
+        self._tell(Subject(subject, simulated))
 
     def told(self, text: str) -> None:
         """Tell what stays."""
-        self._tell({"told": text})
+        self._tell(Told(text))
 
     def progress(self, share: float) -> None:
         """So much is done."""
-        self._tell({"progress": round(share, 3)})
+        self._tell(Progress(round(share, 3)))
 
     def shows(self, text: str) -> None:
         """What was found, as at a terminal; nothing moves any more."""
         self._moves = False
-        self._tell({"result": text.strip("\n")})
+        self._tell(Result(text.strip("\n")))
 
     def choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
         """One of the answers; whatever else is said is told to be none, and asked again."""
@@ -154,7 +135,7 @@ class JsonLines:
             self.told(f"{file}: written")
         return wanted == "write"
 
-    def _tell(self, message: object) -> None:
+    def _tell(self, message: Struct) -> None:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
@@ -279,7 +260,7 @@ class JsonPerson(JsonLines):
 
     def say(self, text: str) -> None:
         """Tell what happens now."""
-        self._tell({"doing": text})
+        self._tell(Doing(text))
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
         """One of the answers."""
@@ -288,7 +269,7 @@ class JsonPerson(JsonLines):
     def found(self, finding: Finding) -> None:
         """As it is made."""
         self._found += 1
-        self._tell({"finding": finding})
+        self._tell(Found(finding))
         self.progress(min(0.99, self._found / CHECK_STEPS))
 
     def result(self, found: Report, where: str) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Coroutine, Sequence
 from typing import Any
 
 import zenoh
-from msgspec import Struct
 
 from acsard.bus.fleet import ALL, robot_of
 from acsard.bus.subscription import encoded
@@ -20,6 +19,7 @@ from acsard.messages.topics import full_key
 from acsard.values import NS_PER_S
 from acsard.web.robots import Robots
 from acsard.web.streams import DECLARE_S, UNREADY
+from acsard.web.told import Row
 
 MOST = 200
 """Robots; a stranger may invent names."""
@@ -46,22 +46,6 @@ BY_NAME = (
 
 LONG = 40
 """Characters of a version that are shown."""
-
-
-class Row(Struct, frozen=True):
-    """One robot."""
-
-    robot: str
-    mode: str | None
-    """As in `state`; "gone" once its daemon has said that it ends, None while nothing is heard."""
-    reason: str
-    speed: float | None
-    """m/s"""
-    link: str
-    age: float | None
-    """s since its state was heard, or its daemon ended."""
-    version: str
-    """"" until it says."""
 
 
 class _Known:

@@ -12,7 +12,6 @@ import asyncio
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -26,6 +25,7 @@ from acsard.web.boards import NO_DEVICE, Board, boards
 from acsard.web.calls import Ending
 from acsard.web.errands import Reach, words
 from acsard.web.frames import Begin, FrameError, Press, Reply
+from acsard.web.told import Ended, Guided, Running
 
 ENDING_S = 1.0
 """Whoever pressed STOP hears by then whether it has ended."""
@@ -48,7 +48,7 @@ CLOSING_S = 2.0
 
 BOARDS_S = 5.0
 
-Say = Callable[[object], None]
+Say = Callable[[Guided], None]
 
 
 class Choices(Struct, frozen=True):
@@ -165,7 +165,7 @@ class Guide:
         finally:
             self._errand = None
         meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
-        errand.say({"guide": {"ended": code, "meaning": meaning, "text": text}})
+        errand.say(Guided(Ended(code, meaning, text)))
         self._tell_all()
 
     async def _ports(self, asked: Begin) -> list[str]:
@@ -178,7 +178,7 @@ class Guide:
 
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():
-            say(self._errand.about(viewer) if self._errand else {"guide": {"running": ""}})
+            say(self._errand.about(viewer) if self._errand else Guided(Running("")))
 
 
 class _Errand:
@@ -194,10 +194,9 @@ class _Errand:
         self._relayed_ns = 0
         self._last = b""
 
-    def about(self, viewer: object) -> dict[str, Any]:
+    def about(self, viewer: object) -> Guided:
         """That it goes on, as this one is told."""
-        yours = viewer is self.viewer
-        return {"guide": {"running": self.name, "by": self.by, "yours": yours}}
+        return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
         """From start to end: exit code, and its last words on standard error. Raises `OSError`."""
@@ -283,7 +282,7 @@ class _Errand:
             self._question, self._leg, self._rides = said.question, said.leg, False
         if said.progress >= 1.0:
             self._rides = False
-        self.say({"guide": msgspec.Raw(line)})
+        self.say(Guided(msgspec.Raw(line)))
 
     async def _overhear(self, process: asyncio.subprocess.Process) -> None:
         assert process.stderr is not None

@@ -9,12 +9,11 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import msgspec
-
 from acsard.bus.access import SERVICE_ROLES, least_role
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import SERVICES, TOPICS, Topic, service_key
-from acsard.web.frames import KINDS
+from acsard.web import socket_schemas
+from acsard.web.socket_schemas import FROM_ROBOT, TO_ROBOT
 
 Described = dict[str, Any]
 
@@ -23,9 +22,6 @@ PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
 
 NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
 """Rows that have no value to be asked for here."""
-
-TO_ROBOT = "ToRobot"
-"""Any message that the WebSocket takes."""
 
 PAYLOADS = {"set": "Settings", "set_pose": "SetPose"}
 
@@ -54,7 +50,7 @@ def document(version: str) -> Described:
         },
         "paths": paths,
         "components": {
-            "schemas": _keys() | _frames(),
+            "schemas": _keys() | socket_schemas.schemas(),
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
         "security": [{}, {"token": []}],
@@ -82,14 +78,6 @@ def _flat(node: Any, before: str) -> Any:
     if isinstance(ref := node.get("$ref"), str):
         return {"$ref": ref.replace("#/$defs/", f"#/components/schemas/{before}")}
     return {key: _flat(value, before) for key, value in node.items()}
-
-
-def _frames() -> Described:
-    """The messages of `/ws` to the robot, by their names."""
-    refs, parts = msgspec.json.schema_components(
-        KINDS.values(), ref_template="#/components/schemas/{name}"
-    )
-    return {**parts, TO_ROBOT: {"title": TO_ROBOT, "oneOf": list(refs)}}
 
 
 def _ref(name: str) -> Described:
@@ -213,9 +201,12 @@ _OTHERS: Described = {
     "/ws": {
         "get": {
             "summary": "a WebSocket, JSON as text both ways: follows, drives, stops",
-            "description": f"Each message to the robot is a `{TO_ROBOT}`; what comes from it is on "
-            "the page deploy/web.",
-            "x-messages": {"$ref": f"#/components/schemas/{TO_ROBOT}"},
+            "description": f"Each message to the robot is a `{TO_ROBOT}`, each from it a "
+            f"`{FROM_ROBOT}`.",
+            "x-messages": {
+                "to": {"$ref": f"#/components/schemas/{TO_ROBOT}"},
+                "from": {"$ref": f"#/components/schemas/{FROM_ROBOT}"},
+            },
             "responses": {"101": {"description": "It is open."}, "default": _TROUBLE},
         }
     },

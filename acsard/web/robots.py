@@ -15,9 +15,10 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import Info, PoseStamped, RobotState
+from acsard.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
+from acsard.web.minute import Minute, Plotted
 from acsard.web.streams import UNREADY, Stream, Streams
 from acsard.web.trail import Trail
 
@@ -34,6 +35,9 @@ MISSING = 3
 """So many states that did not come are a silence; at least `SILENT_S`."""
 
 SILENT_S = 1.5
+
+WISHED_NS = 2 * NS_PER_S
+"""What was wished longer ago says nothing of now."""
 
 Connect = Callable[[], Client]
 """Opens the way to the daemon, or raises `UnreachableError`; blocks."""
@@ -66,7 +70,9 @@ class Robots:
         """Why nothing is heard of the robot, in words; "" while it is."""
         self._connect, self._counts = connect, counts
         self._trails = {"path": Trail(), "truth": Trail()}
+        self._minute = Minute()
         self._states, self._poses = Decoder(RobotState), Decoder(PoseStamped)
+        self._wishes = Decoder(TwistStamped)
         self._asks = asyncio.Event()
         self.state: RobotState | None = None
 
@@ -86,6 +92,10 @@ class Robots:
     def way(self) -> dict[str, list[tuple[float, float]]]:
         """Where it was in the last minutes, and truly was if that is known."""
         return {name: trail.points() for name, trail in self._trails.items()}
+
+    def minute(self) -> Plotted:
+        """What the plots show, of the last minute."""
+        return self._minute.plotted(clock.mono_ns())
 
     async def _reached(self) -> Client:
         while True:
@@ -134,6 +144,19 @@ class Robots:
         if before is not None and state.counters.get("lines", 0) < before.counters.get("lines", 0):
             self._trails = {name: Trail() for name in self._trails}  # another daemon
         self._trails["path"].add(now_ns, state.x, state.y)
+        if self._minute.due(states.at_ns):
+            self._minute.add(states.at_ns, state, self._wished(now_ns))
+
+    def _wished(self, now_ns: int) -> Twist | None:
+        """What the robot is to do now, where somebody follows that here."""
+        stream = self.streams.followed(self.id, "cmd_vel_out")
+        raw = None if stream is None else stream.raw()
+        if stream is None or raw is None or now_ns - stream.at_ns > WISHED_NS:
+            return None
+        try:
+            return self._wishes.decode(*raw).twist
+        except DecodeError:
+            return None
 
     def _take_truth(self, truth: Stream, now_ns: int) -> None:
         raw = truth.raw()

@@ -54,6 +54,11 @@ class Stream:
         """Of the newest; 0 before the first."""
         return self._newest[0]
 
+    @property
+    def at_ns(self) -> int:
+        """When the newest came, by the monotonic clock."""
+        return self._newest[2]
+
     def take(self, sample: zenoh.Sample) -> None:
         """One has come."""
         with self._taking:
@@ -101,6 +106,10 @@ class Streams:
             await self.leave(robot, key)
             raise
         return stream
+
+    def followed(self, robot: str, key: str) -> Stream | None:
+        """The stream that somebody follows, if anybody does."""
+        return self._streams.get((robot, key))
 
     async def leave(self, robot: str, key: str) -> None:
         """One follows it no more."""

@@ -18,6 +18,7 @@ from acsard.host import clock
 from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
 from acsard.web.streams import Stream
+from acsard.web.told import Refused
 from acsard.web.who import Reason
 
 UNREAD_BYTES = 32768
@@ -77,7 +78,7 @@ class Outgoing:
         now_ns = clock.mono_ns()
         if now_ns - self._told.get(reason, -TELL_NS) >= TELL_NS:
             self._told[reason] = now_ns
-            self.say({"refused": what, "reason": text})
+            self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Until cancelled, or the connection closes; `look_around` says when it is due again."""

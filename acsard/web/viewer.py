@@ -18,6 +18,7 @@ from aiohttp import web
 from acsard.bus.access import MAY
 from acsard.host import clock
 from acsard.values import NS_PER_S
+from acsard.web import told
 from acsard.web.calls import Calls, RefusedError
 from acsard.web.commands import Hand, Order
 from acsard.web.counts import Counts
@@ -91,7 +92,8 @@ class Viewer:
     async def run(self) -> None:
         """Until it ends, by whomever."""
         self._greet()
-        self._out.say(self._robots.way())
+        self._out.say(told.Way(**self._robots.way()))
+        self._out.say(told.LastMinute(self._robots.minute()))
         self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
@@ -153,7 +155,7 @@ class Viewer:
                 self._call(frame)
             case Ping():
                 now = clock.now().wall_ns / 1e6
-                self._out.say({"pong": frame.ping, "now": now})
+                self._out.say(told.Pong(frame.ping, now))
             case Subscribe():
                 self._subscribe(frame)
             case Unsubscribe():
@@ -224,7 +226,7 @@ class Viewer:
         finally:
             if frame.call != "stop":
                 self._calling -= 1
-        self._out.say({"answer": frame.id, "ok": ok, "text": text})
+        self._out.say(told.Answer(frame.id, ok, text))
 
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
@@ -245,31 +247,28 @@ class Viewer:
 
     def _greet(self) -> None:
         about = self._about = self._robots.about
-        self._out.say(
-            {
-                "hello": {
-                    "robot": self._robots.id,
-                    "version": about.version,
-                    "role": self.who.role,
-                    "sender": self.sender,
-                    "limits": {"linear": about.linear, "angular": about.angular},
-                    "simulated": about.simulated,
-                    "state_rate": about.state_hz,
-                }
-            }
+        greeting = told.Greeting(
+            self._robots.id,
+            about.version,
+            self.who.role,
+            self.sender,
+            told.Limits(about.linear, about.angular),
+            about.simulated,
+            about.state_hz,
         )
+        self._out.say(told.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
         """Is the robot heard, who else is there; when to look again."""
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:
-                self._out.say({"gone": self._gone})
+                self._out.say(told.Gone(self._gone))
         if self._robots.about is not self._about:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
-            self._out.say({"fleet": self._fleet.rows(), "note": self._fleet.note})
+            self._out.say(told.Rows(self._fleet.rows(), self._fleet.note))
         return now + LOOK_S
 
     def _start(

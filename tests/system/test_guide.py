@@ -16,6 +16,7 @@ import pytest
 
 from acsard.asking.json_lines import HEARD_S
 from acsard.lan.authority import Authority
+from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
 from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
@@ -68,7 +69,10 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
             await guided.answer(await guided.asks(str(alone.config)), "write")
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")  # the map was another
-            found.extend(s["guide"]["finding"] for s in guided.ours.heard if "finding" in str(s))
+            heard = guided.ours.heard
+            found.extend(s["guide"]["finding"] for s in heard if "finding" in str(s))
+            told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
+            assert described.kinds(heard) >= told
 
     with Page(alone, tmp_path) as served:
         run(story)

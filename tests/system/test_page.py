@@ -9,6 +9,7 @@ import re
 import signal
 import struct
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, suppress
 from importlib.resources import files
@@ -20,9 +21,10 @@ import pytest
 
 from acsard.lan.authority import Authority
 from acsard.web.limits import CONNECTIONS_HERE
+from acsard.web.viewer import HEARTBEAT_S
 from tests import pictures
 from tests.pictures import VIEWS
-from tests.system.browser import NAME, Hands, Page, hands, run
+from tests.system.browser import NAME, Hands, Page, answer, hands, run
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import Bus, Daemon, Program, until
 
@@ -284,6 +286,31 @@ def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
     page.browser.js("document.dispatchEvent(new Event('freeze'))")
     page.bus.at_rest()
     assert page.browser.js("document.getElementById('stick').matches('.held')") is False
+
+
+def viewers(page: Phone) -> int:
+    """Who looks, as the page's server knows it."""
+    _, told = asyncio.run(answer(f"{page.server.here}/metrics"))
+    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
+
+
+def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
+    page: Phone,
+) -> None:
+    """The browser keeps it, asleep, with all that it has open."""
+    browser = page.browser
+    assert viewers(page) == 1
+    left = time.monotonic()
+    browser.open("about:blank")
+    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    assert time.monotonic() - left < HEARTBEAT_S, "the server had to find out"
+    browser.js("history.back()")
+    page.shows("age", "live")
+    page.shows("mode", "READY")
+    assert viewers(page) == 1
+    page.hold()
+    browser.touch("End")
+    page.bus.at_rest()
 
 
 PAD = """navigator.getGamepads = () => [{connected: true, axes: AXES,
@@ -873,6 +900,57 @@ def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page:
     assert len(browser.js(legend)) == 4
     # Standing still all four are zero: each has its colour somewhere on the line.
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
+
+
+ABOVE = """(() => {
+    const canvas = document.getElementById('plot-speed'), paper = canvas.getContext('2d');
+    const {width, height} = canvas, look = getComputedStyle(document.documentElement);
+    const {data} = paper.getImageData(0, 0, width, height);
+    const is = (name) => {
+        paper.fillStyle = look.getPropertyValue(name).trim();
+        const [, ...rgb] = /#(..)(..)(..)/.exec(paper.fillStyle);
+        return (n) => rgb.every((one, at) => data[n + at] === parseInt(one, 16));
+    };
+    return ['--accent', '--wished'].map(is).map((colour) => {
+        let count = 0;
+        for (let n = 0; n < data.length / 2; n += 4) if (colour(n)) count++;
+        return count;
+    });
+})()"""
+"""Points of the measured and of the wished speed in the upper half of their plot."""
+
+
+def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
+    page: Phone,
+) -> None:
+    """It was driven before anybody looked, then while a page was open, and stands now."""
+    browser, bus = page.browser, page.bus
+    browser.open("about:blank")
+    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    with bus.commanding(0.4, 0.0):
+        until(lambda: bus.state()["x"] > 1.5, 10.0, "for some seconds")
+    bus.at_rest()
+
+    def looked() -> tuple[int, int]:
+        """Comes anew."""
+        browser.open(page.server.here)
+        page.shows("mode", "READY")
+        browser.tap("tab-status")
+        page.shows("unknown", "Nothing is known of before")
+        measured, wished = browser.js(ABOVE)
+        return measured, wished
+
+    measured, wished = looked()
+    assert measured > 20
+    assert wished == 0
+    page.shows("unknown", "What was wished before")
+    with bus.commanding(0.4, 0.0):
+        until(lambda: bus.state()["linear"] > 0.35, 10.0, "it drives")
+    bus.at_rest()
+    measured, wished = looked()
+    assert measured > 20
+    assert wished > 0
+    assert browser.said == []
 
 
 SEEN = """(() => {

@@ -16,6 +16,8 @@ from typing import Any
 import aiohttp
 import pytest
 
+from acsard.web.socket_schemas import KEYS
+from tests import described
 from tests.system.browser import Page, answer, hands, run, text
 from tests.system.harness import (
     PATIENCE_S,
@@ -58,6 +60,81 @@ def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> 
             await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
 
     run(story)
+
+
+def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
+    daemon: Daemon, bus: Bus, tmp_path: Path
+) -> None:
+    kept: list[Any] = []
+
+    async def story() -> None:
+        async with hands(page) as ours:
+            async with hands(page) as first:
+                alone = await first.find(lambda said: "minute" in said)
+            assert set(alone["minute"]["wished_linear"]) <= {None}
+            await ours.say(subscribe="cmd_vel_out")
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+            await ours.hold(0.3, 0.5)
+            await ours.drive(0.0)
+            await asyncio.to_thread(bus.at_rest)
+            async with hands(page) as later:
+                kept.append((await later.find(lambda said: "minute" in said))["minute"])
+
+    with Page(daemon, tmp_path) as page:
+        run(story)
+    (minute,) = kept
+    assert max(minute["linear"]) > 0.25
+    assert max(one or 0.0 for one in minute["wished_linear"]) == pytest.approx(0.3)
+    assert minute["age"] == sorted(minute["age"], reverse=True)
+    wheels = [max(one) for one in minute["wheels"]]
+    assert len(wheels) == 4
+    assert min(wheels) > 0.25 / 0.05
+
+
+@pytest.mark.network
+def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_said(
+    tmp_path: Path,
+) -> None:
+    heard: list[Any] = []
+
+    async def story(daemon: Daemon, page: Page) -> None:
+        async with hands(page) as ours:
+            await ours.find(lambda said: "minute" in said)
+            for key in KEYS:
+                await ours.say(subscribe=key)
+                await ours.find(lambda said, key=key: said.get("key") == key and said["value"])  # type: ignore[misc]
+            await ours.say(subscribe="state", robot="nobody")
+            await ours.say(subscribe="nothing")
+            await ours.find(lambda said: "refused" in said)
+            await ours.call("clear")
+            await ours.say(ping=1)
+            await ours.find(lambda said: "pong" in said)
+            await ours.say(subscribe="fleet")
+            await ours.find(lambda said: said.get("fleet"))
+            await ours.say(begin="check", port="sim")
+            await ours.find(lambda said: "question" in said.get("guide", ()))
+            await ours.say(press="leave")
+            await ours.find(lambda said: "ended" in said.get("guide", ()))
+            daemon.signal(signal.SIGSTOP)
+            try:
+                await ours.find(lambda said: "gone" in said)
+            finally:
+                daemon.signal(signal.SIGCONT)
+            heard.extend(ours.heard)
+
+    with (
+        Daemon(tmp_path, config={"odometry": {"gyro": True}}) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as page,
+    ):
+        bus.linked()
+        run(lambda: story(daemon, page))
+    found = described.kinds(heard)
+    assert found >= set(described.FRAMES), set(described.FRAMES) - found
+    assert found >= {"Running", "Subject", "Question", "Ended"}
+    for one in {frozenset(frame): frame for frame in heard}.values():
+        assert [spoilt for spoilt in described.spoilt(one) if described.taken(spoilt)] == []
 
 
 @pytest.mark.network

@@ -29,6 +29,10 @@ export class Link extends EventTarget {
     this.#connect();
     this.beat();
     document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
+    // A browser may keep a page that was left, with its connection, and wake it when somebody goes
+    // back to it: the robot would take it for one who looks.
+    addEventListener("pagehide", () => this.#end("the page was left"));
+    addEventListener("pageshow", (event) => event.persisted && this.#connect());
   }
 
   /** How far what is shown may lag behind, ms: the last way there and back, or what is waited for. */
@@ -116,7 +120,7 @@ export class Link extends EventTarget {
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "minute", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {
@@ -127,19 +131,23 @@ export class Link extends EventTarget {
   #ping() {
     if (!this.open) return;
     if (performance.now() - this.#heard > SILENT) {
-      // A close needs an answer too, which a cut way does not give.
-      const socket = this.#socket;
-      this.#socket = null;
-      socket.onclose = null;
-      socket.close();
-      this.open = false;
-      this.way = null;
-      this.#tell("down", { reason: "no answer" });
+      this.#end("no answer");
       this.#connect();
       return;
     }
     this.#asked ??= performance.now();
     this.send({ ping: this.#asked });
+  }
+
+  /** At once: a close needs an answer too, which a cut way or a frozen page does not have. */
+  #end(reason) {
+    const socket = this.#socket;
+    if (!socket) return;
+    this.#socket = socket.onclose = null;
+    socket.close();
+    this.open = false;
+    this.way = null;
+    this.#tell("down", { reason });
   }
 
   #tell(kind, detail) {

@@ -6,7 +6,7 @@ import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
-import { Plot } from "./plot.js";
+import { Minute } from "./minute.js";
 import { Recordings } from "./recordings.js";
 import { barred, hint, may, permit } from "./roles.js";
 import { Settings } from "./settings.js";
@@ -26,13 +26,7 @@ const drive = new Drive(link, $("stick"), $("knob"), told);
 const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
-const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "wished", colour: "--wished" }];
-const plots = {
-  speed: new Plot($("plot-speed"), COMPARED, { low: -0.1, high: 0.3 }),
-  turn: new Plot($("plot-turn"), COMPARED, { low: -0.3, high: 0.3 }),
-  wheels: new Plot($("plot-wheels"), ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` })), { low: -1, high: 3 }),
-  late: new Plot($("plot-late"), [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }], { low: 0, high: 1 }),
-};
+const plots = new Minute();
 let view = "drive";
 let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
@@ -149,7 +143,8 @@ function looked() {
   if (state && performance.now() - heard > lasts()) views.unheard(silent);
   if (old > 2 * lasts()) drive.release("let go: nothing is heard of the robot");
   if (view !== "status" || document.hidden) return;
-  for (const plot of Object.values(plots)) plot.draw(performance.now());
+  plots.draw(performance.now());
+  views.text("unknown", plots.lacks(performance.now()));
 }
 
 function stated({ detail }) {
@@ -237,6 +232,7 @@ link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.
 link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
 link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value, OTHER));
 link.addEventListener("path", ({ detail }) => OTHER || map.trail(detail.path));
+link.addEventListener("minute", ({ detail }) => OTHER || plots.begin(performance.now(), detail.minute));
 link.addEventListener("fleet", ({ detail }) => {
   views.cards($("cards"), detail.fleet, hello?.robot, OTHER ? "" : hello?.robot);
   views.text("fleet-note", detail.note);

@@ -5,7 +5,8 @@ import { colours, sized } from "./map.js";
 import { made } from "./views.js";
 import { signed } from "./words.js";
 
-const SPAN = 60000;
+export const SPAN = 60000;
+export const GAP = 2000; // with nothing known for so long a line is broken
 const ROOM = 44;
 
 // Dash and shift of each line, px. Drawn in this order, of four that lie on each other each is seen.
@@ -36,6 +37,19 @@ export class Plot {
     });
   }
 
+  /** What is known of before, in the place of what stands there of the same time: times, and a
+   *  column for each line, null where nothing is known. */
+  begin(times, ...columns) {
+    if (!times.length) return;
+    columns.forEach((column, n) => {
+      const line = this.#lines[n];
+      const before = line.points.filter(([at]) => at < times[0]);
+      const after = line.points.filter(([at]) => at > times.at(-1));
+      const known = times.map((at, row) => [at, column[row]]).filter(([, value]) => value !== null);
+      line.points = [...before, ...known, ...after];
+    });
+  }
+
   draw(now) {
     const [paper, width, height] = sized(this.#canvas);
     if (!width) return;
@@ -45,6 +59,9 @@ export class Plot {
     const bottom = Math.min(this.#floor.low, ...all) * 1.08;
     const x = (at) => ROOM + ((at - now + SPAN) / SPAN) * (width - ROOM - 6);
     const y = (value) => 8 + ((top - value) / (top - bottom)) * (height - 18);
+    const first = Math.min(now, ...this.#lines.flatMap((line) => line.points.slice(0, 1).map((point) => point[0])));
+    paper.fillStyle = look("--ground"); // nothing is known of then
+    if (first > now - SPAN) paper.fillRect(ROOM, 8, x(first) - ROOM, height - 18);
     paper.font = "11px system-ui, sans-serif";
     paper.fillStyle = look("--quiet");
     paper.strokeStyle = look("--line");
@@ -58,7 +75,7 @@ export class Plot {
     }
     this.#lines.forEach(({ name, colour, points, sample, said }, n) => {
       const last = points.at(-1);
-      const words = `${name} ${last ? signed(last[1], 2) : "–"}`;
+      const words = `${name} ${last && now - last[0] <= GAP ? signed(last[1], 2) : "–"}`;
       if (said.textContent !== words) said.textContent = words;
       const [small, wide, high] = sized(sample);
       for (const one of [small, paper]) {
@@ -74,7 +91,7 @@ export class Plot {
       let before = -Infinity;
       for (const [at, value] of points) {
         if (at < now - SPAN) continue;
-        paper[at - before > 2000 ? "moveTo" : "lineTo"](x(at), y(value));
+        paper[at - before > GAP ? "moveTo" : "lineTo"](x(at), y(value));
         before = at;
       }
       paper.stroke();

@@ -15,8 +15,9 @@ from acsard.client import Client
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import Info
 from acsard.web.counts import Counts
-from acsard.web.fleet import Fleet, Row
+from acsard.web.fleet import Fleet
 from acsard.web.robots import About, Robots
+from acsard.web.told import Row
 from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0

@@ -14,7 +14,8 @@ from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from acsard.messages.topics import SERVICES, TOPICS
 from acsard.web.frames import KINDS, FrameError, decode
-from acsard.web.openapi import PLAIN, TO_ROBOT, asked, document
+from acsard.web.openapi import PLAIN, asked, document
+from acsard.web.socket_schemas import FROM_ROBOT, TO_ROBOT
 
 WHOLE = document("1.2.3")
 
@@ -79,7 +80,9 @@ def test_what_the_socket_takes_is_what_its_schema_says(message: str) -> None:
 
 
 def test_the_socket_and_the_token_are_described() -> None:
-    assert WHOLE["paths"]["/ws"]["get"]["x-messages"]["$ref"].endswith(f"/{TO_ROBOT}")
+    messages = WHOLE["paths"]["/ws"]["get"]["x-messages"]
+    assert messages["to"]["$ref"].endswith(f"/{TO_ROBOT}")
+    assert messages["from"]["$ref"].endswith(f"/{FROM_ROBOT}")
     assert set(WHOLE["paths"]["/token"]["post"]["responses"]) >= {"303", "401", "429"}
 
 

@@ -1,0 +1,51 @@
+// The plots of the last minute: they begin with what the page's server has kept, and what is not
+// known of it is said.
+
+import { GAP, Plot, SPAN } from "./plot.js";
+
+const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "wished", colour: "--wished" }];
+const WHEELS = ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` }));
+const LATE = [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }];
+
+export class Minute {
+  #before = performance.now(); // nothing is known of before then
+  #wished = -Infinity; // and until then not always what was wished
+
+  constructor() {
+    const plot = (name, ...rest) => new Plot(document.getElementById(`plot-${name}`), ...rest);
+    this.speed = plot("speed", COMPARED, { low: -0.1, high: 0.3 });
+    this.turn = plot("turn", COMPARED, { low: -0.3, high: 0.3 });
+    this.wheels = plot("wheels", WHEELS, { low: -1, high: 3 });
+    this.late = plot("late", LATE, { low: 0, high: 1 });
+  }
+
+  /** `kept`: a column for each line, as long as `age`, ms, of what was known at `now`. */
+  begin(now, kept) {
+    const times = kept.age.map((age) => now - age);
+    this.speed.begin(times, kept.linear, kept.wished_linear);
+    this.turn.begin(times, kept.angular, kept.wished_angular);
+    this.wheels.begin(times, ...kept.wheels);
+    this.late.begin(times, kept.late_p99, kept.late_max);
+    const first = times[0] ?? now;
+    this.#before = Math.min(this.#before, first < now - SPAN + GAP ? -Infinity : first);
+    let known = first;
+    times.forEach((at, row) => {
+      if (kept.wished_linear[row] !== null) known = at;
+      else if (at - known > GAP) this.#wished = at;
+    });
+  }
+
+  draw(now) {
+    for (const plot of [this.speed, this.turn, this.wheels, this.late]) plot.draw(now);
+  }
+
+  /** What they lack, in words; "" when it is all there. */
+  lacks(now) {
+    const recent = now - SPAN + GAP;
+    const clock = (at) => new Date(Date.now() - now + at).toLocaleTimeString();
+    const said = [];
+    if (this.#before > recent) said.push(`Nothing is known of before ${clock(this.#before)}.`);
+    if (this.#wished > recent) said.push(`What was wished before ${clock(this.#wished)} is known only while this page was open somewhere.`);
+    return said.join(" ");
+  }
+}

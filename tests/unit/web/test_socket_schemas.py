@@ -1,0 +1,108 @@
+"""The schemas of `/ws`: what it says is as one of them, and spoilt as none."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import msgspec
+import pytest
+from msgspec import Struct
+
+from acsard.checkup.findings import Finding
+from acsard.config.settings import Config
+from acsard.messages.encodings import encode
+from acsard.messages.report import Report
+from acsard.values import Role
+from acsard.web import lines, told
+from acsard.web.minute import Minute
+from acsard.web.socket_schemas import KEYS, LINES, SENT, VALUE
+from acsard.web.streams import KEYS as FOLLOWED
+from acsard.web.to_browser import Following
+from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
+from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
+
+GREETING = told.Greeting(
+    "acsar", "1", "operator", "phone/1f", told.Limits(1.0, 4.0), True, 10.0
+)  # fmt: skip
+
+SAID: tuple[Struct, ...] = (
+    told.Hello(GREETING),
+    told.Way([(0.0, 1.5)], []),
+    told.LastMinute(Minute().plotted(0)),
+    told.Answer(7, True, "stopped"),
+    told.Rows([told.Row("acsar", None, "", None, "", None, "")], ""),
+    told.Pong(12.5, 1e12),
+    told.Refused("cmd", "why"),
+    told.Gone("why"),
+)
+
+GUIDED: tuple[Struct, ...] = (
+    told.Running("check", "here", True),
+    told.Ended(0, "success", ""),
+    lines.Subject("port sim", True),
+    lines.Told("so"),
+    lines.Doing("so"),
+    lines.Progress(0.5),
+    lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
+    lines.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    lines.Result("all"),
+)
+
+
+def as_told(message: object) -> Any:
+    return msgspec.json.decode(msgspec.json.encode(message))
+
+
+def test_all_that_may_be_followed_is_described() -> None:
+    assert set(KEYS) == FOLLOWED
+    assert {one.removeprefix(VALUE) for one in FRAMES if one.startswith(VALUE)} == {
+        key.replace("/", ".") for key in KEYS
+    }
+
+
+@pytest.mark.parametrize("message", SAID, ids=lambda one: type(one).__name__)
+def test_what_is_said_is_as_described_and_nothing_of_it_may_be_missing(message: Struct) -> None:
+    frame = as_told(message)
+    assert kinds([frame]) == {type(message).__name__}
+    assert [one for one in spoilt(frame) if taken(one)] == []
+
+
+@pytest.mark.parametrize("line", GUIDED, ids=lambda one: type(one).__name__)
+def test_what_a_check_or_calibration_says_is_as_described(line: Struct) -> None:
+    assert kinds([as_told({"guide": line})]) == {"Guided", type(line).__name__}
+    assert not taken({"guide": {}})
+    assert not taken({"guide": as_told(line) | {next(iter(as_told(line))): {"of": "nothing"}}})
+
+
+def test_there_is_an_example_of_each() -> None:
+    assert {type(one) for one in SAID} == set(SENT)
+    assert {type(one) for one in GUIDED} == set(LINES)
+    assert len(GUIDES) == len(LINES)
+
+
+@pytest.mark.parametrize("role", get_args(Role))
+def test_each_role_may_be_greeted_and_no_other(role: Role) -> None:
+    hello = as_told(told.Hello(msgspec.structs.replace(GREETING, role=role)))
+    assert taken(hello)
+    assert not taken({"hello": hello["hello"] | {"role": "king"}})
+
+
+@pytest.mark.parametrize("robot", ["acsar", "robot2"])
+def test_a_message_of_a_key_has_its_type_by_reference(robot: str) -> None:
+    report = Report(Config(), START)
+    list(report.due(OUTPUTS, {"odom"}, lambda: SNAPSHOT))
+    odom = report.current("odom", lambda: SNAPSHOT)
+    assert odom is not None
+    head = Following(robot, "odom", "acsar", 0.1).head
+    frame = as_told(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
+    assert kinds([frame, frame | {"value": None}]) == {"Value.odom"}
+    assert [one for one in spoilt(frame) if taken(one)] == _without(frame)
+    assert not taken(frame | {"key": "state"})
+    assert SCHEMAS["Value.odom"]["properties"]["value"]["anyOf"][0] == {
+        "$ref": "#/components/schemas/Odometry"
+    }
+
+
+def _without(frame: dict[str, Any]) -> list[dict[str, Any]]:
+    """The robot may go without saying."""
+    return [{k: v for k, v in frame.items() if k != "robot"}] if "robot" in frame else []
