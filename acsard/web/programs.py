@@ -101,8 +101,12 @@ class Programs:
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._counts.refuse("malformed", who.origin)
             raise TroubleError(400, f"the body is to be a JSON object: {error}") from None
+        robot = given.pop("robot", "")
+        if not isinstance(robot, str):
+            self._counts.refuse("malformed", who.origin)
+            raise TroubleError(400, "robot is to be the id of another robot, which may be stopped")
         try:
-            reply = await self._calls.call(who, verb, given)
+            reply = await self._calls.call(who, verb, given, robot)
         except RefusedError as error:
             self._counts.refuse("role" if error.role else "path", who.origin)
             raise TroubleError(403 if error.role else 404, str(error)) from None

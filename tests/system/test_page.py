@@ -354,6 +354,19 @@ def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
     page.shows("alarm", "STOP: no connection to the robot")
 
 
+def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_again(
+    page: Phone, tmp_path: Path
+) -> None:
+    page.server.signal(signal.SIGSTOP)
+    page.browser.tap("stop")
+    page.server.process.kill()
+    assert page.bus.state()["mode"] == "ready"
+    address = page.server.here
+    with Page(page.daemon, tmp_path, "--address", address):
+        until(lambda: page.bus.state()["mode"] == "stopped", 10.0, "it is told again")
+        until(lambda: page.browser.text("alarm") == "", 5.0, "and says so")
+
+
 def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     pad = PAD.replace("AXES", "[0, -1, 0, 0]")

@@ -171,7 +171,7 @@ def drives(person: Person, bus: Bus) -> None:
         raise AssertionError(f"{error}; it said {told}") from None
 
 
-WAYS = ("a key", "the button", "escape", "stop", "hidden")
+WAYS = ("a key", "the button", "a long press", "escape", "stop", "hidden")
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -186,6 +186,8 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
         browser.key("Down", "KeyX", "x")
     elif way == "the button":
         browser.tap("guide-halt")
+    elif way == "a long press":
+        browser.touch("Start", browser.middle("guide-halt"))
     elif way == "escape":
         browser.key("Down", "Escape", "Escape")
     elif way == "stop":
@@ -200,7 +202,8 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
     print(f"{way}: at rest after {took:.2f} s")
     # 0.3 m/s at 1 m/s2, and some of the way.
     assert took < 0.3 + 0.5 + lost(begun, begun + took)
-    person.ended("failure" if way in ("a key", "the button") else "stopped")
+    browser.lift()
+    person.ended("failure" if way in ("a key", "the button", "a long press") else "stopped")
     none_left(server)
     browser.open("about:blank")
 

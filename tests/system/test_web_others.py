@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
+import aiohttp
 import pytest
 import zenoh
 
@@ -72,6 +73,19 @@ def test_another_robot_is_followed_and_stopped_and_only_that(two: Two) -> None:
     assert two.ours.state()["mode"] == "ready"
     (stopped,) = [one for one in two.theirs.get("events")["events"] if one["name"] == "stop"][-1:]
     assert stopped["by"].startswith("here@page")
+
+
+def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(two.page.here) as session:
+            wishes = ((THEIRS, "stop", 200), (THEIRS, "clear", 403), (3, "stop", 400))
+            for robot, verb, status in wishes:
+                async with session.post(f"/api/srv/{verb}", json={"robot": robot}) as answer:
+                    assert answer.status == status, await answer.text()
+
+    run(story)
+    assert two.theirs.state()["mode"] == "stopped"
+    assert two.ours.state()["mode"] == "ready"
 
 
 def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(two: Two) -> None:

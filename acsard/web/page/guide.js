@@ -29,8 +29,11 @@ export class Guide {
     $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
     $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#way() }));
     $("way").addEventListener("change", () => this.#ways());
-    $("guide-halt").addEventListener("click", () => this.#key());
-    $("guide-leave").addEventListener("click", () => this.leave());
+    // As STOP does: a finger that stays down, or slides off, has pressed too.
+    for (const [name, act] of [["guide-halt", () => this.#key()], ["guide-leave", () => this.leave()]]) {
+      $(name).addEventListener("pointerdown", act);
+      $(name).addEventListener("click", (event) => event.detail === 0 && act()); // by Enter
+    }
     $("guide-close").addEventListener("click", () => this.#close());
     $("guide-question").addEventListener("submit", (event) => event.preventDefault());
     document.addEventListener("visibilitychange", () => document.hidden && !this.#question && this.leave());

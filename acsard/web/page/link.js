@@ -102,9 +102,7 @@ export class Link extends EventTarget {
     socket.onclose = async (event) => {
       if (this.#socket !== socket) return;
       const was = this.open;
-      this.open = false;
-      this.way = null;
-      this.#tell("down", { reason: event.reason });
+      this.#down(event.reason);
       if (!was) this.#shut = await this.#refused();
       if (document.hidden) return; // again when somebody looks
       setTimeout(() => this.#connect(), AGAIN[Math.min(this.#tries++, AGAIN.length - 1)]);
@@ -145,8 +143,14 @@ export class Link extends EventTarget {
     if (!socket) return;
     this.#socket = socket.onclose = null;
     socket.close();
+    this.#down(reason);
+  }
+
+  /** What was asked by it has no answer any more. */
+  #down(reason) {
     this.open = false;
     this.way = null;
+    for (const id of [...this.#answers.keys()]) this.#answer({ answer: id, ok: false, text: "the connection went before an answer came" });
     this.#tell("down", { reason });
   }
 

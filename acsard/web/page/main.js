@@ -19,6 +19,8 @@ const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
 const words = (told) => clickable(told, OTHER);
 const LATCHED = ["stopped", "fault"];
+const URGENT = 30000; // ms for which a STOP without an answer is sent again
+const PAUSE = 300; // between two
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
@@ -28,6 +30,7 @@ const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
 let view = "drive";
+let presses = 0; // of STOP
 let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
 let hello = null;
@@ -60,17 +63,27 @@ function followed(key, rate, wanted) {
   else link.unsubscribe(key);
 }
 
+/** Sent until it is answered: a link may be dead and not know it yet. */
 async function stop() {
   drive.release();
   guide.leave();
-  const told = link.open || OTHER ? await link.call("stop", undefined, OTHER) : await posted();
-  views.alarm(told.ok ? "" : `STOP: ${told.text}`);
+  const press = ++presses;
+  const last = performance.now() + URGENT;
+  for (;;) {
+    const told = link.open ? await link.call("stop", undefined, OTHER) : await posted();
+    if (press !== presses) return; // a newer one tells
+    const again = !told.ok && performance.now() < last;
+    views.alarm(told.ok ? "" : `STOP: ${told.text}${again ? "; it is sent again" : ""}`);
+    if (!again) return;
+    await new Promise((done) => setTimeout(done, PAUSE));
+  }
 }
 
 /** STOP without the link: there may be no place for one more page. */
 async function posted() {
   try {
-    const answer = await fetch("api/srv/stop", { method: "POST", signal: AbortSignal.timeout(3000) });
+    const body = JSON.stringify({ robot: OTHER });
+    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: AbortSignal.timeout(3000) });
     const told = await answer.json();
     return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
   } catch {
