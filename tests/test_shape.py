@@ -34,6 +34,7 @@ PURE_AMONG_SHELLS = (
     "bench.matching",
     "bench.record",
     "door.watch",
+    "foxglove.commanders",
     "foxglove.hand",
     "foxglove.news",
     "foxglove.objections",
