@@ -41,6 +41,7 @@ PURE_AMONG_SHELLS = (
     "foxglove.parameters",
     "foxglove.twists",
     "host.silence",
+    "record.around",
     "record.bag",
     "record.batch",
     "record.columns",
