@@ -93,6 +93,7 @@ def report(directory: Path) -> list[Path]:
         recorded = _recorded(Path(place) / "drive.mcap")
         done = finish(acsard("log", "report", str(recorded), str(drawn)), place)
         assert done.code == 0, done
+        browser.ask("Emulation.setScrollbarsHidden", hidden=True)
         written = []
         for size, look in itertools.product(("phone", "desktop"), LOOKS):
             browser.size(*SIZES[size], touch=size != "desktop", dark=look == "dark")
