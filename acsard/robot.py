@@ -324,19 +324,18 @@ class Robot:
             case "deactivate":
                 return life.deactivate()
             case "reset_odometry":
-                self._place(Pose())
-                return "pose is x 0, y 0, yaw 0"
+                return self._place(Pose())
             case "set_pose":
-                self._place(request.pose or Pose())
-                pose = self._odometry.pose
-                return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
+                return self._place(request.pose or Pose())
             case "set":
                 return self._set(request.settings, now_ns)
 
-    def _place(self, pose: Pose) -> None:
-        """The robot is there from now on, and what was owed to the pose before is not owed."""
+    def _place(self, pose: Pose) -> str:
+        """It is there from now on; to the pose before nothing is owed."""
         self._odometry.set_pose(pose)
         self.session.snapping.forgive()
+        pose = self._odometry.pose
+        return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         """Change settings in the middle of whatever the robot does."""

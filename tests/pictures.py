@@ -1,20 +1,32 @@
-"""What the robot's page looks like: `python -m tests.pictures DIRECTORY` writes every view as PNG,
-on a phone upright and sideways and on a desktop, light and dark, for people to look at."""
+"""What the robot's page and a recording's report look like, for people to look at.
+
+`python -m tests.pictures DIRECTORY` writes every view of the page as PNG, on a phone upright and
+sideways and on a desktop, light and dark; and the report of a drive, whole, 1280 and 390 pixels
+wide. With `--report` that alone.
+"""
 
 from __future__ import annotations
 
+import itertools
+import random
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from acsard.config.settings import Config
+from tests.scenarios.taped import Tape, drive_through_faults, happenings
+from tests.scenarios.world import World
 from tests.system.browser import Page
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, Daemon, acsard, finish, until
+from tests.unit.report.driven import two_drivers
 
 VIEWS = ("drive", "status", "events", "set", "robots")
 
 SIZES = {"phone": PHONE, "sideways": SIDEWAYS, "desktop": DESKTOP}
+
+LOOKS = ("light", "dark")
 
 
 def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = True) -> list[Path]:
@@ -35,7 +47,7 @@ def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = 
         written = [
             _picture(browser, directory, size, look, view)
             for size in sizes
-            for look in (("light", "dark") if both else ("light",))
+            for look in (LOOKS if both else LOOKS[:1])
             for view in VIEWS
         ]
         assert browser.said == [], browser.said
@@ -70,9 +82,46 @@ def _picture(browser: Browser, directory: Path, size: str, look: str, view: str)
     return path
 
 
+DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
+
+
+def report(directory: Path) -> list[Path]:
+    """The pictures of a drive's report, named `report-phone-dark.png`."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as place, browsing() as browser:
+        drawn = Path(place) / "drive.html"
+        recorded = _recorded(Path(place) / "drive.mcap")
+        done = finish(acsard("log", "report", str(recorded), str(drawn)), place)
+        assert done.code == 0, done
+        browser.ask("Emulation.setScrollbarsHidden", hidden=True)
+        written = []
+        for size, look in itertools.product(("phone", "desktop"), LOOKS):
+            browser.size(*SIZES[size], touch=size != "desktop", dark=look == "dark")
+            browser.open(drawn.as_uri())
+            until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+            browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 500))")
+            written.append(directory / f"report-{size}-{look}.png")
+            browser.picture(written[-1], whole=True)
+        assert browser.said == [], browser.said
+        return written
+
+
+def _recorded(path: Path) -> Path:
+    """Two minutes: two drive, one is stopped, links and wheels fail."""
+    tape = Tape()
+    world = World(Config(), recorder=tape)
+    two_drivers(world)
+    happenings(world, random.Random(1))
+    drive_through_faults(world, 100.0)
+    tape.write(path, Config())
+    return path
+
+
 def main() -> None:
-    for path in write(Path(sys.argv[1])):
-        print(path)
+    *words, directory = sys.argv[1:]
+    for write_one in (report,) if words == ["--report"] else (write, report):
+        for path in write_one(Path(directory)):
+            print(path)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from acsard.host import clock
 from acsard.incoming.bus import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import BUSY, Query, most_bytes, refused
-from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys
 from acsard.ros.transports import Endpoint
 
@@ -41,7 +40,6 @@ in a step: the last of so many 2.6 s late. The next one is told to ask again."""
 ATTACHMENT_BYTES = 256
 """An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
 
-CDR = encoding_name("cdr")
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
 
@@ -103,10 +101,7 @@ class Inbox:
         """A sample on a ROS key, which names its encoding nowhere: it stands for a native one."""
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
-        # An rmw key names the type; by a bridge only the length tells a Twist from a TwistStamped.
-        named = endpoint.transport == "rmw"
-        encoding = f"{CDR};{endpoint.type}" if named else CDR
-        self._arrived(sample, native, encoding, endpoint.transport)
+        self._arrived(sample, native, endpoint.encoding, endpoint.transport)
 
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
         arrived = clock.now()

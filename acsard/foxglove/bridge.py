@@ -69,6 +69,8 @@ class Bridge:
         context = foxglove.Context()
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
+        self._deaf = facts.deaf
+        """Why no commander is heard; "" once that is told."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -115,6 +117,9 @@ class Bridge:
         driving = self._drives.driving()
         shown, fresh = self._shown.take()
         self._relay.follow(shown, fresh, state=bool(driving))
+        if self._deaf and not shown.isdisjoint(self._relay.commanders):
+            self._notices.say("warning", "commands", self._deaf, stays="commands")
+            self._deaf = ""
         state = self._relay.pass_on()
         if state is not None:
             self._state, self._state_ns = state, clock.mono_ns()

@@ -13,6 +13,11 @@ from acsard.messages.encodings import DecodeError
 from acsard.ros.channels import CMD_VEL_IN, SOURCE, Channel, said
 from acsard.ros.transports import left_out
 
+DEAF = (
+    "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS: see it with "
+    "`acsard foxglove` at the robot, or later by `acsard log export`"
+)
+
 
 class Facts(Struct, frozen=True):
     """`config` is the robot's where we may read it, else the defaults."""
@@ -23,6 +28,8 @@ class Facts(Struct, frozen=True):
     sources: tuple[str, ...]
     forbidden: str
     """Why we may not drive, in words; "" when we may."""
+    deaf: str = ""
+    """Why we hear no commander, in words; "" when we do."""
 
     def rows(self) -> list[tuple[Channel, str]]:
         """Each channel with its key on the bus; those of the commanders once for each source."""
@@ -40,8 +47,9 @@ def key_of(row: Channel, source: str) -> str:
 
 def learn(robot: Client, tls: str) -> Facts:
     """Ask the robot; raises what `Client.get` raises, and `ReplyError` for another version's."""
-    forbidden, role = "", "maintainer"
+    forbidden, role, deaf = "", "maintainer", ""
     if tls:
+        deaf = DEAF
         us = robot.whoami()
         role = us.role
         forbidden = "" if role in ("operator", "maintainer") else us.words()
@@ -53,4 +61,4 @@ def learn(robot: Client, tls: str) -> Facts:
         raise ReplyError(
             f"cannot read what the robot says ({error}); is the daemon of another version?"
         ) from None
-    return Facts(config, tables, sources, forbidden)
+    return Facts(config, tables, sources, forbidden, deaf)

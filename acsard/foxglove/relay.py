@@ -16,20 +16,10 @@ import zenoh
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.client import Client
 from acsard.foxglove.facts import Facts, key_of
+from acsard.foxglove.heard import Commanders
 from acsard.foxglove.news import News
-from acsard.foxglove.twists import command
-from acsard.host import clock
 from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import (
-    MESSAGES,
-    Events,
-    Header,
-    RobotState,
-    Time,
-    Twist,
-    TwistStamped,
-    Vector3,
-)
+from acsard.messages.schema import MESSAGES, Events, RobotState
 from acsard.messages.topics import by_key
 from acsard.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.ros.shapes import Log
@@ -63,6 +53,7 @@ class Relay:
         self._robot, self._context, self._wake = robot, context, wake
         self._outs: dict[str, _Out] = {}
         self._followed: dict[str, Subscription] = {}
+        self._commanders = Commanders(robot, wake)
         self._decoders: dict[str, Decoder[msgspec.Struct]] = {}
         self._news = News()
         self.log_topic = ""
@@ -71,6 +62,7 @@ class Relay:
 
     def offer(self, facts: Facts) -> None:
         """Show what the robot has, beside what was shown before."""
+        self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)
             if row is LOG:
@@ -84,11 +76,21 @@ class Relay:
                 )
                 self._outs[topic] = _Out(row, key_of(row, source), channel)
 
+    @property
+    def commanders(self) -> Collection[str]:
+        """The topics that show what each source commands."""
+        return self._commanders.topics
+
     def follow(self, topics: Collection[str], fresh: Collection[str], *, state: bool) -> None:
         """Subscribe to what these need, and to `state` if it is asked for; `fresh` are new ones."""
         if self.log_topic in fresh:
             self._news = News()  # who opens the log sees the last events
-        shown = [self._outs[topic] for topic in topics if topic in self._outs]
+        self._commanders.follow(topics)
+        shown = [
+            out
+            for topic, out in self._outs.items()
+            if topic in topics and topic not in self._commanders.topics
+        ]
         keys = {out.key for out in shown} | ({STATE} if state else set())
         for key in self._followed.keys() - keys:
             self._followed.pop(key).undeclare()
@@ -105,16 +107,18 @@ class Relay:
 
     def _subscribed(self, key: str) -> Subscription:
         topic = by_key(key)
-        latched = topic is not None and topic.latched
-        arrivals = queue_on(self._robot.session, self._robot.key(key), latched=latched)
+        assert topic is not None, key
+        arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
         arrivals.wakes(self._wake)
-        if topic is not None and not latched:
+        if not topic.latched:
             self._robot.ask(key, arrivals.take)  # the next one may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> RobotState | None:
         """Pass on what has come; the newest state among it."""
         newest: RobotState | None = None
+        for topic, command in self._commanders.take():
+            self._outs[topic].log(command)
         for key, samples in self._followed.items():
             outs = [out for out in self._outs.values() if out.key == key]
             for message in self._messages(key, samples):
@@ -156,19 +160,8 @@ class Relay:
         return found
 
     def _message(self, key: str, sample: zenoh.Sample) -> msgspec.Struct:
-        topic = by_key(key)
-        if topic is None:
-            return _asked_for(key, sample)
         if key not in self._decoders:
+            topic = by_key(key)
+            assert topic is not None, key
             self._decoders[key] = Decoder(MESSAGES[topic.type])
         return self._decoders[key].decode(*encoded(sample))
-
-
-def _asked_for(key: str, sample: zenoh.Sample) -> TwistStamped:
-    """What a source commands, with the time at which it is here."""
-    now = clock.now()
-    twist = command(key, *encoded(sample), now.mono_ns).twist
-    return TwistStamped(
-        Header(Time.from_ns(now.wall_ns)),
-        Twist(Vector3(x=twist.linear), Vector3(z=twist.angular)),
-    )

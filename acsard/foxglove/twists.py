@@ -10,7 +10,6 @@ from acsard.drive.kinematics import Kinematics
 from acsard.foxglove.hand import Wish
 from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
 from acsard.messages.encodings import DecodeError, encoding_name
-from acsard.values import Command
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """For twists alone, of which neither joints nor wheels are asked."""
@@ -29,12 +28,7 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     raise DecodeError("unknown_encoding", f"{encoding} where json or cdr is wanted")
 
 
-def command(key: str, encoding: str, payload: bytes, arrived_ns: int) -> Command:
-    """The command in a payload on `cmd/<source>`; raises `DecodeError`."""
-    return _receiver.command(Arrival(key, True, payload, encoding, arrived_ns, None, ""))
-
-
 def wish(encoding: str, payload: bytes) -> Wish:
     """The twist in what a viewer published, with its stamp; raises `DecodeError`."""
-    found = command("cmd/app", encoding, payload, 0)
+    found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)

@@ -12,20 +12,11 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from acsard.messages.report import Look, Report
-from acsard.messages.schema import (
-    DiagnosticArray,
-    Header,
-    RobotState,
-    TFMessage,
-    Time,
-    Twist,
-    TwistStamped,
-    Vector3,
-)
+from acsard.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.record.steps import Step
 from acsard.robot import Robot
 from acsard.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, said
-from acsard.ros.shapes import log
+from acsard.ros.shapes import asked, log
 from acsard.ros.transports import left_out
 from acsard.values import Command, Instant, Outputs
 
@@ -88,9 +79,8 @@ class Publisher:
 
     def _heard(self, command: Command, now: Instant) -> Published:
         arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns
-        header = Header(Time.from_ns(arrived_ns), self._config.odometry.base_frame)
-        linear, angular = Vector3(x=command.twist.linear), Vector3(z=command.twist.angular)
-        message = TwistStamped(header, Twist(linear, angular))
+        frame = self._config.odometry.base_frame
+        message = asked(command.twist, Time.from_ns(arrived_ns), frame)
         return Published(CMD_VEL_IN, command.source, arrived_ns, message)
 
 

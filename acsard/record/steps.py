@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import msgspec
 from msgspec import Struct
 
+from acsard.config.settings import Config
 from acsard.robot import Robot
 from acsard.values import AcsardError, Estimate, Event, Inputs, Outputs, Recording
 
@@ -35,6 +36,28 @@ class Taken(NamedTuple):
     outputs: Outputs
     left: bytes | None
     """What was handed to the port, None when nothing went."""
+
+
+class Start(NamedTuple):
+    """What a file begins with: the robot after the step before number `number`."""
+
+    number: int
+    state: bytes
+    config: Config
+    """In force then: settings may have been changed since the daemon began."""
+
+
+def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
+    """What follows without a break, and what it begins with if it begins anew."""
+    start: Start | None = None
+    steps: list[Taken] = []
+    for item in items:
+        if isinstance(item, Taken):
+            steps.append(item)
+            continue
+        yield start, steps
+        start, steps = item, []
+    yield start, steps
 
 
 class BlackBox(Protocol):

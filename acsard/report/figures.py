@@ -30,7 +30,7 @@ from acsard.report.path import path
 from acsard.report.thinning import Point, Span
 from acsard.values import WHEELS
 
-ROW_PX, ROOM_PX = 54, 60
+ROW_PX, ROOM_PX = 54, 68
 """Height of a row of bands, and what the time axis takes beside the rows."""
 
 
@@ -41,6 +41,12 @@ class Line(NamedTuple):
     colour: str
     points: Sequence[Point]
     shape: str = "linear"
+    width: float = 1.6
+    """px"""
+
+
+BENEATH = 3.4
+"""Of what another curve nearly hides: its colour is seen on both sides."""
 
 
 class Part(NamedTuple):
@@ -85,6 +91,17 @@ def _looks(rows: list[Row]) -> Iterator[Look]:
             yield Look(kind, "", COLOURS.get(kind, UNKNOWN))
 
 
+def _keys(looks: list[Look]) -> list[Key]:
+    """One for each colour, with all that it means, each in a row of its own."""
+    meanings: dict[tuple[str, str], list[str]] = {}
+    for one in looks:
+        meanings.setdefault((one.colour, one.pattern), []).append(one.told)
+    return [
+        Key("▨" if pattern else "■", colour, ", ".join(told))
+        for (colour, pattern), told in meanings.items()
+    ]
+
+
 class Pictures:
     """Draws a course; `offset_s` is what the clocks here are ahead of UTC."""
 
@@ -107,7 +124,7 @@ class Pictures:
                 title,
                 [
                     Line("wished", WISHED, curves["wished"].points(), "hv"),
-                    Line("limited", LIMITED, curves["limited"].points(), "hv"),
+                    Line("limited", LIMITED, curves["limited"].points(), "hv", BENEATH),
                     Line("measured", MEASURED, curves["measured"].points()),
                 ],
             )
@@ -129,7 +146,7 @@ class Pictures:
             Part(
                 f"{name.replace('_', ' ')}, rad/s",
                 [
-                    Line("asked", LIMITED, asked.points(), "hv"),
+                    Line("asked", LIMITED, asked.points(), "hv", BENEATH),
                     Line("measured", MEASURED, turned.points()),
                 ],
             )
@@ -148,7 +165,7 @@ class Pictures:
             Part(
                 "lines a second",
                 [
-                    Line("sent", LIMITED, link.sent.points(), "hvh"),
+                    Line("sent", LIMITED, link.sent.points(), "hvh", BENEATH),
                     Line("answered", MEASURED, link.good.points(), "hvh"),
                 ],
             ),
@@ -181,7 +198,6 @@ class Pictures:
         looks = list(_looks(rows))
         data = [self._bars(look, [(at, s) for at, row in enumerate(rows) for s in look.of(row)])
                 for look in looks]  # fmt: skip
-        keys = [Key("▨" if one.pattern else "■", one.colour, one.told) for one in looks]
         axes = self._timed() | {
             "barmode": "overlay",
             "uniformtext": {"mode": "hide", "minsize": 11},
@@ -192,7 +208,9 @@ class Pictures:
         if silent:
             caption += f" Silent all the time: {', '.join(silent)}."
         height = ROW_PX * len(rows) + ROOM_PX
-        return Figure("who", "Who drove, and why others did not", caption, keys, height, data, axes)
+        return Figure(
+            "who", "Who drove, and why others did not", caption, _keys(looks), height, data, axes
+        )
 
     def _bars(self, look: Look, spans: list[tuple[int, Span]]) -> Trace:
         kind, colour = look.kind, look.colour
@@ -251,8 +269,13 @@ class Pictures:
 
     def _timed(self) -> dict[str, Any]:
         seconds = max(self._course.seconds, 0.1)
-        axis = {"type": "date", "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)]}
-        return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 36}}
+        axis = {
+            "type": "date",
+            "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)],
+            # Ticks that nobody sees hold the times clear of the lowest number beside them.
+            "ticks": "outside", "ticklen": 8, "tickcolor": "rgba(0,0,0,0)",
+        }  # fmt: skip
+        return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
         """Pictures above each other, with one time axis and one legend."""
@@ -278,6 +301,6 @@ class Pictures:
             "x": numbers(self._ms(point.t) for point in line.points),
             "y": numbers(point.value for point in line.points),
             "yaxis": axis,
-            "line": {"color": line.colour, "width": 1.6, "shape": line.shape},
+            "line": {"color": line.colour, "width": line.width, "shape": line.shape},
             "hovertemplate": f"{line.name} %{{y:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>",
         }

@@ -24,8 +24,14 @@ from acsard.report.thinning import Place
 HEADINGS = 12
 """Arrows along a path."""
 
-NOTED = ("fault", "stop", "link_down", "link_stale", "link_late")
-"""Events that the path shows where they happened."""
+NOTED = {
+    "fault": ("✖", "x", COLOURS["error"]),
+    "stop": ("◆", "diamond", COLOURS["warning"]),
+    "link_down": ("▼", "triangle-down", "#b04fc4"),
+    "link_stale": ("▲", "triangle-up", "#e0b400"),
+    "link_late": ("⬟", "pentagon", "#8f4f22"),
+}
+"""Events that the path shows where they happened: sign, as the library calls it, and colour."""
 
 
 def path(course: Course) -> Figure:
@@ -42,11 +48,11 @@ def path(course: Course) -> Figure:
             _places("end", places[-1:], "markers", marker=_dot("square", END, 13)),
         ]
         keys = [Key("▶", LIMITED, "heading"), Key("●", MEASURED, "start"), Key("■", END, "end")]
-    for name in NOTED:
-        trace = _noted(name, course.marks)
+    for name, (sign, symbol, colour) in NOTED.items():
+        trace = _noted(name, course.marks, _dot(symbol, colour, 12))
         if trace:
             data.append(trace)
-            keys.append(Key("✖", trace["marker"]["color"], trace["name"]))
+            keys.append(Key(sign, colour, trace["name"]))
     axes = layout() | {
         "xaxis": {"title": {"text": "x, m"}, "automargin": True},
         "yaxis": {"title": {"text": "y, m"}, "scaleanchor": "x", "scaleratio": 1},
@@ -60,13 +66,12 @@ def path(course: Course) -> Figure:
     return Figure("path", "The path", caption, keys, 460, data, axes, timed=False)
 
 
-def _noted(name: str, marks: Marks) -> Trace | None:
+def _noted(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
     """Where these events happened."""
     marks_here = [mark for mark in marks.all() if mark.name == name]
     here = [(mark, mark.place) for mark in marks_here if mark.place is not None]
     if not here:
         return None
-    dot = _dot("x", COLOURS["error" if name == "fault" else "warning"], 11)
     trace = _places(name.replace("_", " "), [at for _, at in here], "markers", marker=dot)
     words = [sentence(mark) for mark, _ in here]
     return trace | {"hovertext": words, "hovertemplate": "%{hovertext}<extra></extra>"}

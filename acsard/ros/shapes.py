@@ -11,8 +11,18 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from acsard.messages.schema import Byte, Happening, Header, RobotState, Time
+from acsard.messages.schema import (
+    Byte,
+    Happening,
+    Header,
+    RobotState,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
 from acsard.values import Event
+from acsard.values import Twist as BodyTwist
 
 Whole = Annotated[int, Meta(extra={"cdr": "q"})]
 Natural = Annotated[int, Meta(extra={"cdr": "I"})]
@@ -47,6 +57,13 @@ def log(event: Event | Happening, stamp: Time) -> Log:
 def how_often(text: str, count: int) -> str:
     """What to put behind a text that does not begin with its numbers itself; "" for nothing."""
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
+
+
+def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
+    """What a source asks for, on `cmd_vel_in/<source>`: stamped when it arrived."""
+    return TwistStamped(
+        Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+    )
 
 
 class Counter(Struct, frozen=True):

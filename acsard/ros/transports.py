@@ -13,6 +13,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.config.settings import Config, RosConfig
+from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, Direction, service_key
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
@@ -43,6 +44,13 @@ class Endpoint(Struct, frozen=True):
     latched: bool
     type: str
     """The ROS type its key names; by a bridge, where a name may take two, the first."""
+
+    @property
+    def encoding(self) -> str:
+        """Of what comes in on it, which names none: a bridge's Twist or TwistStamped is told by
+        its length only."""
+        cdr = encoding_name("cdr")
+        return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
 
 
 KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}

@@ -2,16 +2,18 @@
 
 pytest -s -m bench tests/bench/test_record.py
 
-Ten rounds of two daemons, one after the other, each driven at 20 commands a second; the one that
-comes first changes; then one at rest. Five minutes. The processor's time is the kernel's own
-account, of all threads.
+Lateness: ten rounds of two daemons, one after the other, each driven at 20 commands a second; the
+one that comes first changes. Processor: twenty pairs of new processes, two at once, so that
+whatever else the machine does costs both alike; its time is the kernel's own account, of all
+threads. Then one at rest. Nine minutes.
 """
 
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from statistics import median, stdev
+from statistics import mean, median, stdev
 from typing import NamedTuple
 
 import pytest
@@ -21,6 +23,11 @@ from tests.system.harness import Bus, Daemon
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(900)]
 
 ROUNDS, SPAN_S, SETTLES_S, REST_S = 10, 9.0, 1.0, 30.0
+
+PAIRS = 20
+
+SURE = 0.2
+"""Points of a core that the mean of all pairs may be off, by twice its standard error."""
 
 MORE = 0.4
 """Points of a core that recording may take."""
@@ -68,6 +75,27 @@ def cost(where: Path, records: bool) -> Cost:
     return Cost(100 * used / span, late["p50"], late["p99"], missed, written / span)
 
 
+def pair(where: Path, first: bool) -> tuple[float, float]:
+    """% of a core without and with recording, of two daemons that drive at once."""
+    with ExitStack() as stack:
+        pids: dict[bool, int] = {}
+        for records in (first, not first):
+            (place := where / str(records)).mkdir(parents=True)
+            words = ["--record", str(place / "record")] if records else []
+            daemon = stack.enter_context(Daemon(place, words=words))
+            bus = stack.enter_context(Bus(daemon.endpoint))
+            bus.linked()
+            stack.enter_context(bus.commanding(0.3))
+            pids[records] = daemon.pid
+        time.sleep(SETTLES_S)
+        before = {records: processor_s(pid) for records, pid in pids.items()}
+        began = time.monotonic()
+        time.sleep(SPAN_S)
+        used = {records: processor_s(pid) - before[records] for records, pid in pids.items()}
+        span = time.monotonic() - began
+        return 100 * used[False] / span, 100 * used[True] / span
+
+
 def told(name: str, costs: list[Cost]) -> str:
     middle = [median(column) for column in zip(*costs, strict=True)]
     return (
@@ -77,20 +105,29 @@ def told(name: str, costs: list[Cost]) -> str:
     )
 
 
-def test_recording_costs_little_and_makes_no_period_late(tmp_path: Path) -> None:
+def test_recording_makes_no_period_late(tmp_path: Path) -> None:
     costs: dict[bool, list[Cost]] = {False: [], True: []}
     for number in range(ROUNDS):
         for records in (False, True) if number % 2 else (True, False):
             costs[records].append(cost(tmp_path / f"{number}-{records}", records))
     off, on = costs[False], costs[True]
-    more = [b.processor - a.processor for a, b in zip(off, on, strict=True)]
     print(f"\n{told('without', off)}\n{told('recording', on)}")
-    print(f"recording takes {median(more):+.2f} points of a core (each +- {stdev(more):.2f})")
-    assert median(more) < MORE + 2 * stdev(more) / ROUNDS**0.5
     # Within what two like it differ by, on this machine now.
     noise = max(one.p99 for one in off) - min(one.p99 for one in off)
     assert median(one.p99 for one in on) <= median(one.p99 for one in off) + noise
     assert 0 < median(one.bytes_ for one in on) * 86_400 < DRIVING
+
+
+def test_recording_takes_little_of_the_processor(tmp_path: Path) -> None:
+    pairs = [pair(tmp_path / str(number), bool(number % 2)) for number in range(PAIRS)]
+    more = [on - off for off, on in pairs]
+    error = stdev(more) / PAIRS**0.5
+    print(f"\nrecording takes {mean(more):+.2f} +- {2 * error:.2f} points of a core", end=" ")
+    print(f"(twice the standard error of {PAIRS} pairs; each +- {stdev(more):.2f}, ", end="")
+    # A busy machine makes both dearer: where the one without takes 3 %, it is quiet.
+    print(f"median {median(more):+.2f}) beside {mean(off for off, _ in pairs):.2f} without")
+    assert 2 * error < SURE
+    assert mean(more) - 2 * error < MORE
 
 
 def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:

@@ -1,24 +1,45 @@
-"""An export says what was said: message for message what the bus had while it was recorded."""
+"""An export says what was said: message for message what the bus had while it was recorded.
+
+Twice: what the export makes of a recording, message by message; and its file, byte by byte and as
+readers of others decode it.
+"""
 
 from __future__ import annotations
 
+import math
 import random
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from acsard.config.settings import Config
-from acsard.messages.schema import DiagnosticArray, Events, Message, RobotState
+from acsard.messages.schema import (
+    DiagnosticArray,
+    Events,
+    Header,
+    Message,
+    RobotState,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
+from acsard.record.export import export
 from acsard.record.file import Recording
 from acsard.record.published import MEASURED, Publisher
 from acsard.record.replay import lived
 from acsard.record.replayed import Course
-from acsard.ros.channels import LOG
-from acsard.ros.shapes import log
+from acsard.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG
+from acsard.ros.shapes import log, state
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import World
 
@@ -44,9 +65,7 @@ def driven(config: Config) -> tuple[World, Tape]:
     return world, tape
 
 
-def exported(tape: Tape, config: Config, path: Path) -> Said:
-    tape.write(path, config)
-    recording = Recording(path)
+def exported(recording: Recording) -> Said:
     course = Course(recording)
     publisher, said = Publisher(course.robot, recording.about.started_ns), defaultdict(list)
     for step in course.steps():
@@ -63,11 +82,28 @@ def exported(tape: Tape, config: Config, path: Path) -> Said:
         pytest.param(CHECKED, id="checked", marks=pytest.mark.slow),
     ],
 )
-def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """What was published, and what the export says."""
+def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A drive, and the file of it."""
     world, tape = driven(request.param)
     path = tmp_path_factory.mktemp("export") / "drive.mcap"
-    return world, tape, exported(tape, request.param, path)
+    tape.write(path, request.param)
+    return world, tape, Recording(path)
+
+
+@pytest.fixture(scope="module")
+def both(recorded: Any) -> Any:
+    """What was published, and what the export says."""
+    world, tape, recording = recorded
+    return world, tape, exported(recording)
+
+
+@pytest.fixture(scope="module")
+def file(recorded: Any) -> Path:
+    """The exported file."""
+    _, _, recording = recorded
+    new: Path = recording.path.with_name("new.mcap")
+    assert export(recording, new, "mcap").trouble == ""
+    return new
 
 
 def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
@@ -101,20 +137,29 @@ def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 
-def test_every_event_is_a_line_of_the_log(both: Any) -> None:
-    world, _, said = both
+COUNTED = {"lines_rejected", "missed_periods", "command_refused", "first_contact"}
+"""`events` has what goes on and on in one row, with how often in all; the log a line each time."""
+
+
+def happened(world: World) -> list[Any]:
+    """Each event once."""
     told: list[Any] = []
     for events in world.bus.published["events"]:
         assert isinstance(events, Events)
         told += events.events[len(events.events) - (events.total - len(told)) :]
+    return told
+
+
+def test_every_event_is_a_line_of_the_log(both: Any) -> None:
+    world, _, said = both
+    told = happened(world)
     assert len(told) > 20
     lines = said[LOG.native]
     assert [(one.stamp, one.name) for one in told] == [(one.stamp, one.name) for one in lines]
-    # `events` has what goes on and on in one row, with how often in all; the log a line each time.
     others = {
         one.name for one, line in zip(told, lines, strict=True) if log(one, line.stamp) != line
     }
-    assert others <= {"lines_rejected", "missed_periods", "command_refused", "first_contact"}
+    assert others <= COUNTED
 
 
 def test_every_command_is_there_by_its_source_with_the_time_it_came(both: Any) -> None:
@@ -131,3 +176,122 @@ def test_every_command_is_there_by_its_source_with_the_time_it_came(both: Any) -
     for key, commands in heard.items():
         told = [(m.header.stamp.to_ns(), m.twist.linear.x, m.twist.angular.z) for m in said[key]]
         assert told == commands
+
+
+# the file
+
+
+def commanded(source: str) -> str:
+    """The topic of what it commands."""
+    return CMD_VEL_IN.topic("", source)
+
+
+def live(world: World, tape: Tape) -> Said:
+    """What a stranger had of each topic but the log, in the shape that ROS has it."""
+    found: Said = defaultdict(list)
+    for key in BY_KEY:
+        found[BY_KEY[key].topic("")] = [_as_told(one) for one in world.bus.published[key]]
+    for inputs, _, _ in tape.taken:
+        for one in inputs.commands:
+            arrived = one.arrived_ns + inputs.now.wall_ns - inputs.now.mono_ns
+            asked = Twist(Vector3(x=one.twist.linear), Vector3(z=one.twist.angular))
+            stamped = TwistStamped(Header(Time.from_ns(arrived), "base_link"), asked)
+            found[commanded(one.source)].append(stamped)
+    return found
+
+
+def _as_told(message: Message) -> Any:
+    """Without what the daemon measures of itself."""
+    if isinstance(message, DiagnosticArray):
+        left_out = MEASURED | {"acsard: recording"}
+        rows = [row for row in message.status if row.name not in left_out]
+        return DiagnosticArray(message.header, rows)
+    return state(message) if isinstance(message, RobotState) else message
+
+
+def test_the_file_has_each_message_that_was_published_to_the_byte(
+    recorded: Any, file: Path
+) -> None:
+    world, tape, _ = recorded
+    written: dict[str, list[bytes]] = defaultdict(list)
+    with file.open("rb") as stream:
+        for _, channel, message in SeekingReader(stream).iter_messages():
+            written[channel.topic].append(message.data)
+    rows = {row.topic("", "app"): row for row in CHANNELS}
+    published = live(world, tape)
+    assert set(written) == {*published, "/log"} >= set(rows)
+    for name, messages in published.items():
+        data = [rows.get(name, CMD_VEL_IN).encode(one) for one in messages]
+        assert written[name] == data, f"{name}: {len(written[name])} of {len(data)}"
+    lines = [LOG.encode(log(one, one.stamp)) for one in happened(world)]
+    assert len(written["/log"]) == len(lines)
+    others = {
+        one.name
+        for one, line, data in zip(happened(world), lines, written["/log"], strict=True)
+        if line != data
+    }
+    assert others <= COUNTED
+
+
+def by_mcap_ros2(path: Path, reader: Any) -> Iterator[tuple[str, Any]]:
+    """Topic and message, decoded by the definitions in the file; by the library of MCAP."""
+    with path.open("rb") as stream:
+        for one in reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            yield one.channel.topic, one.decoded_message
+
+
+def by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
+    """The same by another library, that knows no type before."""
+    store: Any = get_typestore(Stores.EMPTY)
+    with path.open("rb") as stream:
+        for schema, channel, message in NonSeekingReader(stream).iter_messages():
+            assert schema is not None
+            if schema.name not in store.types:
+                store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            yield channel.topic, store.deserialize_cdr(message.data, schema.name)
+
+
+@cache
+def fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
+    return kind.__struct_fields__
+
+
+def same(told: Any, ours: Any) -> bool:
+    """Field by field, down to the numbers."""
+    if isinstance(ours, msgspec.Struct):
+        return all(same(getattr(told, name), getattr(ours, name)) for name in fields(type(ours)))
+    if isinstance(ours, (list, tuple)):
+        return len(told) == len(ours) and all(map(same, told, ours))
+    if isinstance(ours, float) and math.isnan(ours):
+        return math.isnan(told)
+    return bool(told == ours)
+
+
+@pytest.mark.parametrize("library", ["seeking", "not seeking", "rosbags"])
+def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
+    library: str, recorded: Any, file: Path
+) -> None:
+    world, tape, _ = recorded
+    readers = {"seeking": SeekingReader, "not seeking": NonSeekingReader}
+    messages = by_mcap_ros2(file, readers[library]) if library in readers else by_rosbags(file)
+    told: Said = defaultdict(list)
+    for name, message in messages:
+        told[name].append(message)
+    for name, published in live(world, tape).items():
+        assert len(told[name]) == len(published) > 0
+        for number, (one, ours) in enumerate(zip(told[name], published, strict=True)):
+            assert same(one, ours), f"{name}, message {number}: {one} for {ours}"
+    lines = [(one.stamp.sec, one.stamp.nanosec, one.name) for one in told["/log"]]
+    assert lines == [(one.stamp.sec, one.stamp.nanosec, one.name) for one in happened(world)]
+
+
+def test_it_is_the_definitions_in_the_file_that_they_read_by(file: Path, tmp_path: Path) -> None:
+    # They are in the chunks, which are compressed, and behind them, where who seeks looks first.
+    whole = file.read_bytes()
+    other = tmp_path / "other.mcap"
+    other.write_bytes(whole.replace(b"string child_frame_id", b"string child_grame_id"))
+    with other.open("rb") as stream:
+        reader = SeekingReader(stream, decoder_factories=[DecoderFactory()])
+        one = next(iter(reader.iter_decoded_messages("/odom")))
+    assert one.decoded_message.child_grame_id == "base_link"
+    assert not hasattr(one.decoded_message, "child_frame_id")

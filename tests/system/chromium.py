@@ -249,10 +249,19 @@ class Browser:
         kind = "rawKeyDown" if kind == "Down" else "keyUp"
         self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 
-    def picture(self, path: Path) -> None:
-        """What a person sees, as PNG."""
-        told = self.ask("Page.captureScreenshot", format="png")
+    def picture(self, path: Path, *, whole: bool = False) -> None:
+        """What a person sees, as PNG; or the `whole` page, down to its end."""
+        told = self.ask(
+            "Page.captureScreenshot",
+            format="png",
+            captureBeyondViewport=whole,
+            **{"clip": self._whole()} if whole else {},
+        )
         path.write_bytes(base64.b64decode(told["data"]))
+
+    def _whole(self) -> dict[str, float]:
+        size = self.ask("Page.getLayoutMetrics")["cssContentSize"]
+        return {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
 
 
 @contextmanager

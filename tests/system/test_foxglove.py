@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.exceptions import InvalidStatus
 
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Twist, Vector3
+from acsard.config.settings import JointsConfig
+from acsard.messages.encodings import FORMATS, encode, encoding_name
+from acsard.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
 from acsard.values import NS_PER_S
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -31,6 +37,7 @@ from tests.system.harness import (
     read,
     until,
 )
+from tests.system.ros_clients import JOINTS, STAMPED, TWIST, BridgeHalf, RmwClient, session_at
 from tests.system.viewer import Looked, Viewer, opened
 
 SLOW = pytest.mark.slow
@@ -218,6 +225,98 @@ def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
     told = looked.read(looked.came[0].payload)
     assert (told.twist.linear.x, told.twist.angular.z) == (0.0, 0.0)
     assert told.header.stamp.sec > 0
+
+
+Sent = tuple[str, float, Callable[[], None]]
+"""Of which source, at what m/s, and what sends it."""
+
+
+def moving(name: str, speed: float) -> Any:
+    """A message of this ROS type."""
+    if name == JOINTS:
+        wheels = [speed / 0.05] * 4
+        return JointState(name=list(JointsConfig().as_tuple()), velocity=wheels)
+    twist = Twist(Vector3(x=speed), Vector3())
+    return twist if name == TWIST else TwistStamped(Header(), twist)
+
+
+def every_way(session: zenoh.Session) -> Iterator[Sent]:
+    """To command, each with a speed of its own."""
+    speeds = (number / 100 for number in itertools.count(1))
+
+    def put(key: str, payload: bytes, **named: str) -> Callable[[], None]:
+        return lambda: session.put(f"acsard/acsar/{key}", payload, **named)  # type: ignore[arg-type]
+
+    for name, form in itertools.product((TWIST, STAMPED), FORMATS):
+        payload = encode(moving(name, speed := next(speeds)), form)
+        named = encoding_name(form, name.rpartition("/")[2])
+        yield "nav", speed, put("cmd/nav", payload, encoding=named)
+        payload = encode(moving(name, speed := next(speeds)), form)
+        yield "nav", speed, put("cmd/nav", payload)
+    for form in FORMATS:
+        payload = encode(moving(JOINTS, speed := next(speeds)), form)
+        yield "ros2_control", speed, put("wheel_cmd/ros2_control", payload)
+    topics = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
+    for client, (topic, source) in itertools.product(
+        (RmwClient(session), BridgeHalf(session)), topics.items()
+    ):
+        for name in (JOINTS,) if topic == "joint_commands" else (TWIST, STAMPED):
+            payload = encode(moving(name, speed := next(speeds)), "cdr")
+            yield source, speed, partial(client.put, topic, name, payload)
+
+
+def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
+    """Frame and speeds of each."""
+    return [(m.header.frame_id, m.twist.linear.x, m.twist.angular.z) for m in messages]
+
+
+@SLOW
+def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Path) -> None:
+    words = ["--record", str(tmp_path / "record")]
+    with Daemon(tmp_path, words=words) as daemon, Shows(daemon) as own, Viewer(own.port) as viewer:
+        sources = ("teleop", "ros2_control", "nav")
+        looked = {source: viewer.show(f"/cmd_vel_in/{source}") for source in sources}
+        read: dict[str, list[Any]] = {source: [] for source in sources}
+
+        def shown(source: str) -> list[tuple[str, float, float]]:
+            one, known = looked[source], read[source]
+            known += [one.read(came.payload) for came in one.came[len(known) :]]
+            return asked(known)
+
+        with session_at(daemon.endpoint) as session:
+            for source, speed, send in every_way(session):
+
+                def came(source: str = source, speed: float = speed, send: Any = send) -> bool:
+                    send()
+                    return any(linear == pytest.approx(speed) for _, linear, _ in shown(source))
+
+                until(came, 5.0, f"{speed} of {source}")
+            session.put("acsard/acsar/cmd/nav", b'{"linear": {"x": 1}}')
+            session.delete("acsard/acsar/cmd/nav")
+        daemon.process.terminate()
+        assert daemon.ended(5.0) == 0
+    (path,) = (tmp_path / "record").glob("*.mcap")
+    ended = finish(acsard("log", "export", str(path), str(tmp_path / "new.mcap")), tmp_path)
+    assert ended.code == 0, ended
+    told = exported(tmp_path / "new.mcap")
+    for source in sources:
+        live, written = shown(source), asked(told[f"/cmd_vel_in/{source}"])
+        # The first may have come before the subscription.
+        assert live == written[-len(live) :]
+
+
+def exported(path: Path) -> dict[str, list[Any]]:
+    """The messages of each topic."""
+    found: dict[str, list[Any]] = {}
+    store: Any = get_typestore(Stores.EMPTY)
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if schema.name not in store.types:
+                store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            told = store.deserialize_cdr(message.data, schema.name)
+            found.setdefault(channel.topic, []).append(told)
+    return found
 
 
 @SLOW

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from acsard.report.page import page
+from tests import pictures
+from tests.pictures import LOOKS
 from tests.system.chromium import DESKTOP, PHONE, browsing
 from tests.system.harness import until
 from tests.unit.report.driven import drive_of_two, followed
@@ -82,3 +85,13 @@ def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -
             widths = "[...document.querySelectorAll('.main-svg')].map(b => b.clientWidth)"
             assert 0.7 * width < max(browser.js(widths)) <= width
             print(f"{width}: {browser.js('document.documentElement.scrollWidth')} px wide")
+
+
+def test_pictures_of_it_are_as_wide_as_a_phone_and_a_desk_and_as_high_as_it_is(
+    tmp_path: Path,
+) -> None:
+    written = pictures.report(tmp_path)
+    sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
+    assert [width for width, _ in sizes] == [PHONE[0]] * 2 + [DESKTOP[0]] * 2
+    assert min(height for _, height in sizes) > 3 * DESKTOP[1]
+    assert len({path.read_bytes() for path in written}) == len(LOOKS) * 2

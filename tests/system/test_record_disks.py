@@ -19,8 +19,8 @@ import pytest
 from acsard.config.settings import RecordConfig
 from acsard.record.closing import closing
 from acsard.record.directory import Ring, Run
+from acsard.record.disk import HAPPENED
 from acsard.record.file import About, Recording, Writing
-from acsard.record.recorder import HAPPENED
 from acsard.record.recovery import recover
 from acsard.web.recordings import rows
 from tests.system import bystander

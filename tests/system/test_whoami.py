@@ -207,6 +207,14 @@ def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
             viewer.set({"limits.linear_speed": 0.5})
             viewer.status(f"not set: {may}")
             assert viewer.call("/acsard/stop", {})["success"]
+            for source in ("nav", "app"):
+                viewer.show(f"/cmd_vel_in/{source}")
+            deaf = "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS"
+            viewer.status(deaf)
+        with Viewer(port) as late:
+            late.show("/odom").first()
+            late.status(deaf)
+        assert program.stderr.count(deaf) == 1
     with Bus(robot.plain) as bus:
         assert bus.get("srv/clear")["success"]
         assert bus.count("commands") == 0

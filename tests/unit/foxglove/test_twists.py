@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.foxglove.hand import Wish
-from acsard.foxglove.twists import command, encoding_of, wish
+from acsard.foxglove.twists import encoding_of, wish
 from acsard.messages.encodings import DecodeError, encode
 from acsard.messages.schema import Header, Time, TwistStamped, Vector3
 from acsard.messages.schema import Twist as Message
@@ -68,8 +68,3 @@ def test_what_is_no_twist_is_refused(payload: bytes) -> None:
 def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
     with pytest.raises(DecodeError):
         wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
-
-
-def test_a_command_on_the_bus_is_read_by_the_same_rules() -> None:
-    found = command("cmd/nav", "", encode(STAMPED, "msgpack"), 7)
-    assert (found.source, found.twist, found.arrived_ns) == ("nav", Twist(0.3, -0.2), 7)

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, RecordConfig
 from acsard.incoming.commands import Arrival
 from acsard.mcu.gate import Offered
+from acsard.record import around, disk
 from acsard.record import recorder as module
 from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import KEPT, Ring, listed
@@ -86,7 +87,7 @@ def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
 def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "LONGEST_NS", 3_000_000_000)
+    monkeypatch.setattr(disk, "LONGEST_NS", 3_000_000_000)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(10.0)
@@ -171,8 +172,8 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minute = 6  # s: the same in a tenth of the time
-    monkeypatch.setattr(module, "LONGEST_NS", minute * 10**9 // 3)
-    monkeypatch.setattr(module, "AROUND_NS", minute * 10**9)
+    monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
+    monkeypatch.setattr(around, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.bus.wanted = set()
 
@@ -200,11 +201,11 @@ def test_the_minute_before_and_after_what_happened_is_kept(
 
 def die(bench: Bench) -> None:
     """As a process does that is killed: what is open is closed, nothing else."""
-    disk = bench.recorder._disk
-    assert disk._writing is not None
-    assert disk._ring is not None
-    disk._writing.close()
-    disk._ring.close()
+    side = bench.recorder._disk
+    assert side._writing is not None
+    assert side._ring is not None
+    side._writing.close()
+    side._ring.close()
 
 
 @pytest.mark.slow
@@ -212,7 +213,7 @@ def die(bench: Bench) -> None:
 def test_the_minute_before_and_after_a_crash_is_kept(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(14.0)
@@ -386,7 +387,7 @@ def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.Monk
 def test_the_minute_before_a_fault_of_our_own_is_kept(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(6.0)
     told = cuts(ends_by(bench, ValueError(BUG)))
@@ -400,8 +401,8 @@ def test_a_clock_that_is_set_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot without a clock of its own, that was off for weeks, hears the time once it drives."""
-    monkeypatch.setattr(module, "LONGEST_NS", 2_000_000_000)
-    monkeypatch.setattr(module, "AROUND_NS", 0)
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(around, "AROUND_NS", 0)
     seen = set[str]()
 
     def there() -> set[str]:
@@ -426,7 +427,7 @@ def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
     bench.world.run(1.0)
     bench.write()
     bench.recorder._disk._fail(OSError(errno.ENOSPC, "No space left on device"))
-    bench.drive(module.RETRY_ROUNDS + 3.0)
+    bench.drive(disk.RETRY_ROUNDS + 3.0)
     first, second = bench.end()
     assert first.name.endswith(KEPT)
     last = closing(first)
@@ -449,7 +450,7 @@ def full(handle: int) -> None:
 @pytest.fixture
 def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
     """One that drives, and tries a disk that refused in the next round."""
-    monkeypatch.setattr(module, "RETRY_ROUNDS", 0)
+    monkeypatch.setattr(disk, "RETRY_ROUNDS", 0)
     bench.world.drive(0.5, 0.2, seconds=0.5)
     rounds(bench)
     return bench
@@ -643,7 +644,7 @@ def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
     monkeypatch.setattr(module, "CLOSE_S", 0.01)
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", hangs)
-        patched.setattr(module, "leave", hangs)
+        patched.setattr(disk, "leave", hangs)
         eager.recorder.close()
         assert eager.recorder._thread.is_alive()
     goes.set()
@@ -689,7 +690,7 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
     shutil.rmtree(bench.where)
     bench.drive(1.0)
     assert "has been removed" in bench.recorder.status.trouble
-    bench.drive(module.RETRY_ROUNDS + 3.0)
+    bench.drive(disk.RETRY_ROUNDS + 3.0)
     status = bench.recorder.status
     assert status.trouble == ""
     assert status.missing > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable
 from typing import Any
 
@@ -12,9 +13,9 @@ import pytest
 from acsard.config.parsing import parse
 from acsard.report.drawing import Figure
 from acsard.report.figures import Pictures
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
-from tests.unit.report.driven import course_of, drive_of_two, followed
+from tests.unit.report.driven import course_of, drive_of_two, followed, two_drivers
 from tests.unit.report.seen import column, trace
 
 OFFSET_S = 3600.0
@@ -29,6 +30,28 @@ def figures() -> dict[str, Figure]:
 def known(values: Iterable[float]) -> list[float | None]:
     """With what compares as equal in place of NaN."""
     return [None if math.isnan(value) else value for value in values]
+
+
+def all_that_happens(world: World) -> None:
+    two_drivers(world)
+    happenings(world, random.Random(1))
+
+
+def test_no_two_signs_of_a_picture_look_alike() -> None:
+    course, _ = course_of(all_that_happens)
+    for figure in Pictures(course, OFFSET_S).all():
+        signs = [(key.sign, key.colour) for key in figure.keys]
+        assert len(signs) == len(set(signs)) > 0, figure.keys
+    keys = {key.meaning for figure in Pictures(course, OFFSET_S).all() for key in figure.keys}
+    assert keys >= {"stop", "link down", "driving, teleop drives"}
+
+
+def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Figure]) -> None:
+    for name, beneath in (("speeds", "limited"), ("wheels", "asked"), ("link", "sent")):
+        widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
+        below = [one["name"] for one in figures[name].data].index(beneath)
+        above = figures[name].data[below + 1]["name"]
+        assert widths[beneath] > 2 * widths[above]
 
 
 @pytest.mark.slow
@@ -79,7 +102,7 @@ def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str,
     looks = drivers(who)
     assert set(looks) == {"teleop", "nav"}
     assert len(set(looks.values())) == 2
-    keys = {key.meaning: key.colour for key in who.keys}
+    keys = {one: key.colour for key in who.keys for one in key.meaning.split(", ")}
     assert {name: keys[f"{name} drives"] for name in looks} == {n: c for n, (c, _) in looks.items()}
 
 
