@@ -224,6 +224,7 @@ class Ride:
     """Between the keys and the robot."""
 
     def __init__(self, robot: Client, teleop: Teleop, robot_id: str, endpoint: str) -> None:
+        from acsard.client.driving import Answers
         from acsard.messages.encodings import Decoder
         from acsard.messages.schema import RobotState
 
@@ -232,6 +233,7 @@ class Ride:
         self._decoder, self._states = Decoder(RobotState), robot.subscribe("state")
         self._answers: deque[zenoh.Sample] = deque()
         """Left here by a thread of Zenoh's."""
+        self._answered = Answers()
         self._state: RobotState | None = None
         self._heard = self._fine = self._asked = time.monotonic()
 
@@ -260,12 +262,11 @@ class Ride:
 
     def _take(self, sample: zenoh.Sample, asked: bool) -> None:
         from acsard.bus.subscription import encoded
-        from acsard.client.driving import newer
         from acsard.messages.encodings import DecodeError
 
         with suppress(DecodeError):  # a stranger's
             state = self._decoder.decode(*encoded(sample))
-            if asked and not newer(state, self._state):
+            if asked and not self._answered.news(state, self._state):
                 self._state = self._state or state  # the first may be a storage's: no news yet
                 return
             self._state, self._heard = state, time.monotonic()

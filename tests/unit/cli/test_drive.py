@@ -218,6 +218,17 @@ def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
     assert heard_after(Answers(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
 
 
+def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    class SetBack(Robot):
+        def ask(self, name: str, take: Any) -> None:
+            before = self.stored or replace(STATE, stamp=Time(1))
+            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
+            super().ask(name, take)
+
+    said = replace(STATE, stamp=Time(10**6))
+    assert heard_after(SetBack(said), 10 * ASK_S, monkeypatch) < 2 * ASK_S
+
+
 # without a screen
 
 
