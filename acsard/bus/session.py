@@ -8,12 +8,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 
 import zenoh
 
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.bus.tls_trouble import trouble
 from acsard.config.settings import TLS, BusConfig
+from acsard.host.colours import coloured
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
 from acsard.messages.topics import full_key, source_keys
 
@@ -232,5 +234,13 @@ def first_line(error: Exception) -> str:
 
 def log_from_environment() -> None:
     """Zenoh's own log, only when RUST_LOG asks for it: it goes to standard output."""
-    if "RUST_LOG" in os.environ:
-        zenoh.try_init_log_from_env()
+    if "RUST_LOG" not in os.environ:
+        return
+    wish = os.environ.get("NO_COLOR")
+    if not coloured(sys.stdout):  # it looks at this alone, and colours pipes and files
+        os.environ["NO_COLOR"] = "1"
+    zenoh.try_init_log_from_env()
+    if wish is None:
+        os.environ.pop("NO_COLOR", None)
+    else:
+        os.environ["NO_COLOR"] = wish

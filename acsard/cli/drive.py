@@ -16,7 +16,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.host.extras import install
 from acsard.top.teleop import HELP as TELEOP_HELP
 from acsard.values import REST, Twist
 
@@ -45,7 +44,7 @@ NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
 PART_S = 2.0
 """A robot stands within, by the ramp of its own."""
 
-NO_WIDTH = 10_000
+NO_END = 10**9
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -101,8 +100,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "drive",
         help="drive by keyboard",
-        description="Drive by keyboard from this terminal, on a screen of its own with the extra "
-        "`top`, else line by line.\n\n" + HELP,
+        description="Drive by keyboard from this terminal, on a screen of its own (in colours with "
+        "the extra `top`); line by line where TERM is dumb.\n\n" + HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--linear", type=float, default=0.5, metavar="M/S", help="default 0.5")
@@ -139,11 +138,10 @@ def _show(ride: Ride) -> None:
     if dumb or not sys.stdout.isatty():
         return _plain(ride)
     try:
-        from acsard.top import terminal
-    except ImportError:
-        print(f"acsard: with the library rich it has a screen of its own: {install('top')}")
-        return _plain(ride)
-    return terminal.drive(ride.step, ride.seen)
+        from acsard.top.terminal import drive
+    except ImportError:  # no rich, and so no colours
+        from acsard.top.bare import drive
+    return drive(ride.step, ride.seen)
 
 
 def _plain(ride: Ride) -> None:
@@ -151,14 +149,13 @@ def _plain(ride: Ride) -> None:
     from acsard.top.keys import keys, until_told
     from acsard.top.teleop import news
 
-    due = News()
+    due, page = News(), Page()
     with until_told(), keys() as read:
-        print(HELP)
         while (typed := read(PERIOD_S)) is not None:
             ride.step(typed)
             seen = ride.seen()
             if due.tell(seen, time.monotonic()):
-                print("\n".join(news(seen, _width())), flush=True)
+                print("\n".join(page.with_help(news(seen, _width()), _height())), flush=True)
 
 
 def _part(ride: Ride) -> None:
@@ -178,7 +175,11 @@ def _part(ride: Ride) -> None:
 
 def _width() -> int:
     """Of the terminal that is written to; of a file there is none."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_WIDTH
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_END
+
+
+def _height() -> int:
+    return shutil.get_terminal_size().lines if sys.stdout.isatty() else NO_END
 
 
 class News:
@@ -203,10 +204,27 @@ class News:
         return True
 
 
+class Page:
+    """Where there is no screen, the help comes again before it is out of sight; pure."""
+
+    def __init__(self) -> None:
+        self._shown = NO_END
+        """Lines since the help began."""
+
+    def with_help(self, told: list[str], height: int) -> list[str]:
+        """These lines, below the help where they are the first or would shove it out."""
+        self._shown += len(told)
+        if self._shown < height:
+            return told
+        self._shown = len(TELEOP_HELP) + len(told)
+        return [*TELEOP_HELP, *told]
+
+
 class Ride:
     """Between the keys and the robot."""
 
     def __init__(self, robot: Client, teleop: Teleop, robot_id: str, endpoint: str) -> None:
+        from acsard.client.driving import Answers
         from acsard.messages.encodings import Decoder
         from acsard.messages.schema import RobotState
 
@@ -215,6 +233,7 @@ class Ride:
         self._decoder, self._states = Decoder(RobotState), robot.subscribe("state")
         self._answers: deque[zenoh.Sample] = deque()
         """Left here by a thread of Zenoh's."""
+        self._answered = Answers()
         self._state: RobotState | None = None
         self._heard = self._fine = self._asked = time.monotonic()
 
@@ -243,12 +262,11 @@ class Ride:
 
     def _take(self, sample: zenoh.Sample, asked: bool) -> None:
         from acsard.bus.subscription import encoded
-        from acsard.client.driving import newer
         from acsard.messages.encodings import DecodeError
 
         with suppress(DecodeError):  # a stranger's
             state = self._decoder.decode(*encoded(sample))
-            if asked and not newer(state, self._state):
+            if asked and not self._answered.news(state, self._state):
                 self._state = self._state or state  # the first may be a storage's: no news yet
                 return
             self._state, self._heard = state, time.monotonic()

@@ -151,6 +151,7 @@ class _Watch:
         self._states = robot.subscribe("state")
         self._answers: deque[zenoh.Sample] = deque()
         """What was asked for comes on a thread of Zenoh's, which only leaves it here."""
+        self._answered = Answers()
         self.state: RobotState | None = None
         self.heard = self._asked = time.monotonic()
         self.objection: str | None = None
@@ -205,7 +206,7 @@ class _Watch:
         except DecodeError:
             self._unreadable = True
             return
-        if asked and not newer(state, self.state):
+        if asked and not self._answered.news(state, self.state):
             if self.state is None:  # the first may be a storage's: another, at once, tells
                 self.state, self._asked = state, self.heard
             return
@@ -215,13 +216,21 @@ class _Watch:
             self._fine = self.heard
 
 
-def newer(answer: RobotState, held: RobotState | None) -> bool:
-    """An answer shows that the daemon lives: it is newer than the state held so far.
+class Answers:
+    """Which answers show that the daemon lives.
 
     A storage of a router answers too, for a robot that is dead with the last state there was. What
     comes unasked is no storage's, and may be older: clocks are set back.
     """
-    return held is not None and answer.stamp.to_ns() > held.stamp.to_ns()
+
+    def __init__(self) -> None:
+        self._last: RobotState | None = None
+
+    def news(self, answer: RobotState, held: RobotState | None) -> bool:
+        """It is newer than the state held so far; or, where the robot's clock was set back since
+        that came, than the answer before it."""
+        before, self._last = (held, self._last), answer
+        return any(one is not None and answer.stamp.to_ns() > one.stamp.to_ns() for one in before)
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:

@@ -13,7 +13,7 @@ import zenoh
 from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
-from acsard.client.driving import newer
+from acsard.client.driving import Answers
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState
 from acsard.messages.topics import full_key
@@ -43,6 +43,7 @@ class _Known:
         """Its state and when that came: one value, since another thread reads it. `NEVER`: a first
         answer, which may be a storage's."""
         self.asked = NEVER
+        self.answered = Answers()
         self.version = ""
 
 
@@ -152,7 +153,7 @@ class Fleet:
         if one is None:
             return
         held = one.said[0]
-        if not asked or newer(state, held):
+        if not asked or one.answered.news(state, held):
             one.said = state, time.monotonic()
         elif held is None:
             one.said = state, NEVER

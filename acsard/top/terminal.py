@@ -1,14 +1,10 @@
-"""A person's terminal: one screen after the other, keys, ^Z, and what is left as it was."""
+"""The screens of `top`, `fleet` and `drive` by rich, and one of them as plain text."""
 
 from __future__ import annotations
 
-import io
-import os
-import signal
-import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -16,16 +12,12 @@ from rich.text import Text
 
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
-from acsard.top.keys import keys, until_told
+from acsard.top.held import PERIOD_S, be_lenient, hold, steer
+from acsard.top.keys import keys
 from acsard.top.roster import table
 from acsard.top.teleop import Look, Teleop, lines
 from acsard.top.view import MODES, screen
 from acsard.values import AcsardError
-
-PERIOD_S = 0.25
-
-KEYS_S = 0.05
-"""Who drives is looked after so often."""
 
 LOOKS: dict[Look, str] = {
     "head": "bold",
@@ -44,7 +36,7 @@ def once(feed: Feed) -> str:
     feed.ask()
     time.sleep(ONCE_S)
     feed.ask()
-    _be_lenient()
+    be_lenient()
     console = Console(color_system=None, force_terminal=False)
     with console.capture() as captured:
         console.print(screen(feed.seen(), console.width))
@@ -55,28 +47,20 @@ def live(feed: Feed) -> None:
     """Show the screen, and what changes, until a key or a signal."""
     with suppress(AcsardError):  # it may come by itself; the screen says that it waits
         feed.ask()
-    _hold(lambda console, suspend: _watch(feed, console, suspend))
+    console = Console()
+    hold(lambda suspend: _watch(feed, console, suspend))
 
 
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
     """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
-    _hold(lambda console, suspend: _drive(step, seen, console, suspend))
+    console = Console()
+    hold(lambda suspend: steer(step, seen, _teleop(console), suspend))
 
 
 def roster(fleet: Fleet) -> None:
     """Show a line for each robot, and what changes, until a key or a signal."""
-    _hold(lambda console, suspend: _roster(fleet, console, suspend))
-
-
-def _hold(shows: Callable[[Console, list[bool]], bool]) -> None:
-    """Have a screen until a signal, or until it is over; `shows` gives True for ^Z."""
-    _be_lenient()
-    console, suspend = Console(), []
-    signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
-    with until_told():
-        while shows(console, suspend):
-            suspend.clear()
-            os.kill(os.getpid(), signal.SIGSTOP)  # ^Z: the terminal is as it was; fg goes on
+    console = Console()
+    hold(lambda suspend: _roster(fleet, console, suspend))
 
 
 def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
@@ -88,27 +72,6 @@ def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
             typed = read(PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
-    return True
-
-
-def _drive(
-    step: Callable[[str], None],
-    seen: Callable[[], Teleop],
-    console: Console,
-    suspend: list[bool],
-) -> bool:
-    with keys() as read, _screen(console) as shown:
-        due = 0.0
-        while not suspend:
-            typed = read(KEYS_S)
-            if typed is None:
-                return False
-            step(typed)
-            if typed or time.monotonic() >= due:
-                due = time.monotonic() + PERIOD_S
-                shown.update(teleop_screen(seen(), *console.size), refresh=True)
-    for letter in ("k", "", ""):
-        step(letter)  # nobody steps while we are stopped
     return True
 
 
@@ -129,6 +92,12 @@ def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
             if typed is None or "q" in typed.lower():
                 return False
     return True
+
+
+@contextmanager
+def _teleop(console: Console) -> Iterator[Callable[[Teleop], None]]:
+    with _screen(console) as shown:
+        yield lambda seen: shown.update(teleop_screen(seen, *console.size), refresh=True)
 
 
 def teleop_screen(seen: Teleop, width: int, height: int) -> Group:
@@ -152,9 +121,3 @@ def _screen(console: Console) -> Live:
         redirect_stdout=False,
         redirect_stderr=False,
     )
-
-
-def _be_lenient() -> None:
-    """A terminal without a sign of ours shows another in its place."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")

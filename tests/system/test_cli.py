@@ -570,6 +570,16 @@ os.execvp("bash", [*words, *sys.argv[1:]])
 """The same, as a job of a shell."""
 
 
+WITHOUT_RICH = """\
+import fcntl, runpy, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+sys.modules["rich"] = None
+sys.argv[0] = "acsard"
+runpy.run_module("acsard", run_name="__main__")
+"""
+"""The same, where the library of the screens is not installed."""
+
+
 class Terminal:
     """A person at a terminal: presses keys, reads the screen."""
 
@@ -689,20 +699,29 @@ def screens(terminal: Terminal) -> list[str]:
 
 
 @contextmanager
-def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
+def screened(
+    shared: Daemon, columns: int, how: str = ON_TERMINAL
+) -> Iterator[tuple[Terminal, Program]]:
     """`acsard drive` at a terminal of that width that can have a screen."""
-    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
+    with at_terminal(shared, "drive", "xterm-256color", columns, how) as (terminal, program):
         until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
 
 
+RICH_OR_NOT = pytest.mark.parametrize("how", [ON_TERMINAL, WITHOUT_RICH], ids=["rich", "bare"])
+
+
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("columns", [40, 80])
+@RICH_OR_NOT
 def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
-    shared: Daemon, bus: Bus, columns: int
+    shared: Daemon, bus: Bus, columns: int, how: str
 ) -> None:
-    with screened(shared, columns) as (terminal, _):
+    with screened(shared, columns, how) as (terminal, _):
+        with held(terminal, "i"):
+            until(lambda: "DRIVING" in screens(terminal)[-1], 5.0, "driving")
         frames = screens(terminal)
+    assert all("u  i  o" in frame for frame in frames if "as teleop" in frame)
     shown = next(frame for frame in frames if WAITS in frame)
     told = " ".join(shown.split())
     for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
@@ -714,12 +733,13 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
 
 
 @pytest.mark.slow
+@RICH_OR_NOT
 def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
-    shared: Daemon, bus: Bus
+    shared: Daemon, bus: Bus, how: str
 ) -> None:
     with Terminal() as fresh:
         usual = fresh.settings
-    with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
+    with screened(shared, 80, how) as (terminal, program), bus.follow("cmd/teleop") as commands:
         during = terminal.settings
         assert during != usual
         with held(terminal, "i"):

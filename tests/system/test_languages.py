@@ -181,7 +181,8 @@ def heard(shared: Daemon) -> list[Said]:
             key, kind = row["key"].removeprefix("acsard/acsar/"), row["type"]
             if "<" in key or key == "alive" or row["direction"] == "in":
                 continue
-            if row["direction"] == "out" and key != "tf_static":
+            by_itself = row["rate"] not in ("latched", "on change")
+            if row["direction"] == "out" and by_itself:
                 with bus.follow(f"json/{key}") as messages:
                     found.append((kind, messages.find(lambda _: True, 5.0, key).value))
             elif row["direction"] != "service":

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.cli import drive
-from acsard.cli.drive import ASK_S, HOLD_S, ZEROS, News, Ride, Teleop, split
+from acsard.cli.drive import ASK_S, HOLD_S, NO_END, ZEROS, News, Page, Ride, Teleop, split
 from acsard.messages.encodings import encode
 from acsard.messages.schema import RobotState, Time
+from acsard.top.teleop import HELP
 from acsard.values import REST, Twist
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_teleop import SEEN
@@ -217,6 +218,17 @@ def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
     assert heard_after(Answers(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
 
 
+def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    class SetBack(Robot):
+        def ask(self, name: str, take: Any) -> None:
+            before = self.stored or replace(STATE, stamp=Time(1))
+            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
+            super().ask(name, take)
+
+    said = replace(STATE, stamp=Time(10**6))
+    assert heard_after(SetBack(said), 10 * ASK_S, monkeypatch) < 2 * ASK_S
+
+
 # without a screen
 
 
@@ -241,10 +253,26 @@ def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second()
     assert len(told(flickering)) <= 20
 
 
+def test_the_help_comes_again_before_news_shoves_it_off_the_terminal() -> None:
+    page, shown = Page(), list[str]()
+    for number in range(100):
+        shown += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
+        # The last line of a terminal is empty: there is the cursor.
+        assert list(HELP) == [line for line in shown[-23:] if line in HELP]
+    assert shown.count(HELP[0]) < 30
+    assert shown[-4:-3] == ["news 99"]
+
+
+def test_a_file_has_the_help_once() -> None:
+    page = Page()
+    assert page.with_help(["news"], NO_END) == [*HELP, "news"]
+    assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000
+
+
 def test_without_the_library_of_the_screen_the_rest_is_there() -> None:
     words = (
         "import sys; sys.modules['rich'] = None\n"
-        "import acsard.cli.drive, acsard.top.fleet, acsard.top.keys, acsard.top.roster\n"
+        "import acsard.cli.drive, acsard.top.fleet, acsard.top.bare, acsard.top.roster\n"
         "try:\n    import acsard.top.terminal\nexcept ImportError:\n    print('no screen')"
     )
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=60)

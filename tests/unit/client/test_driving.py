@@ -75,6 +75,8 @@ class World:
         self.dies = math.inf
         """From when on, s, only a storage of a router answers, with the last state."""
         self.stored: Any = None
+        self.set_back = math.inf
+        """When the robot's clock is, by 50 s."""
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -104,7 +106,8 @@ class World:
         state = self._says(self.now - 100.0, self.sent[-1] if self.sent else 0.0, self.sent)
         if state is None:
             return None
-        return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
+        clock = self.now - (0.0 if self.now < self.set_back else 50.0)
+        return sample_of(replace(state, stamp=Time.from_ns(int(clock * NS_PER_S))))
 
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
         """How long a drive of 0.5 m/s takes, s."""
@@ -287,6 +290,16 @@ def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(world, "_sample", lambda: made)
     world.drive(monkeypatch)
     assert world.sent.count(0.5) in (20, 21)
+
+
+def test_so_does_one_that_publishes_seldom_when_its_clock_is_set_back_on_the_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All its answers are older than what came before."""
+    world = World(followed)
+    world.published, world.set_back = False, 101.0
+    world.drive(monkeypatch, 5.0)
+    assert world.sent.count(0.5) in (100, 101)
 
 
 def test_a_daemon_of_another_version_is_told_from_a_dead_one(

@@ -179,3 +179,16 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
     assert told(fleet, clock, 2.5).endswith("commanded by app")
     assert "SILENT" not in told(fleet, clock, 0.0)
     assert told(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
+
+
+def test_a_robot_whose_clock_was_set_back_is_heard_by_its_answers(
+    session: Session, clock: Clock
+) -> None:
+    robot: Any = Remembers(session)
+    fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
+    session.comes("robot1")
+    told(fleet, clock, 0.5)
+    for second in (2000, 1, 3, 5):  # an hour's clock, and one that begins anew
+        robot.stored = replace(STATE, stamp=Time(second))
+        told(fleet, clock, 2.5)
+    assert "SILENT" not in told(fleet, clock, 0.0)

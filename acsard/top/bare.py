@@ -1,0 +1,43 @@
+"""The screen of `acsard drive` where there is no rich: the same lines, without colours."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from acsard.top.held import hold, steer
+from acsard.top.teleop import Teleop, lines
+
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
+"""A screen of its own without a cursor, where what is wider than we know is cut, not broken."""
+
+HOME, CLEAR_LINE, CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+"""Where each screen begins, and what clears the one before: from the begin of a line, since behind
+a full one the cursor still stands on its last sign."""
+
+
+def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
+    """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
+    hold(lambda suspend: steer(step, seen, _screen(), suspend))
+
+
+@contextmanager
+def _screen() -> Iterator[Callable[[Teleop], None]]:
+    def show(seen: Teleop) -> None:
+        width, height = shutil.get_terminal_size()
+        told = [CLEAR_LINE + text for _, text in lines(seen, width, height)]
+        below = [CLEAR_BELOW] if len(told) < height else []
+        _write(HOME + "\n".join(told + below))
+
+    _write(ENTER)
+    try:
+        yield show
+    finally:
+        _write(LEAVE)
+
+
+def _write(text: str) -> None:
+    sys.stdout.write(text)
+    sys.stdout.flush()

@@ -1,0 +1,152 @@
+"""NO_COLOR at a terminal, and whatever is no terminal, has no colours anywhere."""
+
+from __future__ import annotations
+
+import fcntl
+import re
+import struct
+import sys
+import termios
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+)
+from tests.system.test_cli import ON_TERMINAL, VERBS, WAITS, Terminal
+
+SGR = re.compile(r"\x1b\[([\d;:]*)m")
+
+
+def colours(text: str) -> list[str]:
+    """The sequences that ask for a colour; bold, faint and reversed are none."""
+    found = (match[1] for match in SGR.finditer(text))
+    return [one for one in found if any(map(_is_colour, re.split("[;:]", one)))]
+
+
+def _is_colour(number: str) -> bool:
+    return bool(number) and int(number) // 10 in (3, 4, 9, 10) and number not in ("39", "49")
+
+
+SCREENS = [
+    (["drive"], WAITS),
+    (["top"], WAITS),
+    (["top", "--once"], WAITS),
+    (["fleet"], WAITS),
+    (["fleet", "--once"], WAITS),
+    (["echo", "state", "--short"], WAITS),
+    (["echo", "state"], WAITS),
+    (["doctor"], "configuration"),
+    (["log", "--directory", "."], "no recording"),
+    (["run", "--port", "nowhere", "--id", "other"], "nowhere"),
+]
+
+
+EVERY_HELP = """\
+import argparse
+from acsard.cli import main, parser
+
+def words(of, before=()):
+    yield before
+    for action in of._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, inner in action.choices.items():
+                yield from words(inner, (*before, name))
+
+for one in words(parser()):
+    for last in ("--help", "--nonsense"):
+        try:
+            main([*one, last])
+        except SystemExit:
+            pass
+print("that was", "all")
+"""
+"""Also of the verbs' own verbs, and what is said to an option that there is not."""
+
+
+def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
+    """All that a program writes at a terminal that knows colours, until that text is there."""
+    with Terminal() as terminal:
+        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+        env = environment(TERM="xterm-256color", COLORTERM="truecolor")
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            env.pop(name, None)
+        with Program(
+            words,
+            where,
+            env | more,
+            stdin=terminal.slave,
+            stdout=terminal.slave,
+            stderr=terminal.slave,
+            start_new_session=True,
+        ):
+            until(lambda: text in SGR.sub("", terminal.screen), 15.0, f"{text!r} of {words}")
+        return terminal.screen
+
+
+def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
+    """These words of the command line at a terminal, with that daemon's file."""
+    file = [] if words[0] in ("run", "log") else ["--config", str(daemon.config)]
+    return [sys.executable, "-c", ON_TERMINAL, *words, *file]
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize(("words", "text"), SCREENS, ids=[" ".join(one) for one, _ in SCREENS])
+def test_no_screen_has_a_colour_where_nobody_wants_one(
+    shared: Daemon, bus: Bus, tmp_path: Path, words: list[str], text: str
+) -> None:
+    assert colours(shown(typed_at(shared, words), tmp_path, text, NO_COLOR="1")) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["drive"], ["top"], ["fleet"], ["doctor"]], ids=" ".join)
+def test_a_screen_has_colours_where_nobody_minds(
+    shared: Daemon, bus: Bus, tmp_path: Path, words: list[str]
+) -> None:
+    text = next(text for verb, text in SCREENS if verb == words)
+    assert colours(shown(typed_at(shared, words), tmp_path, text))
+
+
+def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", EVERY_HELP]
+    told = shown(words, tmp_path, "that was all", NO_COLOR="1")
+    assert told.count("usage: acsard") >= 2 * len(VERBS)
+    assert colours(told) == []
+
+
+@pytest.mark.variations(5)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["doctor"], ["top"], ["fleet"], ["echo", "state", "-n1", "--short"],
+        ["echo", "odom", "-n1"],
+        ["hz", "odom", "-n2"], ["topics"], ["check"], ["set"], ["whoami"], ["odom"],
+        ["get", "nonsense"], ["call", "nonsense"], ["set", "limits.linear_speed", "-1"], ["drive"],
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_nothing_that_goes_into_a_pipe_has_one(shared: Daemon, bus: Bus, words: list[str]) -> None:
+    env = environment(TERM="xterm-256color", FORCE_COLOR="1")
+    env.pop("NO_COLOR", None)
+    done = finish(acsard(*words, "--config", str(shared.config)), shared.config.parent, env=env)
+    assert done.out + done.err
+    assert "\x1b" not in done.out + done.err
+
+
+@pytest.mark.slow
+def test_the_log_of_zenoh_in_a_pipe_has_none(tmp_path: Path) -> None:
+    env = environment(TERM="xterm-256color", RUST_LOG="zenoh=debug")
+    env.pop("NO_COLOR", None)
+    words = acsard("run", "--listen", free_endpoint())
+    with Program(words, tmp_path, env) as program:
+        until(lambda: "zenoh::" in program.stdout + program.stderr, 10.0, "its log")
+    assert "\x1b" not in program.stdout + program.stderr
