@@ -6,6 +6,7 @@ import numpy as np
 
 from acsard.calibration.evidence import (
     COUNT,
+    DRIFT,
     LEFT,
     RATE,
     RIGHT,
@@ -46,7 +47,8 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     jacobian[:, RIGHT] = base.gain * turn * rows.right
     jacobian[:, RATE] = _slower(rows, base, parameters)
     jacobian[:, TURN] = (by_wheels + jacobian[:, RATE] * parameters[RATE]) / turn
-    residual = rows.turned - by_wheels
+    jacobian[:, DRIFT] = rows.seconds
+    residual = rows.turned - by_wheels - parameters[DRIFT] * rows.seconds
     usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
     return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
 

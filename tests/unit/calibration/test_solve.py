@@ -94,6 +94,19 @@ def test_bias_and_time_offset_are_told(count: int) -> None:
         assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
 
 
+def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
+    """A curve to one side is what a bias looks like, in every block alike."""
+    z = []
+    for seed in range(12):
+        robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
+        found = calibrated(drive(robot, wander(robot.rng, 100.0)).csv(places=False)).found
+        logs = found.covariance / np.outer(found.values, found.values)
+        apart = np.array([0.0, -1.0, 1.0])
+        off = np.log(found.values) @ apart - np.log(1.002 / 0.998)
+        z.append(off / np.sqrt(apart @ logs @ apart))
+    assert np.sqrt(np.mean(np.square(z))) < 1.4
+
+
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip
