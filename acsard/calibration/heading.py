@@ -228,7 +228,7 @@ def rows(
     parts: Sequence[Block],
 ) -> Rows:
     """What each block says; of the wheels alone where there is no sensor of heading."""
-    fast = [_fast(run) for run in driven]
+    fast = [_fast(run, turned) for run, turned in zip(driven, angles, strict=True)]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / ROW_S))
@@ -261,7 +261,7 @@ def level(rows: Rows) -> Rows:
     return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
-def _fast(run: Run) -> Floats:
-    apart = run.right - run.left
+def _fast(run: Run, turned: Wheels) -> Floats:
+    apart = turned.apart(run.t)
     steps = np.minimum(np.diff(run.t), ROW_S)
     return _sums(np.abs(apart) * apart, steps)

@@ -130,8 +130,8 @@ def grid(run: Run, turned: Wheels, fine_s: float = FINE_S) -> Grid:
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
     t, left, right = run.t[kept], turned.left[kept], turned.right[kept]
-    apart, steps = np.diff(right - left), np.diff(t)
-    return Grid(t, np.diff(left), np.diff(right), np.abs(apart) * apart / steps)
+    apart, steps = turned.apart((t[1:] + t[:-1]) / 2), np.diff(t)
+    return Grid(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
 
 def path(steps: Grid, base: Base, parameters: Floats) -> Path:

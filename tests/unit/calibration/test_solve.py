@@ -107,6 +107,20 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
     assert np.sqrt(np.mean(np.square(z))) < 1.4
 
 
+def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
+    """20 counts a turn at 1 kHz are 0 or 314 rad/s: of their squares nothing is to be told."""
+    seen = usual(plan=wander(np.random.default_rng(2), 100.0))
+    t = np.arange(seen.t[0], seen.t[-1], 0.001)
+    counted = [
+        np.floor(np.interp(t, seen.t, np.cumsum(side) * 0.01) * 20 / (2 * np.pi))
+        for side in (seen.left, seen.right)
+    ]
+    left, right = (np.diff(counts) * 2 * np.pi / 20 / 0.001 for counts in counted)
+    coarse = replace(seen, t=t[1:], left=left, right=right)
+    found = calibrated(coarse.csv(places=False)).found
+    assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
+
+
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip
