@@ -27,6 +27,7 @@ from acsard.calibration.evidence import (
     LEFT,
     RATE,
     RIGHT,
+    STRETCH,
     TURN,
     Evidence,
 )  # fmt: skip
@@ -41,6 +42,9 @@ SMALL, SETTLED = 1e-5, 0.02
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
 """Standard deviations before anything is seen, of parameters that a log may not tell: by which
 share a track grows with each rad/s, s, m, m."""
+
+GYRO_SCALE = 0.005
+"""The same of what a gyro calls one rad/s, of a usual MEMS gyro: no log of it alone shows that."""
 
 HELD = 1e9
 """Weight by which the mean radius is held where nothing measures it."""
@@ -118,13 +122,20 @@ class Fit(Struct, frozen=True):
         return np.asarray(covariance * np.outer(student, student))
 
 
-def fit(sources: Sequence[Source], start: Floats, *, places: bool, drift: float = 0.0) -> Fit:
-    """From parameters that are nearly right; `places`: positions are among the sources; `drift`:
-    standard deviation of a gyro's bias, rad/s, 0 where there is none."""
+def fit(
+    sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
+    drift: float = 0.0,
+) -> Fit:  # fmt: skip
+    """From parameters that are nearly right; what is among the sources: positions, a gyro.
+
+    `drift`: standard deviation of the gyro's bias, rad/s, 0 where that is taken out of all.
+    """
     active: tuple[int, ...] = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
-    usual: Mapping[int, float] = USUAL
+    usual = dict(USUAL)
+    if gyro:
+        active, usual[STRETCH] = (*active, STRETCH), GYRO_SCALE
     if drift:
-        active, usual = (*active, DRIFT), USUAL | {DRIFT: drift}
+        active, usual[DRIFT] = (*active, DRIFT), drift
     held = start[LEFT] + start[RIGHT]
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):

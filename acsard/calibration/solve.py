@@ -107,8 +107,9 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
             continue  # coarse positions may follow over a longer time
         except RefusedError as error:
             raise unlike or error from None
-        unsure_bias = headings.unsure if headings is not None else 0.0
-        fitted = fit(made.sources, made.start, places=bool(made.spots), drift=unsure_bias)
+        gyro = headings is not None and headings.source == "yaw_rate"
+        drift = headings.unsure if headings is not None else 0.0
+        fitted = fit(made.sources, made.start, places=bool(made.spots), gyro=gyro, drift=drift)
         unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
         tries.append((unsure, len(tries), made, fitted))
         if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:

@@ -10,6 +10,7 @@ from acsard.calibration.evidence import (
     LEFT,
     RATE,
     RIGHT,
+    STRETCH,
     TURN,
     Base,
     Evidence,
@@ -48,7 +49,9 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     jacobian[:, RATE] = _slower(rows, base, parameters)
     jacobian[:, TURN] = (by_wheels + jacobian[:, RATE] * parameters[RATE]) / turn
     jacobian[:, DRIFT] = rows.seconds
-    residual = rows.turned - by_wheels - parameters[DRIFT] * rows.seconds
+    jacobian[:, STRETCH] = by_wheels
+    gyro = by_wheels * (1 + parameters[STRETCH]) + parameters[DRIFT] * rows.seconds
+    residual = rows.turned - gyro
     usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
     return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
 

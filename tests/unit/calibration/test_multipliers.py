@@ -13,7 +13,7 @@ from tests.unit.calibration.cut import BASE, ideal, ready
 
 def fit_of(rate: float, varies: float) -> Fit:
     """Parameters that are known as well as can be, but for what the track does."""
-    parameters = np.array([0.99, 1.01, 0.625, rate, 0, 0, 0, 0])
+    parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (COUNT - 4)])
     normal = np.tile(np.eye(COUNT) * 1e12, (12, 1, 1))
     return Fit(
         parameters,

@@ -121,6 +121,18 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
     assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
 
 
+@pytest.mark.parametrize("places", [False, True])
+def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
+    """1 % is usual; positions tell it, and nothing else does."""
+    robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
+    seen = drive(robot, wander(robot.rng, 300.0))
+    found = calibrated(replace(seen, gyro=seen.gyro * 1.01).csv(places=places)).found
+    assert abs(found.values[0] - 1.6) < 2.2 * found.std[0]
+    assert found.std[0] < 0.016
+    if places:
+        assert found.values[0] == pytest.approx(1.6, rel=0.006)
+
+
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip

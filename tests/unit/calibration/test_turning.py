@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from acsard.calibration import turning
-from acsard.calibration.evidence import AHEAD, ASIDE, LATE, huber
+from acsard.calibration.evidence import AHEAD, ASIDE, COUNT, LATE, huber
 from tests.unit.calibration.cut import BASE, ideal, ready
 
-AT = np.array([0.9, 1.1, 0.6, 0.05, 0.0, 0.0, 0.0, 0.0])
+AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
 
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:
