@@ -47,6 +47,13 @@ WRONG_WAY = 4.0
 """Times more must be left unexplained by a robot as it should be than by one of which a side is
 reversed, or which turns to the other side, before that is believed."""
 
+NOTHING = 1e-3
+"""Share of the positions' spread that says nothing for one begin or another: of short straights
+any explains all but the noise."""
+
+STRAYED = 1.3
+"""Times another turn than it began with is no settling."""
+
 COARSE_S = 0.1
 """The paths are summed in such steps here."""
 
@@ -70,14 +77,21 @@ def search(
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         tried = [_tried(kept, grids, base, (left, way * turn, 0.0)) for turn in TURNS]
         begun += [one for one, *others in _neighbours(tried) if one.unexplained <= min(others)]
-    begun.sort(key=lambda one: one.unexplained * _doubt(one, sides))
-    few, worst = _furthest(kept, SETTLED_SPOTS), FAR_WORSE * begun[0].unexplained
+    if sides is not None:
+        left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
+        begun.append(_tried(kept, grids, base, (float(left), float(way), 0.0)))
+
+    def worse(one: Begin) -> float:
+        return (one.unexplained + NOTHING) * _doubt(one, sides)
+
+    begun.sort(key=worse)
+    few, worst = _furthest(kept, SETTLED_SPOTS), FAR_WORSE * worse(begun[0])
     settled = [
         _settled(_timed(one, few, grids, base), few, grids, base)
         for one in begun[:MOST_BEGUN]
-        if one.unexplained <= worst
+        if worse(one) <= worst
     ]
-    return min(settled, key=lambda one: one.unexplained * _doubt(one, sides))
+    return min(settled, key=worse)
 
 
 def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
@@ -106,6 +120,11 @@ def _doubt(begun: Begin, sides: Floats | None) -> float:
         least, most = NEAR_HEADING
     beyond = max(0.0, np.log(least / turn), np.log(turn / most))
     return (1.0 if np.array_equal(np.sign(signed), like) else WRONG_WAY) * float(1.0 + 2.0 * beyond)
+
+
+def _turn(parameters: Floats) -> float:
+    """What it turns by the right side, with its sign."""
+    return float(parameters[TURN] * parameters[RIGHT])
 
 
 def _timed(begun: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
@@ -159,5 +178,8 @@ def _settled(begun: Begin, few: Sequence[Spots], grids: dict[int, Grid], base: B
     if not np.isfinite(before.unexplained):
         return begun
     parameters = fit([evidence], begun.parameters, places=True).parameters
+    moved = _turn(parameters) / _turn(begun.parameters)
+    if not 1 / STRAYED < moved < STRAYED:
+        return before  # nothing tells it there
     after = Begin(parameters, unexplained(parameters))
     return min([before, after], key=lambda one: one.unexplained)

@@ -133,6 +133,14 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
         assert found.values[0] == pytest.approx(1.6, rel=0.006)
 
 
+def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
+    """One small square: in pieces of four seconds it is straights, and noise."""
+    side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
+    robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
+    found = calibrated(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]).csv()).found
+    assert found.values[0] == pytest.approx(1.5, rel=0.05)
+
+
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip
