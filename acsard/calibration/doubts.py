@@ -20,6 +20,9 @@ UNLIKE = 0.5
 UNITS = 8.0
 """Times too much or too little that only another unit explains."""
 
+LEAST_TURN = 0.2
+"""Times as far as the configured wheels say: less is not of a robot that skids, but rpm."""
+
 FAR_SIZE = 2e-3
 """So little no other unit of the wheels makes of a way."""
 
@@ -136,11 +139,11 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     `turn`: what it turns, over what the configured wheels and track say; `bare`: over what wheel
     radius and separation say.
     """
-    if 1 / UNITS < turn < UNITS and bare < 1 / LEAST_CHI:
+    if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
         return
     may = (
         f"{source} is in degrees (multiply by pi / 180), or the wheel speeds are in m/s (divide "
-        f"by the wheel radius)"
+        "by the wheel radius) or turns/s (multiply by 2 pi)"
         if turn > 1
         else "the wheel speeds are in deg/s, rpm or counts, or are angles (rad/s are needed)"
     )

@@ -2,8 +2,9 @@
 
 The parameters are numbers about 1: radius of left and right over the wheel radius, wheel separation
 over the effective track (its inverse makes the turn linear in all), then how the track shrinks with
-the turn rate, and three that only positions know: how late they are (s) and where on the robot
-they are taken (m ahead, m to the left).
+the turn rate, three that only positions know: how late they are (s) and where on the robot they are
+taken (m ahead, m to the left), and two of a gyro: by how much its bias is off (rad/s), and by which
+share its rate is too large.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from msgspec import Struct
 from acsard.calibration.runs import Complexes
 from acsard.calibration.table import Floats
 
-LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE = range(7)
-COUNT = 7
+LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE, DRIFT, STRETCH = range(9)
+COUNT = 9
 
 HUBER = 2.0
 """Residuals of so many standard deviations begin to count less."""
@@ -34,7 +35,7 @@ class Base(Struct, frozen=True):
 
     def start(self) -> Floats:
         """The configured parameters."""
-        return np.array([self.left, self.right, 1 / self.track, 0.0, 0.0, 0.0, 0.0])
+        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - RATE)])
 
     @property
     def gain(self) -> float:

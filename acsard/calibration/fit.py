@@ -12,7 +12,7 @@ from block to block, whichever is more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -22,10 +22,12 @@ from acsard.calibration.evidence import (
     AHEAD,
     ASIDE,
     COUNT,
+    DRIFT,
     LATE,
     LEFT,
     RATE,
     RIGHT,
+    STRETCH,
     TURN,
     Evidence,
 )  # fmt: skip
@@ -40,6 +42,9 @@ SMALL, SETTLED = 1e-5, 0.02
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
 """Standard deviations before anything is seen, of parameters that a log may not tell: by which
 share a track grows with each rad/s, s, m, m."""
+
+GYRO_SCALE = 0.005
+"""The same of what a gyro calls one rad/s, of a usual MEMS gyro: no log of it alone shows that."""
 
 HELD = 1e9
 """Weight by which the mean radius is held where nothing measures it."""
@@ -68,6 +73,8 @@ class Fit(Struct, frozen=True):
     varies: float
     """Share by which the effective track differs from block to block."""
     converged: bool
+    usual: Mapping[int, float]
+    """Standard deviations before anything is seen."""
 
     def without(self, blocks: npt.NDArray[np.bool_]) -> Floats:
         """The parameters if those blocks (a mask) were not there; one step, linear."""
@@ -95,7 +102,7 @@ class Fit(Struct, frozen=True):
         wider = np.maximum(1.0, paired / size)
         chance = alone * np.outer(wider, wider)
         usual = np.zeros(COUNT)
-        usual[list(USUAL)] = np.array(list(USUAL.values())) ** -2
+        usual[list(self.usual)] = np.array(list(self.usual.values())) ** -2
         total = self.normal.sum(axis=0) + self.known
         pull = np.zeros((COUNT, COUNT))
         pull[list(self.active)] = _solved(total, np.diag(usual), self.active)
@@ -115,14 +122,25 @@ class Fit(Struct, frozen=True):
         return np.asarray(covariance * np.outer(student, student))
 
 
-def fit(sources: Sequence[Source], start: Floats, *, places: bool) -> Fit:
-    """From parameters that are nearly right; `places`: positions are among the sources."""
-    active = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
+def fit(
+    sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
+    drift: float = 0.0,
+) -> Fit:  # fmt: skip
+    """From parameters that are nearly right; what is among the sources: positions, a gyro.
+
+    `drift`: standard deviation of the gyro's bias, rad/s, 0 where that is taken out of all.
+    """
+    active: tuple[int, ...] = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
+    usual = dict(USUAL)
+    if gyro:
+        active, usual[STRETCH] = (*active, STRETCH), GYRO_SCALE
+    if drift:
+        active, usual[DRIFT] = (*active, DRIFT), drift
     held = start[LEFT] + start[RIGHT]
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
-        known, told = _known(parameters, held, places)
+        known, told = _known(parameters, held, places, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + told, active)
         # Far off, only part of the way: the path must stay near what it is linear about.
@@ -134,9 +152,9 @@ def fit(sources: Sequence[Source], start: Floats, *, places: bool) -> Fit:
             break
     found = [source(parameters) for source in sources]
     normal, score = _sum(found)
-    known, _ = _known(parameters, held, places)
+    known, _ = _known(parameters, held, places, usual)
     varies = _varies(found, parameters)
-    return Fit(parameters, normal, score, known, active, varies, size < SETTLED)
+    return Fit(parameters, normal, score, known, active, varies, size < SETTLED, usual)
 
 
 def _sum(found: Sequence[Evidence]) -> tuple[Floats, Floats]:
@@ -163,10 +181,12 @@ def _weight(one: Evidence) -> float:
     return 1.0 / max(noise / max(1, rank), white, 1e-18)
 
 
-def _known(parameters: Floats, held: float, places: bool) -> tuple[Floats, Floats]:
+def _known(
+    parameters: Floats, held: float, places: bool, usual: Mapping[int, float]
+) -> tuple[Floats, Floats]:
     """What is known beforehand, as normal equations."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
-    for index, deviation in USUAL.items():
+    for index, deviation in usual.items():
         normal[index, index] = deviation**-2
         score[index] = -parameters[index] * deviation**-2
     if not places:

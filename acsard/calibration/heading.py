@@ -23,6 +23,13 @@ REST_S, EDGE_S = 0.6, 0.3
 TURNED_BY_HAND = 0.05
 """rad/s from the usual bias: no bias but a robot that somebody turns."""
 
+LEAST_SAMPLES, OUTLIER = 5, 6.0
+"""Of a gyro in a rest; times the median deviation, what is no noise."""
+
+WALK, UNSEEN_WALK = 5e-5, 2e-4
+"""rad/s that a bias walks in a second, times its root: of a usual MEMS gyro, at the least; and
+where a single rest says nothing of it."""
+
 ROW_S = 1.0
 """Turns are compared over about so long."""
 
@@ -53,6 +60,8 @@ class Headings(Struct, frozen=True):
     """rad/s, the mean of what was taken off."""
     drifts: bool
     """The bias was not seen at rest: it has to be found with the rest."""
+    unsure: float = 0.0
+    """Standard deviation of the bias where the robot moves, rad/s; 0: it has none, or drifts."""
 
 
 class Rows(Struct, frozen=True):
@@ -77,11 +86,12 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
         raise LogError("yaw_rate is the same in every row: the gyro is not recorded or dead")
     seen = [_biases(run) for run in driven]
-    every = np.concatenate([values for _, values in seen])
+    every = np.concatenate([values for _, values, _ in seen])
     usual = float(np.median(every)) if len(every) else 0.0
-    found = []
-    for run, (t, values) in zip(driven, seen, strict=True):
+    found, rested = [], []
+    for run, (t, values, noise) in zip(driven, seen, strict=True):
         true = np.abs(values - usual) < TURNED_BY_HAND
+        rested.append((t[true], values[true], noise[true]))
         bias = np.interp(run.gyro_t, t[true], values[true]) if true.any() else usual
         rate = run.gyro - bias
         holes = gaps(run.gyro_t)
@@ -89,7 +99,8 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
         steps[np.isin(run.gyro_t[:-1], holes[:, 0])] = 0.0
         found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
     late = offset(found, angles)
-    return Headings("yaw_rate", tuple(found), late, usual, not len(every))
+    unsure = _unsure(rested, [float(run.t[-1]) for run in driven]) if len(every) else 0.0
+    return Headings("yaw_rate", tuple(found), late, usual, not len(every), unsure)
 
 
 def of_yaw(driven: Sequence[Run], angles: Sequence[Wheels], gain: float) -> Headings | None:
@@ -120,15 +131,53 @@ def _in_degrees(run: Run, turned: Wheels, gain: float) -> bool:
     return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(wheels[small])))
 
 
-def _biases(run: Run) -> tuple[Floats, Floats]:
-    """Middle and bias of each rest of a run in which the gyro spoke."""
-    times, values = [], []
+Rests = tuple[Floats, Floats, Floats]
+"""Middle of each rest of a run in which the gyro spoke, s, its bias, rad/s, and the variance of
+that by noise."""
+
+
+def _biases(run: Run) -> Rests:
+    found = []
     for begin, end in rests(run, REST_S, EDGE_S):
         a, b = np.searchsorted(run.gyro_t, (begin, end))
-        if b - a >= 5:
-            times.append((begin + end) / 2)
-            values.append(float(np.median(run.gyro[a:b])))
-    return np.array(times), np.array(values)
+        if b - a >= LEAST_SAMPLES:
+            found.append(((begin + end) / 2, *_mean(run.gyro[a:b])))
+    times, values, noise = np.array(found, dtype=np.float64).reshape(-1, 3).T
+    return times, values, noise
+
+
+def _mean(samples: Floats) -> tuple[float, float]:
+    """Of all but outliers, and its variance, noise of samples that hang together counted as such.
+
+    No median: a gyro with few digits has it on one of its steps.
+    """
+    off = np.abs(samples - np.median(samples))
+    steps = np.diff(np.unique(samples))
+    step = float(steps.min()) if len(steps) else 0.0
+    kept = samples[off <= max(OUTLIER * float(np.median(off)), 1.01 * step)]
+    parts = [float(part.mean()) for part in np.array_split(kept, LEAST_SAMPLES)]
+    few = step**2 / 12 if len(np.unique(kept)) <= 2 else 0.0
+    return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
+
+
+def _unsure(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
+    """Standard deviation of the bias in the mean of all drives, rad/s: noise at the rests, and a
+    random walk between them."""
+    count = sum(len(t) for t, _, _ in rested)
+    noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
+    walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
+    gone, lasted = np.concatenate(walked).sum(axis=0)
+    # Few differences are answered for with more.
+    few = 1 + 2 / max(1, count - len(rested))
+    walk = max(WALK**2, few * gone / lasted) if lasted else UNSEEN_WALK**2
+    # Between two rests the bias is off by a Brownian bridge; outside of them, by a free walk.
+    whole = sum(seconds)
+    between = sum(float(np.sum(np.diff(t) ** 3)) for t, _, _ in rested) / 12
+    outside = sum(
+        (t[0] ** 3 + (last - t[-1]) ** 3) / 3 if len(t) else last**3 / 3
+        for (t, _, _), last in zip(rested, seconds, strict=True)
+    )
+    return float(np.sqrt(noise + walk * (between + outside) / whole**2))
 
 
 def _sums(rate: Floats, steps: Floats) -> Floats:
@@ -179,7 +228,7 @@ def rows(
     parts: Sequence[Block],
 ) -> Rows:
     """What each block says; of the wheels alone where there is no sensor of heading."""
-    fast = [_fast(run) for run in driven]
+    fast = [_fast(run, turned) for run, turned in zip(driven, angles, strict=True)]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / ROW_S))
@@ -212,7 +261,7 @@ def level(rows: Rows) -> Rows:
     return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
-def _fast(run: Run) -> Floats:
-    apart = run.right - run.left
+def _fast(run: Run, turned: Wheels) -> Floats:
+    apart = turned.apart(run.t)
     steps = np.minimum(np.diff(run.t), ROW_S)
     return _sums(np.abs(apart) * apart, steps)

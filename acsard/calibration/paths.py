@@ -26,6 +26,9 @@ BLOCKS = 16
 SHORTEST_S, LONGEST_S = 4.0, 12.0
 """As many blocks are aimed at, of such lengths."""
 
+SMOOTH_S = 0.3
+"""Turn rates that are squared are means over so long: a coarse encoder says 0 or far too much."""
+
 LEAST_TURN = 0.2
 """rad that the faster side must turn in a block for it to tell anything."""
 
@@ -42,6 +45,13 @@ class Wheels(Struct, frozen=True):
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
         """Of left and right, at any times."""
         return np.interp(t, self.t, self.left), np.interp(t, self.t, self.right)
+
+    def apart(self, t: Floats) -> Floats:
+        """rad/s by which the right side turns faster, about these times."""
+        begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
+        (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
+        turned = far_right - right - (far_left - left)
+        return np.asarray(turned / np.maximum(end - begin, 1e-9))
 
 
 class Block(Struct, frozen=True):

@@ -6,7 +6,7 @@ positions, so no start pose, no frame and no yaw are needed. Paths are complex n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -130,8 +130,8 @@ def grid(run: Run, turned: Wheels, fine_s: float = FINE_S) -> Grid:
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
     t, left, right = run.t[kept], turned.left[kept], turned.right[kept]
-    apart, steps = np.diff(right - left), np.diff(t)
-    return Grid(t, np.diff(left), np.diff(right), np.abs(apart) * apart / steps)
+    apart, steps = turned.apart((t[1:] + t[:-1]) / 2), np.diff(t)
+    return Grid(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
 
 def path(steps: Grid, base: Base, parameters: Floats) -> Path:
@@ -174,6 +174,10 @@ def _sums(steps: Complexes) -> Complexes:
     return np.concatenate((np.zeros(1, dtype=np.complex128), np.cumsum(steps)))
 
 
+Paths = Sequence[Path] | Mapping[int, Path]
+"""By the number of the run."""
+
+
 class Laid(Struct, frozen=True):
     """A path laid onto positions: residuals in m, and slopes with shift and turn taken out."""
 
@@ -182,7 +186,7 @@ class Laid(Struct, frozen=True):
     slopes: Complexes
 
 
-def laid(found: Sequence[Spots], paths: Sequence[Path], parameters: Floats) -> Iterator[Laid]:
+def laid(found: Sequence[Spots], paths: Paths, parameters: Floats) -> Iterator[Laid]:
     """Each block's path shifted and turned onto its positions, outliers counting less."""
     for spot in found:
         place, slopes = paths[spot.run].at(spot.t, parameters)
@@ -204,9 +208,7 @@ def laid(found: Sequence[Spots], paths: Sequence[Path], parameters: Floats) -> I
         yield Laid(spot.block, root * residual, root[:, None] * columns)
 
 
-def evidence(
-    found: Sequence[Spots], paths: Sequence[Path], parameters: Floats, blocks: int
-) -> Evidence:
+def evidence(found: Sequence[Spots], paths: Paths, parameters: Floats, blocks: int) -> Evidence:
     """At these parameters."""
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
@@ -219,7 +221,7 @@ def evidence(
     return Evidence(normal, score, squares, counts)
 
 
-def spread(found: Sequence[Spots], paths: Sequence[Path], parameters: Floats) -> float:
+def spread(found: Sequence[Spots], paths: Paths, parameters: Floats) -> float:
     """m rms by which positions lie off the paths laid onto them."""
     sums = [(float(np.sum(np.abs(o.residual) ** 2)), len(o.residual))
             for o in laid(found, paths, parameters)]  # fmt: skip

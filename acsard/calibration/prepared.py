@@ -70,7 +70,7 @@ def prepared(
         heading_follows(headings.source, rows.turned, turning.by_sides(rows, base, sides))
         sources.append(lambda p: turning.evidence(rows, base, p, count))
     if spots:
-        begun = search(spots, driven, angles, base)
+        begun = search(spots, driven, angles, base, sides)
         places_follow(begun)
         sources.append(
             lambda p: places.evidence(spots, [places.path(g, base, p) for g in grids], p, count)

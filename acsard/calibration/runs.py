@@ -239,11 +239,12 @@ def _new(
         return stream
     again = np.concatenate([[False], np.all(np.diff(values) == 0.0, axis=0)])
     rolls = np.interp(t, wheels[0], np.abs(wheels[1]) + np.abs(wheels[2])) > ROLLING
-    again &= rolls
-    if again.sum() <= AGAIN * rolls.sum():
+    rolling = int((again & rolls).sum())
+    if rolling <= AGAIN * rolls.sum():
         return stream
+    # Also those at rest: the first of them may be of before.
     notes.append(
-        f"{what} stay between samples: of {int(again.sum())} rows that say them again "
+        f"{what} stay between samples: of {rolling} rows that say them again "
         "while the wheels turn none is taken"
     )
     return tuple(column[~again] for column in stream)

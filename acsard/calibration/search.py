@@ -1,7 +1,10 @@
-"""Where to begin with positions alone: Gauss-Newton needs a track that is nearly right.
+"""Where to begin with positions: Gauss-Newton needs a track that is nearly right.
 
 Tried are tracks from a tenth to thirty times the configured one, turned the right way round and the
 wrong, and with one side reversed. How large the path comes out then is the radius.
+
+Positions alone often tell a turn in place only up to whole turns: 90 deg to the left end as 270 deg
+to the right do. Of begins that explain about as much, the likelier robot counts.
 """
 
 from __future__ import annotations
@@ -11,22 +14,45 @@ from collections.abc import Sequence
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.calibration.evidence import LATE, LEFT, RIGHT, TURN, Base
+from acsard.calibration import places
+from acsard.calibration.evidence import LATE, LEFT, RIGHT, TURN, Base, Evidence
+from acsard.calibration.fit import fit
 from acsard.calibration.paths import Wheels
 from acsard.calibration.places import Grid, Spots, grid, place
 from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
-TURNS = np.geomspace(0.03, 10.0, 60)
-"""Configured over true track, for wheels of the configured radius."""
+TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
+"""Configured over true track, for wheels of the configured radius; finer where robots are."""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
 """s."""
 
-MOST_SPOTS = 60
+MOST_SPOTS, SETTLED_SPOTS = 60, 20
 """Blocks that are looked at, those that reach furthest: it is a search, and no fit yet."""
 
+MOST_POINTS = 80
+"""Positions of each that are looked at, evenly."""
+
+MOST_BEGUN, FAR_WORSE = 4, 20.0
+"""Begins that are looked at more closely, and how much worse than the best is too bad for that."""
+
+USUAL_TURN, NEAR_HEADING = (0.31, 1.25), (0.8, 1.25)
+"""What a robot turns over what its bare wheels and separation say, from skid-steer to none; and
+over what a sensor of heading says."""
+
+WRONG_WAY = 4.0
+"""Times more must be left unexplained by a robot as it should be than by one of which a side is
+reversed, or which turns to the other side, before that is believed."""
+
+NOTHING = 1e-3
+"""Share of the positions' spread that says nothing for one begin or another: of short straights
+any explains all but the noise."""
+
+STRAYED = 1.3
+"""Times another turn than it began with is no settling."""
 
 COARSE_S = 0.1
 """The paths are summed in such steps here."""
@@ -40,29 +66,79 @@ class Begin(Struct, frozen=True):
 
 
 def search(
-    found: Sequence[Spots], driven: Sequence[Run], angles: Sequence[Wheels], base: Base
-) -> Begin:
-    """The best of all that is tried."""
-    reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in found]
-    kept = [found[i] for i in sorted(np.argsort(reach)[::-1][:MOST_SPOTS])]
+    found: Sequence[Spots], driven: Sequence[Run], angles: Sequence[Wheels], base: Base,
+    sides: Floats | None = None,
+) -> Begin:  # fmt: skip
+    """The best of all that is tried; `sides`: g_l and g_r over the gain, by a sensor of heading."""
+    kept = _furthest(found, MOST_SPOTS)
     needed = sorted({spot.run for spot in kept})
     grids = {run: grid(driven[run], angles[run], COARSE_S) for run in needed}
-    best = Begin(base.start(), np.inf)
+    begun: list[Begin] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
-        for turn in TURNS:
-            best = _better(best, kept, grids, base, (left, way * turn, 0.0))
-    begun = best.parameters
-    shape = float(np.sign(begun[LEFT])), float(begun[TURN] * begun[RIGHT])
-    for late in DELAYS:
-        best = _better(best, kept, grids, base, (*shape, late))
-    return best
+        tried = [_tried(kept, grids, base, (left, way * turn, 0.0)) for turn in TURNS]
+        begun += [one for one, *others in _neighbours(tried) if one.unexplained <= min(others)]
+    if sides is not None:
+        left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
+        begun.append(_tried(kept, grids, base, (float(left), float(way), 0.0)))
+
+    def worse(one: Begin) -> float:
+        return (one.unexplained + NOTHING) * _doubt(one, sides)
+
+    begun.sort(key=worse)
+    few, worst = _furthest(kept, SETTLED_SPOTS), FAR_WORSE * worse(begun[0])
+    settled = [
+        _settled(_timed(one, few, grids, base), few, grids, base)
+        for one in begun[:MOST_BEGUN]
+        if worse(one) <= worst
+    ]
+    return min(settled, key=worse)
 
 
-def _better(
-    best: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Base,
-    shape: tuple[float, float, float],
-) -> Begin:  # fmt: skip
-    """The better of the best so far and this sign of the left side, turn and delay."""
+def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
+    reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in found]
+    kept = [found[i] for i in sorted(np.argsort(reach)[::-1][:most])]
+    return [
+        replace(s, t=s.t[:: 1 + len(s.t) // MOST_POINTS],
+                place=s.place[:: 1 + len(s.t) // MOST_POINTS])
+        for s in kept
+    ]  # fmt: skip
+
+
+def _neighbours(tried: Sequence[Begin]) -> list[tuple[Begin, float, float]]:
+    """Each with what those beside it leave unexplained."""
+    left = [np.inf, *(one.unexplained for one in tried), np.inf]
+    return [(one, left[at], left[at + 2]) for at, one in enumerate(tried)]
+
+
+def _doubt(begun: Begin, sides: Floats | None) -> float:
+    """How much less likely such a robot is than any that should be."""
+    signed = begun.parameters[[LEFT, RIGHT]] * begun.parameters[TURN]
+    turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
+    like = np.ones(2)
+    if sides is not None:
+        turn, like = turn / max(1e-9, float(np.abs(sides).mean())), np.sign(sides)
+        least, most = NEAR_HEADING
+    beyond = max(0.0, np.log(least / turn), np.log(turn / most))
+    return (1.0 if np.array_equal(np.sign(signed), like) else WRONG_WAY) * float(1.0 + 2.0 * beyond)
+
+
+def _turn(parameters: Floats) -> float:
+    """What it turns by the right side, with its sign."""
+    return float(parameters[TURN] * parameters[RIGHT])
+
+
+def _timed(begun: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
+    """With the delay that suits it best."""
+    parameters = begun.parameters
+    shape = float(np.sign(parameters[LEFT])), float(parameters[TURN] * parameters[RIGHT])
+    tried = [_tried(kept, grids, base, (*shape, late)) for late in DELAYS]
+    return min([begun, *tried], key=lambda one: one.unexplained)
+
+
+def _tried(
+    kept: Sequence[Spots], grids: dict[int, Grid], base: Base, shape: tuple[float, float, float]
+) -> Begin:
+    """What this sign of the left side, turn and delay explain."""
     parameters = base.start()
     parameters[[LEFT, RIGHT, TURN, LATE]] = shape[0], 1.0, shape[1], shape[2]
     paths = {run: place(steps, base, parameters) for run, steps in grids.items()}
@@ -75,11 +151,35 @@ def _better(
         size += float(np.sum(np.abs(gone) ** 2))
         spread += float(np.sum(np.abs(seen) ** 2))
     if not size or not spread:
-        return best
-    unexplained = 1.0 - cross**2 / (size * spread)
-    if unexplained >= best.unexplained:
-        return best
+        return Begin(parameters, np.inf)
     scale = cross / size
     parameters[[LEFT, RIGHT]] *= scale
     parameters[TURN] /= scale
-    return Begin(parameters, unexplained)
+    return Begin(parameters, 1.0 - cross**2 / (size * spread))
+
+
+def _settled(begun: Begin, few: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
+    """The same as the fit will have it: with where on the robot the positions are taken, and
+    outliers counting less."""
+    spots = [replace(spot, block=number) for number, spot in enumerate(few)]
+
+    def evidence(parameters: Floats) -> Evidence:
+        return places.evidence(spots, paths(parameters), parameters, len(spots))
+
+    def paths(parameters: Floats) -> dict[int, places.Path]:
+        return {run: places.path(steps, base, parameters) for run, steps in grids.items()}
+
+    def unexplained(parameters: Floats) -> float:
+        spread = sum(float(np.sum(np.abs(s.place - s.place.mean()) ** 2)) for s in spots)
+        off = places.spread(spots, paths(parameters), parameters)
+        return off**2 * sum(len(s.t) for s in spots) / spread if spread else np.inf
+
+    before = Begin(begun.parameters, unexplained(begun.parameters))
+    if not np.isfinite(before.unexplained):
+        return begun
+    parameters = fit([evidence], begun.parameters, places=True).parameters
+    moved = _turn(parameters) / _turn(begun.parameters)
+    if not 1 / STRAYED < moved < STRAYED:
+        return before  # nothing tells it there
+    after = Begin(parameters, unexplained(parameters))
+    return min([before, after], key=lambda one: one.unexplained)

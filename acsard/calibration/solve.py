@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from acsard.calibration import fit as fitting
 from acsard.calibration import heading, places, turning
 from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
-from acsard.calibration.evidence import LATE, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.evidence import DRIFT, LATE, LEFT, RATE, RIGHT, TURN, Base
 from acsard.calibration.excitation import DRIVE, sure_enough, told_apart, turns_enough
 from acsard.calibration.fit import Fit, fit
 from acsard.calibration.gain import Gain, gain, seen_by_places
@@ -107,7 +107,9 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
             continue  # coarse positions may follow over a longer time
         except RefusedError as error:
             raise unlike or error from None
-        fitted = fit(made.sources, made.start, places=bool(made.spots))
+        gyro = headings is not None and headings.source == "yaw_rate"
+        drift = headings.unsure if headings is not None else 0.0
+        fitted = fit(made.sources, made.start, places=bool(made.spots), gyro=gyro, drift=drift)
         unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
         tries.append((unsure, len(tries), made, fitted))
         if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
@@ -129,9 +131,11 @@ def _calibration(
     told_apart(fitted.apart())
     by_wheels = turning.turned(rows, base, fitted.parameters)
     bias = headings.bias if headings is not None else 0.0
+    drift = float(fitted.parameters[DRIFT])
     if headings is not None and headings.drifts:
-        bias = turning.bias(rows, by_wheels)
-        rows = replace(rows, turned=rows.turned - bias * rows.seconds)
+        drift = turning.bias(rows, by_wheels)
+    bias += drift
+    rows = replace(rows, turned=rows.turned - drift * rows.seconds)
     rate, truth = rates(rows, by_wheels), rows.turned
     if headings is None:
         turns_enough(by_wheels)

@@ -30,7 +30,7 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
 COLUMNS = (*NUMBERS, "run")
 
-MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-"))
+MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 
 COMMENTS = ("#", "%")
 """What a line above the numbers begins with that is none of the table."""

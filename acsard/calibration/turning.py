@@ -6,9 +6,11 @@ import numpy as np
 
 from acsard.calibration.evidence import (
     COUNT,
+    DRIFT,
     LEFT,
     RATE,
     RIGHT,
+    STRETCH,
     TURN,
     Base,
     Evidence,
@@ -46,7 +48,10 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     jacobian[:, RIGHT] = base.gain * turn * rows.right
     jacobian[:, RATE] = _slower(rows, base, parameters)
     jacobian[:, TURN] = (by_wheels + jacobian[:, RATE] * parameters[RATE]) / turn
-    residual = rows.turned - by_wheels
+    jacobian[:, DRIFT] = rows.seconds
+    jacobian[:, STRETCH] = by_wheels
+    gyro = by_wheels * (1 + parameters[STRETCH]) + parameters[DRIFT] * rows.seconds
+    residual = rows.turned - gyro
     usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
     return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError, in_range, remarks
+from acsard.calibration.doubts import RefusedError, in_range, remarks, turn_units
 from tests.unit.calibration.cut import BASE, calibrated, usual
 from tests.unit.calibration.robots import Drive
 
@@ -78,6 +78,13 @@ def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: s
     with pytest.raises(RefusedError) as refused:
         calibrated(WRONG[what].csv(gyro=gyro, places=places))
     assert words in str(refused.value)
+
+
+def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
+    """Its radius may be a larger share of its separation than the default's."""
+    with pytest.raises(RefusedError, match="rpm"):
+        turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
+    turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
 
 
 def odometry(robot: Drive) -> Drive:

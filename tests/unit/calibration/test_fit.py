@@ -8,7 +8,7 @@ import pytest
 from acsard.calibration.evidence import COUNT, LEFT, RIGHT, TURN, of_rows
 from acsard.calibration.fit import Fit, fit
 
-START = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+START = np.array([1.0, 1.0, 1.0, *[0.0] * (COUNT - 3)])
 TRUTH = np.array([0.99, 1.01, 0.7])
 
 

@@ -11,7 +11,7 @@ from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.paths import blocks, wheels
 from acsard.calibration.table import LogError
 from tests.unit.calibration.cut import log_of, usual
-from tests.unit.calibration.robots import GUIDED, Drive
+from tests.unit.calibration.robots import GUIDED, Drive, wander
 
 
 def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
@@ -22,6 +22,29 @@ def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
 
 def test_the_bias_is_found_at_rest() -> None:
     assert headings_of(usual())[2].bias == pytest.approx(0.01, abs=0.001)
+
+
+def test_a_gyro_of_few_digits_tells_its_bias_between_them() -> None:
+    drive = usual()
+    coarse = replace(drive, gyro=np.round(drive.gyro - 0.006, 2))
+    assert headings_of(coarse)[2].bias == pytest.approx(0.004, abs=0.001)
+
+
+@pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.0), (0.003, 0.0003)])
+def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> None:
+    z = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        drive = usual(seed, plan=wander(rng, 120.0))
+        step = np.median(np.diff(drive.gyro_t))
+        walked = np.cumsum(rng.normal(0, walk * np.sqrt(step), len(drive.gyro_t)))
+        noisy = drive.gyro + walked + rng.normal(0, noise, len(walked))
+        _, _, headings = headings_of(replace(drive, gyro=noisy))
+        heading = headings.of[0]
+        turned = np.interp(heading.t - 0.02, drive.t, drive.yaw)
+        off = (heading.angle - turned)[[0, -1]] @ [-1, 1] / np.ptp(heading.t)
+        z.append(off / headings.unsure)
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_without_a_rest_the_bias_is_left_to_the_fit() -> None:

@@ -5,17 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.evidence import Base
-from acsard.calibration.fit import Fit
+from acsard.calibration.evidence import COUNT, Base
+from acsard.calibration.fit import USUAL, Fit
 from acsard.calibration.multipliers import Multipliers, Rates, configured, found, rates
 from tests.unit.calibration.cut import BASE, ideal, ready
 
 
 def fit_of(rate: float, varies: float) -> Fit:
     """Parameters that are known as well as can be, but for what the track does."""
-    parameters = np.array([0.99, 1.01, 0.625, rate, 0, 0, 0])
-    normal = np.tile(np.eye(7) * 1e12, (12, 1, 1))
-    return Fit(parameters, normal, np.zeros((12, 7)), np.zeros((7, 7)), (0, 1, 2, 3), varies, True)
+    parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (COUNT - 4)])
+    normal = np.tile(np.eye(COUNT) * 1e12, (12, 1, 1))
+    return Fit(
+        parameters,
+        normal,
+        np.zeros((12, COUNT)),
+        np.zeros((COUNT, COUNT)),
+        (0, 1, 2, 3),
+        varies,
+        True,
+        USUAL,
+    )
 
 
 def test_a_constant_track_is_the_inverse_of_the_turn() -> None:

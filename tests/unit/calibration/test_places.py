@@ -14,7 +14,7 @@ from tests.unit.calibration.cut import BASE, ideal, log_of, usual
 from tests.unit.calibration.robots import Drive
 
 TRUE = np.array([0.998, 1.002, 1 / 1.6, 0.0, 0.0, 0.0, 0.0])
-OFF = np.array([1.05, 0.95, 0.7, 0.0, 0.03, 0.1, -0.05])
+OFF = np.array([1.05, 0.95, 0.7, 0.0, 0.03, 0.1, -0.05, 0.0, 0.0])
 
 
 def of(drive: Drive):  # type: ignore[no-untyped-def]

@@ -12,13 +12,13 @@ from acsard.calibration.paths import blocks, wheels
 from acsard.calibration.places import spots
 from acsard.calibration.search import Begin, search
 from tests.unit.calibration.cut import BASE, log_of, usual
-from tests.unit.calibration.robots import Drive
+from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 
-def begun(drive: Drive, base: Base = BASE) -> Begin:
-    runs = log_of(drive.csv(gyro=False)).runs
+def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Begin:
+    runs = log_of(seen.csv(gyro=False)).runs
     angles = [wheels(run) for run in runs]
-    return search(spots(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base)
+    return search(spots(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base, sides)
 
 
 @pytest.mark.variations(3)
@@ -32,14 +32,32 @@ def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
 
 
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
-    drive = usual()
-    left, mirrored = replace(drive, left=-drive.left), replace(drive, place=drive.place.conj())
+    seen = usual()
+    left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
     one = np.sign(begun(left).parameters[[LEFT, RIGHT]] * begun(left).parameters[TURN])
     assert one.tolist() == [-1.0, 1.0]
     assert begun(mirrored).parameters[TURN] < 0
 
 
 def test_late_positions_are_found() -> None:
-    drive = usual()
-    late = replace(drive, place_t=drive.place_t + 0.9)
+    seen = usual()
+    late = replace(seen, place_t=seen.place_t + 0.9)
     assert begun(late).parameters[LATE] == pytest.approx(0.9, abs=0.15)
+
+
+def squares(chi: float) -> Plan:
+    """To both sides, turned in place by 90 deg of a robot with that track."""
+    side = [(5, 0.4, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * chi / 4), (0.5, 0, 0)]
+    return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
+
+
+@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
+@pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
+def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
+    """Positions alone are the same after 90 deg to the left, 270 to the right and 450."""
+    robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
+    seen = drive(robot, squares(chi))
+    assert begun(seen).parameters[TURN] == pytest.approx(1 / chi, rel=0.05)
+    mirrored = replace(seen, place=seen.place.conj())
+    sides = np.array([1.0, 1.0]) / chi
+    assert begun(mirrored, sides=-sides).parameters[TURN] == pytest.approx(-1 / chi, rel=0.05)

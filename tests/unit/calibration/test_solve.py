@@ -94,6 +94,53 @@ def test_bias_and_time_offset_are_told(count: int) -> None:
         assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
 
 
+def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
+    """A curve to one side is what a bias looks like, in every block alike."""
+    z = []
+    for seed in range(12):
+        robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
+        found = calibrated(drive(robot, wander(robot.rng, 100.0)).csv(places=False)).found
+        logs = found.covariance / np.outer(found.values, found.values)
+        apart = np.array([0.0, -1.0, 1.0])
+        off = np.log(found.values) @ apart - np.log(1.002 / 0.998)
+        z.append(off / np.sqrt(apart @ logs @ apart))
+    assert np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
+    """20 counts a turn at 1 kHz are 0 or 314 rad/s: of their squares nothing is to be told."""
+    seen = usual(plan=wander(np.random.default_rng(2), 100.0))
+    t = np.arange(seen.t[0], seen.t[-1], 0.001)
+    counted = [
+        np.floor(np.interp(t, seen.t, np.cumsum(side) * 0.01) * 20 / (2 * np.pi))
+        for side in (seen.left, seen.right)
+    ]
+    left, right = (np.diff(counts) * 2 * np.pi / 20 / 0.001 for counts in counted)
+    coarse = replace(seen, t=t[1:], left=left, right=right)
+    found = calibrated(coarse.csv(places=False)).found
+    assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
+
+
+@pytest.mark.parametrize("places", [False, True])
+def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
+    """1 % is usual; positions tell it, and nothing else does."""
+    robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
+    seen = drive(robot, wander(robot.rng, 300.0))
+    found = calibrated(replace(seen, gyro=seen.gyro * 1.01).csv(places=places)).found
+    assert abs(found.values[0] - 1.6) < 2.2 * found.std[0]
+    assert found.std[0] < 0.016
+    if places:
+        assert found.values[0] == pytest.approx(1.6, rel=0.006)
+
+
+def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
+    """One small square: in pieces of four seconds it is straights, and noise."""
+    side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
+    robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
+    found = calibrated(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]).csv()).found
+    assert found.values[0] == pytest.approx(1.5, rel=0.05)
+
+
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip

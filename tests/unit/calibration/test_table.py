@@ -72,9 +72,10 @@ def test_a_text_that_is_not_looked_at_may_have_a_number_sign() -> None:
 
 def test_a_number_that_a_sign_spoils_is_none() -> None:
     """As C on Windows writes NaN; the half before it is no speed."""
-    table = read(HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,3,4\n")
+    table = read(HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,--,4\n")
     assert table.columns["t"].tolist() == [1.0, 3.0]
     assert np.isnan(table.columns["left"][1])
+    assert np.isnan(table.columns["right"][1])
     assert "no number" in table.notes[0]
 
 

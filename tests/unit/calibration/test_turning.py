@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from acsard.calibration import turning
-from acsard.calibration.evidence import COUNT, huber
+from acsard.calibration.evidence import AHEAD, ASIDE, COUNT, LATE, huber
 from tests.unit.calibration.cut import BASE, ideal, ready
 
-AT = np.array([0.9, 1.1, 0.6, 0.05, 0.0, 0.0, 0.0])
+AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
 
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:
@@ -37,4 +37,4 @@ def test_slopes_are_those_of_what_the_wheels_say() -> None:
         weight = huber(residual / usual, 1.0)
         # The rate's own change with the other parameters is of second order.
         assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
-    assert not score[4:COUNT].any()
+    assert not score[[LATE, AHEAD, ASIDE]].any()
