@@ -35,7 +35,7 @@ def boards(configured: str) -> list[Board]:
     if configured != SIMULATOR and configured not in found:
         there = "" if os.path.exists(configured) else ", not there now"
         found = {configured: f"configured{there}", **found}
-    found[SIMULATOR] = "the built-in simulator; no real robot moves"
+    found[SIMULATOR] = "the simulator: nothing real moves"
     # What is begun without a look at the list is of the robot that is seen: no other's wheels turn.
     ports = sorted(found, key=lambda port: port != configured)
     return [Board(port, found[port]) for port in ports]

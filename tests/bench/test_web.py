@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import statistics
 import sys
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
+from acsard.web.files import PAGE
 from tests.system.browser import Hands, Page, hands, run
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import (
@@ -33,20 +35,29 @@ from tests.system.harness import (
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(240)]
 
 VIEWERS = """\
-import asyncio, sys, aiohttp
+import asyncio, json, sys, time, aiohttp
 
-KEYS = ("odom", "state", "wheel_states", "cmd_vel_out")
+KEYS = json.loads(sys.argv[3])
+
+
+async def ping(socket):
+    while True:
+        await socket.send_json({"ping": 1})
+        await asyncio.sleep(1)
 
 
 async def view(session, url):
     async with session.ws_connect(url) as socket:
-        for key in KEYS:
-            await socket.send_json({"subscribe": key, "rate": 10})
+        for key, rate in KEYS:
+            await socket.send_json({"subscribe": key, "rate": rate})
+        pinging = asyncio.create_task(ping(socket))
         frames = 0
         async for message in socket:
             frames += 1
-            if frames == 20:
-                print("sees", flush=True)
+            if frames == 100:
+                begun = time.monotonic()
+            if frames == 300:
+                print(f"{200 / (time.monotonic() - begun):.1f}", flush=True)
 
 
 async def main():
@@ -56,7 +67,7 @@ async def main():
 
 asyncio.run(main())
 """
-"""Headless pages that look at four keys at 10 Hz each."""
+"""Programs that take what an open page takes, and say how many frames a second that is."""
 
 SECONDS, RATE_HZ = 10.0, 100.0
 
@@ -72,6 +83,15 @@ def peer(tmp_path: Path) -> Iterator[Peer]:
     """A serial peer that is not ours."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
+
+
+def subscribed() -> list[tuple[str, int]]:
+    """What an open page subscribes to, whatever its view: keys and rates."""
+    script = (PAGE / "main.js").read_text()
+    pairs = re.findall(r'\["([\w/]+)", (\d+)\]', script)
+    pairs += re.findall(r'link\.subscribe\("([\w/]+)", (\d+)', script)
+    assert {"state", "odom", "sim/pose"} <= {key for key, _ in pairs}, pairs
+    return [(key, int(rate)) for key, rate in pairs]
 
 
 def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, float]:
@@ -96,15 +116,15 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
     for count in (0, 20, 1, 0, 20):  # a daemon each, since lateness is of the last minute
         with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as page, Bus(daemon.endpoint) as b:
             b.linked()
-            viewers = Program(
-                [sys.executable, "-c", VIEWERS, f"{page.here}/ws", str(count)], tmp_path
-            )
-            with viewers:
-                if count:
-                    until(lambda v=viewers, c=count: len(v.out) == c, 10.0, "all see")  # type: ignore[misc]
+            told = [f"{page.here}/ws", str(count), json.dumps(subscribed())]
+            viewers = Program([sys.executable, "-c", VIEWERS, *told], tmp_path)
+            with b.commanding(0.3, 0.3), viewers:
+                until(lambda v=viewers, c=count: len(v.out) == c, 30.0, "all see")  # type: ignore[misc]
                 share, kb, periods, late = watched(page, daemon, b)
+            frames = statistics.mean(map(float, viewers.out)) if count else 0.0
             print(
-                f"\n{count:2} viewers: page {100 * share:.1f} % of a core, {kb / 1000:.0f} MB; "
+                f"\n{count:2} viewers, {frames:.0f} frames a second each: page "
+                f"{100 * share:.1f} % of a core, {kb / 1000:.0f} MB; "
                 f"daemon {periods.missed} of {periods.elapsed:.0f} periods missed, "
                 f"late p99 {late:.0f} us"
             )

@@ -288,6 +288,14 @@ def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
     assert page.browser.js("document.getElementById('stick').matches('.held')") is False
 
 
+def test_a_page_lets_go_when_the_browser_is_about_to_go_elsewhere(page: Phone) -> None:
+    """It waits for this event alone; what it tells afterwards is late on a busy machine."""
+    page.hold()
+    page.browser.js("window.dispatchEvent(new Event('beforeunload'))")
+    page.bus.at_rest()
+    assert page.browser.js("document.getElementById('stick').matches('.held')") is False
+
+
 def viewers(page: Phone) -> int:
     """Who looks, as the page's server knows it."""
     _, told = asyncio.run(answer(f"{page.server.here}/metrics"))

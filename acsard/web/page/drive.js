@@ -113,6 +113,9 @@ export class Drive {
     addEventListener("keyup", (event) => this.#key(event, false));
     addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
     addEventListener("blur", () => this.release("let go: the window lost the focus"));
+    // For this one the browser waits before it goes elsewhere; the next comes when it has, and on a
+    // busy machine late.
+    addEventListener("beforeunload", () => this.release("let go: the page is being left"));
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
     document.addEventListener("visibilitychange", () => document.hidden && this.release("let go: the page was hidden"));

@@ -71,7 +71,9 @@ export class Plot {
       paper.moveTo(ROOM, y(value));
       paper.lineTo(width - 6, y(value));
       paper.stroke();
-      paper.fillText((value / (value ? 1.08 : 1)).toFixed(Math.abs(top) < 10 ? 2 : 0), 6, y(value) + 4);
+      // Where two are nearly one, the words of the one that is not zero are left out.
+      if (value && Math.abs(y(value) - y(0)) < 14) continue;
+      paper.fillText(signed(value / (value ? 1.08 : 1), Math.abs(top) < 10 ? 2 : 0), 6, y(value) + 4);
     }
     this.#lines.forEach(({ name, colour, points, sample, said }, n) => {
       const last = points.at(-1);

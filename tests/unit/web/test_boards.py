@@ -23,7 +23,7 @@ def test_the_configured_one_stands_under_its_configured_name(
     assert found == {
         configured: "Arduino Mega 2560 R3, configured",
         "/dev/ttyUSB0": "USB Serial, held by acsard (process 7)",
-        "sim": "the built-in simulator; no real robot moves",
+        "sim": "the simulator: nothing real moves",
     }
 
 
