@@ -65,10 +65,11 @@ class Rolling:
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """What the next line says; the last one that was believed said `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
+        passed_over = self._lost or self._gap or self._counted or self._turned != NOWHERE
         # Of lost lines without counts: it went on at about this speed, or too long to guess.
         lost, unknown = (self._lost, 0.0) if self._lost <= MAX_LOST_S else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
-        if known > dt or unknown:
+        if passed_over:
             self._lost = self._gap = self._counted = 0.0
             self._turned = NOWHERE
         if line.turned is not None:
