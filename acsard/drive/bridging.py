@@ -67,6 +67,11 @@ class Rolling:
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """What the next line says; the last one that was believed said `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
+        if not (self._skipped or bridged or line.gap or line.turned is not None):
+            # Nearly every line without counts of its own: the rest of this, of that line alone.
+            seen = times(speeds, dt)
+            pieces = _some(seen if line.counted is None else line.counted)
+            return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
         # Of lost lines without counts: it went on at about this speed, or too long to guess.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)

@@ -66,6 +66,15 @@ def test_counts_go_before_the_speed() -> None:
     assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
 
 
+def test_counts_of_a_line_passed_over_behind_a_silence_are_told_once() -> None:
+    """Its own time is nothing: the silence has it."""
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))
+    first = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    second = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), FOUR)
+    assert (first.turned, second.turned) == (all_four(0.12), turned)
+
+
 @pytest.mark.parametrize("lines", [1, 4])
 def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int) -> None:
     rolling = Rolling()
