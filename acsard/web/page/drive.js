@@ -1,10 +1,11 @@
 // Stick, keys and gamepad -> one hand. Whatever takes the finger or the eye away lets go.
 
 import { awake } from "./awake.js";
-import { Hand, twist } from "./hand.js";
+import { Hand, twist, ZERO } from "./hand.js";
 
 export const SOURCE = "teleop";
 const LOOK = 10;
+const TWICE = 50; // ms after letting go
 const KEYS = {
   ArrowUp: [0, 1], KeyW: [0, 1], ArrowDown: [0, -1], KeyS: [0, -1],
   ArrowLeft: [-1, 0], KeyA: [-1, 0], ArrowRight: [1, 0], KeyD: [1, 0],
@@ -18,6 +19,7 @@ export class Drive {
   #link;
   #told;
   #timer = null;
+  #again = null;
   #by = null; // "stick", "keys" or "pad": who pressed is who lets go
   #push = [0, 0];
   #pressed = new Set();
@@ -58,6 +60,7 @@ export class Drive {
 
   #press(by) {
     if (!this.allowed || !this.shown || this.#hand.held) return;
+    clearTimeout(this.#again);
     this.#by = by;
     this.#told("");
     this.#hand.press(performance.now());
@@ -81,6 +84,10 @@ export class Drive {
   #end(why) {
     clearInterval(this.#timer);
     this.#timer = null;
+    // A daemon that reads late drops what comes on the heels of another command. Told twice, it
+    // has heard it, and then it is silence: who goes on with zeros keeps others from driving.
+    clearTimeout(this.#again);
+    this.#again = setTimeout(() => this.#send(ZERO), TWICE);
     this.stick.classList.remove("held");
     awake("stick", false);
     this.#told(why);

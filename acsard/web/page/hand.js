@@ -1,8 +1,8 @@
 // What a hand on the stick sends and when. Pure: times in ms come in, commands go out.
 //
 // A hold opens with zeros until the robot follows us, so that no press is the first thing that a
-// robot hears of this browser; then what is wished goes at 20 Hz; letting go is one zero, then
-// silence. A hold that ended by itself takes a new press: nobody's finger drives twice.
+// robot hears of this browser; then what is wished goes at 20 Hz; letting go is one zero (which
+// `drive.js` says a second time), then silence. A hold that ended by itself takes a new press: nobody's finger drives twice.
 
 export const PERIOD = 50;
 export const OPENING = 20;
