@@ -401,8 +401,8 @@ COMMANDS: dict[str, How] = {
     ),
     # deploy/zenoh
     "acsard router two.json5": IN_ONE_VIEW,
-    f"acsard run --id robot1 --listen tcp/127.0.0.1:7451 {_PLAIN}": IN_ONE_VIEW,
-    f"acsard run --id robot2 --listen tcp/127.0.0.1:7452 {_PLAIN}": IN_ONE_VIEW,
+    f"acsard run --id robot1 --namespace robot1 --listen tcp/127.0.0.1:7451 {_PLAIN}": IN_ONE_VIEW,
+    f"acsard run --id robot2 --namespace robot2 --listen tcp/127.0.0.1:7452 {_PLAIN}": IN_ONE_VIEW,
     f"acsard fleet {_PLAIN}": IN_ONE_VIEW,
     f"acsard drive --id robot2 {_PLAIN}": DRIVE._replace(but="without the router"),
     f"acsard call stop --id '*' {_PLAIN}": IN_ONE_VIEW,

@@ -26,7 +26,7 @@ from acsard.messages.topics import (
     source_keys,
     whoami_key,
 )
-from acsard.ros.transports import Endpoint, endpoints, left_out
+from acsard.ros.transports import Endpoint, claims, endpoints, left_out
 from acsard.values import ROLES, ROOT, Role, Verb
 
 SERVICE_ROLES: dict[Verb, Role] = {
@@ -121,6 +121,7 @@ class _Keys:
         ros, topics, told = self._ros, offered(config), published(config)
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
+        self.claims = claims(config.ros)
         self.config = full_key(robot, "config")
         self.stop = full_key(robot, "stop")
         self.imu = full_key(robot, IMU)
@@ -216,7 +217,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     def services(role: Role) -> list[str]:
         return [k for verb, least in SERVICE_ROLES.items() if least == role for k in keys.of(verb)]
 
-    tokens = [keys.alive, *keys.kept, *TOKENS]
+    tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
     answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
     answered.append(keys.any_role)
     answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
@@ -233,7 +234,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("overhear", "egress", ["put"], keys.heard),
         # exact keys
         _rule("watch", "ingress", watching, [*keys.published, keys.alive]),
-        _rule("appear", "ingress", ["liveliness_token"], [keys.alive]),
+        _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
         _rule("ask", "ingress", ["query"], asked),
         _rule("halt", "ingress", ["put"], [keys.stop]),
         _rule("command", "ingress", ["put"], keys.commands),

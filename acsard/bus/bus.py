@@ -29,14 +29,14 @@ from acsard.messages.schema import Message
 from acsard.messages.signature import Signature
 from acsard.messages.topics import IMU, Topic, full_key, json_key
 from acsard.ros.tokens import gid
-from acsard.ros.transports import Endpoint, command_keys, endpoints, node_tokens
+from acsard.ros.transports import Endpoint, claims, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
 
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_PATIENCE_S = 0.5
-"""How long to listen for another daemon with our id before claiming it."""
+"""How long to listen for another daemon with our id or ROS names before claiming them."""
 
 
 class ZenohBus:
@@ -112,12 +112,11 @@ class ZenohBus:
     def _open(self) -> zenoh.Session:
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
-        if settings.connect and _seen(session, self._alive):
-            session.close()
-            raise InUseError(
-                f"another daemon on this bus already is {self._id}; "
-                "give this robot its own robot.id",
-            )
+        if settings.connect:
+            taken = self._taken(_seen(session, self._alive, claims(self._ros)))
+            if taken:
+                session.close()
+                raise InUseError(taken)
         # Before the first key is declared, on which something may come in at once.
         self._inbox.own_id = session.new_timestamp().get_id()
         self._replies.start(session)
@@ -125,11 +124,26 @@ class ZenohBus:
         zid = str(session.zid())
         for endpoint in endpoints(self._ros, zid, self._silent):
             self._declare_ros(session, endpoint)
-        for token in (self._alive, *node_tokens(self._ros, zid)):
+        for token in (self._alive, *claims(self._ros), *node_tokens(self._ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
         self._outlets.start()
         self._links.start(session)
         return session
+
+    def _taken(self, seen: set[str]) -> str:
+        """What another daemon has of ours and the mend, or ""."""
+        if self._alive in seen:
+            return (
+                f"another daemon on this bus already is {self._id}; "
+                "give this robot its own robot.id"
+            )
+        if seen:
+            return (
+                f'another robot on this bus already has ros.namespace = "{self._ros.namespace}": '
+                "one cmd_vel of ROS would drive both; give this robot its own, in [ros] namespace "
+                "or by `acsard run --namespace NAME`, or no ROS (ros.bridge, ros.rmw = false)"
+            )
+        return ""
 
     def _declare_native(self, session: zenoh.Session) -> None:
         inbox = self._inbox
@@ -195,13 +209,18 @@ class ZenohBus:
         self._session.close()
 
 
-def _seen(session: zenoh.Session, token: str) -> bool:
-    """Is there, or comes within our patience, somebody with this liveliness token?"""
-    others = session.liveliness().declare_subscriber(token, history=True)
+def _seen(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
+    """Which of these liveliness tokens others have, or come to have within our patience."""
+    liveliness = session.liveliness()
+    others = {
+        token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)
+    }
     deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * NS_PER_S)
-    found = None
-    while found is None and clock.now().mono_ns < deadline_ns:
+    found: set[str] = set()
+    # Who has our id has our ROS names as well, and is to be told of the id.
+    while alive not in found and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
-        found = others.try_recv()
-    others.undeclare()
-    return found is not None
+        found |= {token for token, other in others.items() if other.try_recv() is not None}
+    for other in others.values():
+        other.undeclare()
+    return found

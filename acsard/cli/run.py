@@ -39,6 +39,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("--baud-rate", type=int, metavar="N", help="9600 to 115200")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(
+        "--namespace", metavar="NAME", help="in front of its ROS topics (ros.namespace)"
+    )
+    parser.add_argument(
         "--listen",
         metavar="ENDPOINT",
         help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
@@ -69,6 +72,7 @@ def overrides(args: argparse.Namespace) -> Overrides:
         ("mcu", "port", args.port),
         ("mcu", "baud_rate", args.baud_rate),
         ("robot", "id", args.id),
+        ("ros", "namespace", args.namespace),
         ("record", "directory", args.record),
         ("bus", "listen", [args.listen] if args.listen else None),
         ("bus", "connect", [args.connect] if args.connect else None),

@@ -59,9 +59,10 @@ def warnings(config: Config) -> list[str]:
             "a second robot there would share its keys; give each its own id"
         )
     ros = config.ros
-    if outside and (ros.bridge or ros.rmw) and not ros.namespace:
+    where = "that leaves this machine" if outside else "with a router" if config.bus.connect else ""
+    if where and (ros.bridge or ros.rmw) and not ros.namespace:
         found.append(
-            'ros.namespace = "" on a bus that leaves this machine: a second robot there would '
+            f'ros.namespace = "" on a bus {where}: a second robot there would '
             "share its ROS topics; give each its own namespace"
         )
     return found + named_faults.warnings(config)

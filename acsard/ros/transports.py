@@ -17,6 +17,7 @@ from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, Direction, service_key
 from acsard.ros.names import bridge_key, full_name, rmw_key
 from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
+from acsard.values import ROOT
 
 Transport = Literal["bridge", "rmw"]
 
@@ -156,6 +157,15 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
     """The keys commands come in on."""
     return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
+
+
+def claims(ros: RosConfig) -> tuple[str, ...]:
+    """Tokens that say which ROS names a daemon obeys: two that have one of them are both driven by
+    one `cmd_vel`. In a tree of our own, since other nodes may be called as ours, and not every
+    daemon has tokens for ROS."""
+    name = full_name(ros.namespace, "cmd_vel")
+    ways = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
+    return tuple(f"{ROOT}/@ros/{way}{name}" for way, on in ways if on)
 
 
 def _node(ros: RosConfig, zid: str) -> Node:

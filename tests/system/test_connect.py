@@ -93,7 +93,11 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
 ) -> None:
     """Neither hands on what the other says: who stops all at one of them has to know."""
     one = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
-    config: Tables = {"robot": {"id": "two"}, "bus": {"connect": [one.endpoint]}}
+    config: Tables = {
+        "robot": {"id": "two"},
+        "bus": {"connect": [one.endpoint]},
+        "ros": {"namespace": "two"},
+    }
     with one, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
         assert one.endpoint in told(two, "no_router", 1)
         with Bus(two.endpoint, robot_id="two") as bus:

@@ -67,6 +67,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
             own: Tables = {
                 "robot": {"id": name},
                 "bus": {"listen": [here], "connect": [endpoint]},
+                "ros": {"namespace": name},
             }
             daemons[name] = stack.enter_context(Daemon(where, config=own, name=name))
             with Bus(here, robot_id=name) as bus:
@@ -193,6 +194,7 @@ def test_named_robots_are_not_waited_for_once_each_is_told(robots: Robots) -> No
 def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> None:
     third: Tables = {
         "robot": {"id": "robot3"},
+        "ros": {"namespace": "robot3"},
         "bus": {"listen": [free_endpoint()], "connect": [robots.endpoint]},
     }
     env = environment(TERM="xterm-256color", COLUMNS="100", LINES="24")
@@ -265,7 +267,8 @@ def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> Non
     with ExitStack() as stack:
         stack.enter_context(Program(acsard("router", "two.json5"), tmp_path))
         for name in (ONE, TWO):
-            join = ("--id", name, "--listen", free_endpoint(), "--connect", endpoint)
+            own = ("--id", name, "--namespace", name)
+            join = (*own, "--listen", free_endpoint(), "--connect", endpoint)
             stack.enter_context(Program(acsard("run", *join), tmp_path))
         view = Robots(tmp_path, endpoint, {})
 

@@ -186,8 +186,43 @@ def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
             assert "Traceback" not in second.err
             assert peer.session.stream == b""
             print(f"second daemon of the id: exit 75 after {second.seconds:.2f} s")
-            with Daemon(tmp_path, peer.path, mine, words=["--id", "other"], name="other") as third:
+            other = ["--id", "other", "--namespace", "other"]
+            with Daemon(tmp_path, peer.path, mine, words=other, name="other") as third:
                 assert third.process.poll() is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "ros", [{"rmw": False, "announce": False}, {"bridge": False, "namespace": "lab/robot"}]
+)
+def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_with_75(
+    tmp_path: Path, peer: Peer, ros: dict[str, object]
+) -> None:
+    """One `cmd_vel` would drive both."""
+    endpoint = free_endpoint()
+
+    def robot(name: str, port: str = "sim") -> Tables:
+        bus = {"listen": [free_endpoint()], "connect": [endpoint]}
+        return {"robot": {"id": name}, "bus": bus, "ros": ros, "mcu": {"port": port}}
+
+    path = write_config(tmp_path / "two.toml", robot("two", str(peer.path)))
+    run = acsard("run", "--config", str(path))
+    with (
+        zenoh.open(client_config(endpoint, "router")),
+        Daemon(tmp_path, config=robot("one"), name="one") as one,
+    ):
+        ended = finish(run, tmp_path)
+        assert ended.code == 75
+        assert "--namespace NAME" in ended.err
+        assert "Traceback" not in ended.err
+        assert peer.session.stream == b""
+        with Program([*run, "--namespace", "two"], tmp_path) as named:
+            named.says("bus ")
+            one.signal(signal.SIGKILL)
+            one.ended(5.0)
+            # Its own tokens of before are not another's.
+            with Daemon(tmp_path, config=robot("one"), name="one") as again:
+                assert again.process.poll() is None
 
 
 # no permission: 77

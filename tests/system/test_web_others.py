@@ -36,7 +36,11 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Two]:
         stack.enter_context(zenoh.open(client_config(router, "router")))
         buses, daemons = [], []
         for name in (OURS, THEIRS):
-            settings: Tables = {"robot": {"id": name}, "bus": {"connect": [router]}}
+            settings: Tables = {
+                "robot": {"id": name},
+                "bus": {"connect": [router]},
+                "ros": {"namespace": name},
+            }
             daemons.append(stack.enter_context(Daemon(where, config=settings, name=name)))
             buses.append(stack.enter_context(Bus(daemons[-1].endpoint, name)))
             buses[-1].linked()

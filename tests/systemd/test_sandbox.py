@@ -135,6 +135,29 @@ def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
     assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
 
 
+@pytest.mark.parametrize("unit", [DOOR, PAGE])
+def test_without_its_key_the_door_or_page_waits_for_a_person_and_doctor_says_which(
+    container: Container, board: Board, unit: str
+) -> None:
+    opened(container)
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text(), unit)
+    container.run("systemctl", "stop", unit)
+    key = container.path(f"{TLS}/key.pem")
+    kept = key.read_bytes()
+    key.unlink()
+    container.start(unit)
+    until(lambda: container.show("ActiveState", unit) == "failed", 5.0, "it is left alone")
+    assert container.show("ExecMainStatus", unit) == "243"
+    assert container.show("NRestarts", unit) == "0"
+    told = container.run(ACSARD, "doctor", "--config", CONFIG).out
+    assert f"{TLS}/key.pem is missing" in told
+    key.write_bytes(kept)
+    container.run("systemctl", "enable", unit)  # as installed
+    container.run("systemctl", "restart", UNIT)
+    until(lambda: container.show("SubState", unit) == "running", 10.0, "it is there again")
+    container.run("systemctl", "disable", unit)
+
+
 # the walls around it
 
 

@@ -29,7 +29,7 @@ from acsard.config.settings import (
     Source,
 )
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
-from acsard.ros.transports import PARAMETERS, endpoints
+from acsard.ros.transports import PARAMETERS, claims, endpoints
 from acsard.values import Role
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
@@ -223,6 +223,12 @@ def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
         assert TRUSTING.who(message, "acsard/*/alive") == FROM["viewer"]
     for who in EVERYBODY:
         assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
+
+
+def test_a_router_may_tell_of_another_with_our_id_or_our_ros_names() -> None:
+    for token in (DEFAULT.key("alive"), *claims(RosConfig())):
+        assert DEFAULT.who("liveliness_token", token) == FROM["maintainer"]
+        assert DEFAULT.lets("maintainer", "declare_liveliness_subscriber", token, "egress")
 
 
 def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:

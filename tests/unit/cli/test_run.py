@@ -23,11 +23,11 @@ def test_without_options_nothing_is_overridden() -> None:
 
 
 def test_the_options_are_the_keys_of_the_configuration() -> None:
-    given = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7",
+    given = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7", "--namespace", "a/b",
                      "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/[::1]:2")  # fmt: skip
     config = parse(b"", given)
     assert (config.mcu.port, config.mcu.baud_rate) == ("/dev/x", 57600)
-    assert config.robot.id == "r7"
+    assert (config.robot.id, config.ros.namespace) == ("r7", "a/b")
     assert config.bus.listen == ("tcp/127.0.0.1:1",)
     assert config.bus.connect == ("tcp/[::1]:2",)
 
@@ -37,6 +37,7 @@ def test_the_options_are_the_keys_of_the_configuration() -> None:
     [
         (["--port", "x"], "mcu"),
         (["--id", "x"], "robot"),
+        (["--namespace", "x"], "ros"),
         (["--listen", "tcp/[::1]:1"], "bus"),
         (["--connect", "tcp/[::1]:1"], "bus"),
     ],

@@ -73,7 +73,8 @@ def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
     listen: tuple[str, ...],
 ) -> None:
     here = ("tcp/127.0.0.1:7447",)
-    client = Config(bus=BusConfig(mode="client", connect=here, listen=listen))
+    bus = BusConfig(mode="client", connect=here, listen=listen)
+    client = Config(bus=bus, ros=RosConfig(namespace="r1"))
     assert contradictions(client) == warnings(client) == []
     assert problems(bus=BusConfig(connect=here, listen=listen)) != []
 
@@ -97,6 +98,14 @@ def test_a_bus_that_leaves_the_machine_wants_an_id_and_a_namespace() -> None:
     assert "ros.namespace" in second
     assert warnings(parse(text + b'[robot]\nid = "r1"\n[ros]\nnamespace = "r1"\n')) == []
     assert len(warnings(parse(text + b"[ros]\nbridge = false\nrmw = false\n"))) == 1
+
+
+def test_a_router_on_the_machine_wants_a_namespace_too() -> None:
+    text = b'[bus]\nconnect = ["tcp/127.0.0.1:7447"]\n'
+    (line,) = warnings(parse(text))
+    assert line.startswith('ros.namespace = "" on a bus with a router')
+    for mend in (b'[ros]\nnamespace = "r1"\n', b"[ros]\nbridge = false\nrmw = false\n"):
+        assert warnings(parse(text + mend)) == []
 
 
 # the checked link

@@ -18,6 +18,7 @@ from acsard.ros.names import TYPE_HASHES
 from acsard.ros.transports import (
     PARAMETERS,
     Endpoint,
+    claims,
     command_keys,
     endpoints,
     left_out,
@@ -103,6 +104,19 @@ def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
     tokens = node_tokens(ros, ZID)
     assert any(token.startswith("@ros2_lv/") for token in tokens) == rmw
     assert any(token == "@/abc/@ros2_lv" for token in tokens) == bridge
+
+
+def test_two_claim_the_same_where_one_topic_would_drive_both() -> None:
+    def shared(one: RosConfig, two: RosConfig) -> bool:
+        return bool({*claims(one)} & {*claims(two)})
+
+    usual, named = RosConfig(), RosConfig(namespace="lab/robot1")
+    assert shared(usual, RosConfig(node="other", announce=False))
+    assert shared(named, RosConfig(namespace="lab/robot1", domain=7)), "the bridge knows no domain"
+    assert not shared(usual, named)
+    assert not shared(RosConfig(bridge=False), RosConfig(bridge=False, domain=7))
+    assert not shared(RosConfig(bridge=False), RosConfig(rmw=False)), "no commander reaches both"
+    assert claims(RosConfig(bridge=False, rmw=False)) == ()
 
 
 def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
