@@ -15,26 +15,22 @@ void bridge_off(struct bridge *bridge)
 
 bool bridge_step(struct bridge *bridge, int16_t wanted)
 {
-    int16_t size = wanted < 0 ? (int16_t)-wanted : wanted;
+    int16_t size = wanted < 0 ? (int16_t)-wanted : wanted, had = bridge->duty;
     int8_t direction = wanted < 0 ? -1 : wanted > 0 ? 1 : bridge->direction;
+    bool same = direction == bridge->direction;
 
-    if (direction != bridge->direction && bridge->duty) {
+    if (!same)
         bridge->duty = 0;
-        bridge->rest = REVERSE_TICKS;
-        return false;
-    }
-    if (bridge->rest) {
-        bridge->rest--;
-        return size == 0;
-    }
-    if (direction != bridge->direction) {
-        /* The inputs change in this tick, the duty rises from the next one on. */
-        bridge->direction = direction;
-        return size == 0;
-    }
-    if (size - bridge->duty > RISE) /* their sum would overflow at a low PWM_HZ */
-        bridge->duty = (int16_t)(bridge->duty + RISE);
+    else if (size - had > RISE) /* their sum would overflow at a low PWM_HZ */
+        bridge->duty = (int16_t)(had + RISE);
     else
         bridge->duty = size;
-    return bridge->duty == size;
+    /* The rest begins with every zero, or what was asked for between would hide a reversal. */
+    if (had && !bridge->duty)
+        bridge->rest = REVERSE_TICKS;
+    else if (bridge->rest)
+        bridge->rest--;
+    else if (!same)
+        bridge->direction = direction; /* in this tick the inputs, the duty from the next one on */
+    return same && bridge->duty == size;
 }

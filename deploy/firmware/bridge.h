@@ -9,7 +9,7 @@
 struct bridge {
     int16_t duty;    /* 0 to PWM_TOP */
     int8_t direction; /* 1 forward, -1 reverse, 0 off: both inputs low */
-    uint8_t rest;    /* ticks it must still stay at zero */
+    uint8_t rest;    /* ticks it must still stay at zero before another direction */
 };
 
 /* Off at once. */

@@ -86,6 +86,8 @@
 
 _Static_assert((COUNTS_PER_TURN) > 0 && (COUNTS_PER_TURN) <= 65535L,
                "counts per turn: of the wheel, all four edges");
+_Static_assert(REVERSE_TICKS * PWM_HZ >= CONTROL_HZ,
+               "a duty of zero must have been taken over before the direction changes");
 _Static_assert(F_CPU / (2UL * PWM_HZ) <= 32767, "the PWM period must fit its timer");
 #if COMMAND_WATCHDOG_MS > 500
 #error "the motors must stop within 500 ms of silence"

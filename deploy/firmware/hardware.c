@@ -22,10 +22,6 @@ static void pwm_start(void)
     ICR3 = (uint16_t)PWM_TOP;
     ICR4 = (uint16_t)PWM_TOP;
     hardware_motors_off();
-    TCCR3A = _BV(COM3A1) | _BV(WGM31);
-    TCCR4A = _BV(COM4A1) | _BV(COM4B1) | _BV(COM4C1) | _BV(WGM41);
-    TCCR3B = _BV(WGM33) | _BV(CS30);
-    TCCR4B = _BV(WGM43) | _BV(CS40);
     PWM_DDR_3 |= PWM_PINS_3;
     PWM_DDR_4 |= PWM_PINS_4;
     DIRECTION_DDR = 0xFF;
@@ -156,12 +152,28 @@ void hardware_snapshot(struct snapshot *out)
 
 void hardware_motors_off(void)
 {
+    /* A direction changes at once and low may be reverse, but a duty is taken over at the timer's
+     * next top only. So the timers leave the pins first, which then are low as PORT says. */
+    TCCR3A = _BV(WGM31);
+    TCCR4A = _BV(WGM41);
+    TCCR3B = _BV(WGM33) | _BV(CS30);
+    TCCR4B = _BV(WGM43) | _BV(CS40);
+    DIRECTION_OUT = 0;
     /* The interrupts use timer 5 only, so they cannot come between the two bytes of these. */
     PWM_A = 0;
     PWM_B = 0;
     PWM_C = 0;
     PWM_D = 0;
-    DIRECTION_OUT = 0;
+}
+
+/* A timer has its pin again with the first duty, when the direction stands: an output that left in
+ * the middle of a pulse is still high then, for one period at most. */
+static void connect(uint8_t motor)
+{
+    if (motor == 0)
+        TCCR3A |= _BV(COM3A1);
+    else
+        TCCR4A |= motor == 1 ? _BV(COM4A1) : motor == 2 ? _BV(COM4B1) : _BV(COM4C1);
 }
 
 void hardware_motor(uint8_t motor, int16_t duty, int8_t direction)
@@ -187,4 +199,6 @@ void hardware_motor(uint8_t motor, int16_t duty, int8_t direction)
         PWM_D = value;
         break;
     }
+    if (value)
+        connect(motor);
 }

@@ -25,7 +25,7 @@ bool hardware_ticked(void);
 /* The latest one. */
 void hardware_snapshot(struct snapshot *out);
 
-/* All bridges off: no PWM, both direction inputs low. */
+/* All bridges off: no PWM, then both direction inputs low. */
 void hardware_motors_off(void);
 
 /* One bridge: duty 0 to PWM_TOP; direction 1, -1, or 0 for both inputs low. */

@@ -6,11 +6,14 @@ that has not let go yet may be one that nobody watches. This is the line that it
     python3 drive.py [LINEAR m/s] [ANGULAR rad/s] [SECONDS] [--ros-args -r __ns:=/robot1]
 """
 
+import signal
 import sys
 import time
+from typing import NoReturn
 
 import rclpy
 from geometry_msgs.msg import Twist
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 PERIOD_S = 0.05
@@ -20,10 +23,25 @@ ZEROS_S = 1.5
 """By a bridge, a zero counts a second after the last speed of whomever."""
 
 
+def end(number: int, frame: object) -> NoReturn:
+    """Ended by a signal, after the zeros."""
+    sys.exit(128 + number)
+
+
 def main(argv: list[str]) -> None:
     given = [float(word) for word in remove_ros_args(argv)[1:]]
     linear, angular, seconds = given + [0.2, 0.0, 3.0][len(given) :]
-    rclpy.init(args=argv)
+    # Its own handlers would end the context first, and no zero could be sent any more.
+    rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    try:
+        drive(linear, angular, seconds)
+    finally:
+        rclpy.try_shutdown()
+
+
+def drive(linear: float, angular: float, seconds: float) -> None:
     node = rclpy.create_node("acsar_drive")
     publisher = node.create_publisher(Twist, "cmd_vel", 10)
     deadline = time.monotonic() + PATIENCE_S
@@ -44,7 +62,6 @@ def main(argv: list[str]) -> None:
         hold(linear, angular, seconds)
     finally:
         hold(0.0, 0.0, 2 * PERIOD_S)
-        rclpy.shutdown()
 
 
 if __name__ == "__main__":

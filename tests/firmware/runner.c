@@ -56,7 +56,7 @@
 /* Registers of the ATmega2560, as data addresses (data sheet, register summary). */
 enum {
     DDRA = 0x21, PORTA = 0x22,
-    DDRE = 0x2D, DDRH = 0x101,
+    DDRE = 0x2D, PORTE = 0x2E, DDRH = 0x101, PORTH = 0x102,
     PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
     TCCR3A = 0x90, TCCR3B = 0x91, ICR3 = 0x96, OCR3A = 0x98,
     TCCR4A = 0xA0, TCCR4B = 0xA1, ICR4 = 0xA6, OCR4A = 0xA8, OCR4B = 0xAA, OCR4C = 0xAC,
@@ -88,6 +88,12 @@ static struct motor {
     int64_t counts_at_reset; /* where the firmware began to count */
     avr_cycle_count_t at;    /* how far this is worked out */
     double flip_duty;        /* the highest duty at which the bridge ever changed direction */
+    struct {
+        bool counts;               /* the timer is in its PWM mode */
+        avr_cycle_count_t started; /* since then, from zero */
+        uint64_t tops;             /* so often it was at its top */
+        unsigned written, compare; /* the register, and what of it is in force */
+    } timer;
     unsigned flips;
     enum encoder encoder;
 } motors[MOTORS];
@@ -251,16 +257,59 @@ static avr_cycle_count_t on_motor(avr_t *unused, avr_cycle_count_t when, void *w
     return when + (wait < 16.0 ? 16 : (avr_cycle_count_t)wait + 1);
 }
 
-/* What the PWM output of a motor gives, 0 to 1: phase correct with its top in ICR is all we know. */
+static void look_at_bridges(void);
+
+static avr_cycle_count_t on_top(avr_t *unused, avr_cycle_count_t when, void *which)
+{
+    (void)unused;
+    (void)when;
+    (void)which;
+    look_at_bridges();
+    return 0;
+}
+
+/* The simulator has no double buffer: in PWM mode a compare register is in force from the next time
+ * that the counter, up and down, is at its top; else at once. Looked at whenever one is written. */
+static void take_over(int index, bool counts, unsigned top)
+{
+    struct motor *motor = &motors[index];
+    avr_cycle_count_t since;
+
+    if (!counts || !motor->timer.counts) {
+        motor->timer.counts = counts;
+        motor->timer.started = avr->cycle;
+        motor->timer.tops = 0;
+        motor->timer.written = motor->timer.compare = word(PWM[index].compare);
+        return;
+    }
+    since = avr->cycle - motor->timer.started;
+    if ((since + top) / (2 * top) > motor->timer.tops) {
+        motor->timer.tops = (since + top) / (2 * top);
+        motor->timer.compare = motor->timer.written;
+    }
+    motor->timer.written = word(PWM[index].compare);
+    if (motor->timer.written != motor->timer.compare)
+        avr_cycle_timer_register(avr, (2 * motor->timer.tops + 1) * top - since, on_top,
+                                 (void *)(intptr_t)index);
+}
+
+/* What the PWM pin of a motor gives, 0 to 1: phase correct at the full clock with its top in ICR is
+ * all we know, or the port when the timer does not have the pin. */
 static double pwm(int index)
 {
     const struct pwm *pwm = &PWM[index];
     uint8_t a = avr->data[pwm->control_a], b = avr->data[pwm->control_b];
-    unsigned top = word(pwm->top), compare = word(pwm->compare);
-    bool running = (a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7);
-    bool connected = (a >> pwm->mode_shift & 3) == 2;
+    unsigned top = word(pwm->top), compare;
+    bool counts = (a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7) == 1 && top;
+    unsigned mode = a >> pwm->mode_shift & 3;
 
-    if (!running || !connected || !top || !(avr->data[pwm->ddr] >> pwm->pin & 1))
+    take_over(index, counts, top);
+    compare = motors[index].timer.compare;
+    if (!(avr->data[pwm->ddr] >> pwm->pin & 1))
+        return 0.0;
+    if (!mode)
+        return avr->data[pwm->ddr + 1] >> pwm->pin & 1;
+    if (!counts || mode != 2)
         return 0.0;
     return compare >= top ? 1.0 : (double)compare / top;
 }
@@ -809,7 +858,7 @@ static void say_nothing(avr_t *unused, const int level, const char *format, va_l
 
 static void power_on(const char *path)
 {
-    static const uint16_t watched[] = {PORTA, DDRA,  DDRE,  DDRH,  TCCR3A, TCCR3B, TCCR4A,
+    static const uint16_t watched[] = {PORTA, DDRA,  DDRE,  DDRH,  PORTE,  PORTH,  TCCR3A, TCCR3B, TCCR4A,
                                        TCCR4B, OCR3A, OCR4A, OCR4B, OCR4C,  ICR3,   ICR4};
     elf_firmware_t firmware;
     uint32_t no_flags = 0;

@@ -307,6 +307,18 @@ def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) 
     assert all(motor.flip_duty == 0.0 for motor in motors)
 
 
+def test_a_cut_takes_the_voltage_before_the_direction(board: Board, host: Host) -> None:
+    """For a driver with one direction input low is reverse."""
+    for _ in range(3):
+        host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
+        assert all(abs(motor.duty) > 0.3 for motor in board.status().motors)
+        until(lambda: is_off(board.status()), 3.0, "motors off for silence")
+    assert [motor.flip_duty for motor in board.status().motors] == [0.0] * 4
+    board.command("encoder b swapped")
+    is_cut(board, host, (9.0, 9.0, 9.0, 9.0), 0.8)
+    assert [motor.flip_duty for motor in board.status().motors] == [0.0] * 4
+
+
 def test_a_wheel_that_stands_by_command_gets_no_current(board: Board, host: Host) -> None:
     host.drive(DRIVE, 0.3)
     host.drive(STOPPED, 0.8)

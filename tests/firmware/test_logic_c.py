@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 TOP = 400
@@ -20,6 +20,8 @@ TICKS = 2_000_000
 """Of the edge clock in a second."""
 
 COUNTS_PER_TURN = 3200
+
+REVERSE_TICKS = 2
 
 
 class WatchdogC(ctypes.Structure):
@@ -367,32 +369,44 @@ def test_at_rest_the_duty_leaks_away(logic: ctypes.CDLL) -> None:
 # bridge
 
 
-@given(st.lists(st.one_of(st.integers(-TOP, TOP), st.none()), max_size=200))
+@example([TOP] * 3 + [0, -TOP])
+@given(st.lists(st.one_of(st.integers(-TOP, TOP), st.just(0), st.none()), max_size=200))
 def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
     logic: ctypes.CDLL, steps: list[int | None]
 ) -> None:
-    """None = off, as by the watchdog."""
+    """None = off, as by the watchdog: between two ticks, so it is none itself."""
     bridge = BridgeC(0, 0, 0)
     at = ctypes.addressof(bridge)
-    zero_for, driven = 99, 0
+    rested, driven = REVERSE_TICKS, 0
     for wanted in steps:
         before = (bridge.duty, bridge.direction)
         if wanted is None:
             logic.bridge_off(at)
             assert (bridge.duty, bridge.direction) == (0, 0)
-        else:
-            full = logic.bridge_step(at, wanted)
-            assert full == (bridge.duty * bridge.direction == wanted), (wanted, bridge.duty)
+            continue
+        full = logic.bridge_step(at, wanted)
+        assert full == (bridge.duty * bridge.direction == wanted), (wanted, bridge.duty)
         assert 0 <= bridge.duty <= TOP
         assert bridge.duty <= before[0] + TOP // 10
+        if abs(wanted) <= bridge.duty:
+            assert abs(wanted) == bridge.duty
         if bridge.direction != before[1]:
             assert bridge.duty == 0
-        if wanted is not None and abs(wanted) <= bridge.duty:
-            assert abs(wanted) == bridge.duty
+            assert rested >= REVERSE_TICKS, "without voltage before the inputs change"
         if bridge.duty and driven and bridge.direction != driven:
-            assert zero_for >= 2, "rest before the other direction"
-        zero_for = zero_for + 1 if bridge.duty == 0 else 0
+            assert rested > REVERSE_TICKS, "nor voltage in the tick in which they change"
+        rested = 0 if bridge.duty else rested + 1
         driven = bridge.direction if bridge.duty else driven
+
+
+def test_a_bridge_goes_on_the_same_way_without_rest(logic: ctypes.CDLL) -> None:
+    bridge = BridgeC(0, 0, 0)
+    at = ctypes.addressof(bridge)
+    for wanted in (TOP, TOP, 0):
+        logic.bridge_step(at, wanted)
+    assert (bridge.duty, bridge.direction) == (0, 1)
+    logic.bridge_step(at, TOP)
+    assert bridge.duty == TOP // 10
 
 
 # supervision

@@ -1,5 +1,7 @@
 """Stand-ins for rclpy and geometry_msgs, which come with ROS only: what `drive.py` needs of them.
 
+As the real one: unless told otherwise, a signal ends the context under whoever still publishes.
+
 The messages go by the protocol of rmw_zenoh, or as a bridge puts them, into a real daemon.
 """
 
@@ -9,7 +11,9 @@ from pathlib import Path
 
 RCLPY = """\
 import os
+import signal
 import zenoh
+from rclpy.signals import SignalHandlerOptions
 from tests.system.harness import client_config
 from tests.system.ros_clients import TWIST, BridgeHalf, RmwClient, twist
 
@@ -24,6 +28,8 @@ class Publisher:
         return int(self.matching.matching_status.matching)
 
     def publish(self, message):
+        if not valid:
+            raise RuntimeError("the publisher's context is invalid")
         payload = twist(message.linear.x, message.angular.z)
         self.client.put(self.topic, TWIST, payload)
 
@@ -32,9 +38,47 @@ class Node:
         assert kind.__name__ == "Twist"
         return Publisher(topic)
 
-def init(args=None): ...
+valid = False
+
+def install(number):
+    before = signal.getsignal(number)
+    def handler(number, frame):
+        global valid
+        valid = False
+        if callable(before):
+            before(number, frame)
+    signal.signal(number, handler)
+
+def init(*, args=None, signal_handler_options=None):
+    global valid
+    valid = True
+    options = SignalHandlerOptions.ALL if signal_handler_options is None else signal_handler_options
+    if options & SignalHandlerOptions.SIGINT:
+        install(signal.SIGINT)
+    if options & SignalHandlerOptions.SIGTERM:
+        install(signal.SIGTERM)
+
 def create_node(name): return Node()
-def shutdown(): ...
+
+def shutdown():
+    global valid
+    if not valid:
+        raise RuntimeError("the context was shut down already")
+    valid = False
+
+def try_shutdown():
+    if valid:
+        shutdown()
+"""
+
+SIGNALS = """\
+from enum import IntFlag
+
+class SignalHandlerOptions(IntFlag):
+    NO = 0
+    SIGINT = 1
+    SIGTERM = 2
+    ALL = 3
 """
 
 UTILITIES = """\
@@ -56,6 +100,7 @@ def write(where: Path) -> None:
     """Lay the packages there."""
     for name, text in {
         "rclpy/__init__.py": RCLPY,
+        "rclpy/signals.py": SIGNALS,
         "rclpy/utilities.py": UTILITIES,
         "geometry_msgs/__init__.py": "",
         "geometry_msgs/msg.py": MESSAGES,
