@@ -107,8 +107,9 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):
         raise UsageError(
-            "--write cannot change [[commands.sources]]: write the timeout into the file yourself, "
-            "and set it without --write"
+            "--write cannot change [[commands.sources]]: set it without --write, and write the "
+            "timeout into the file yourself; a file that has none of these tables needs all that "
+            "`acsard check` prints, for those in the file replace the built-in ones"
         )
     return writable(path)
 
