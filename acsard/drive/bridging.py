@@ -66,6 +66,11 @@ class Rolling:
         """What the next line says; the last one that was believed said `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         passed_over = self._lost or self._gap or self._counted or self._turned != NOWHERE
+        if not (passed_over or bridged or line.gap or line.turned is not None):
+            # Nearly every line without counts of its own: the rest of this, of that line alone.
+            seen = times(speeds, dt)
+            pieces = _some(seen if line.counted is None else line.counted)
+            return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
         # Of lost lines without counts: it went on at about this speed, or too long to guess.
         lost, unknown = (self._lost, 0.0) if self._lost <= MAX_LOST_S else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt

@@ -47,9 +47,18 @@ class Kinematics:
 
     def twist(self, speeds: WheelSpeeds) -> Twist:
         """The twist these wheel speeds give, equations (1) to (3)."""
-        left = self._left_radius * (speeds.front_left + speeds.rear_left) / 2
-        right = self._right_radius * (speeds.front_right + speeds.rear_right) / 2
-        return Twist((right + left) / 2, (right - left) / self.track)
+        linear, angular = self.moved(speeds.as_tuple())
+        return Twist(linear, angular)
+
+    def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
+        """m and rad of the base by so many rad of its wheels, in `WHEELS` order; or both a second.
+
+        What `twist` says, without values for it: each line asks several times.
+        """
+        front_right, front_left, rear_left, rear_right = wheels
+        left = self._left_radius * (front_left + rear_left) / 2
+        right = self._right_radius * (front_right + rear_right) / 2
+        return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
         """How far the left wheels turn with `right` rad, and the right ones with `left` rad, if the

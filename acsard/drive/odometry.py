@@ -134,10 +134,6 @@ class Odometry:
         """What the last line had to tell of wheels that are doubted."""
         return self._witness.events
 
-    def believed(self, wheels: WheelSpeeds) -> WheelSpeeds:
-        """What four wheels say, rad or rad/s, with others in place of those that are left out."""
-        return self._witness.believed(wheels)
-
     def skip(self, feedback: Feedback) -> None:
         """Pass over a line that cannot be true: what it should have told is left to the next one.
 
@@ -157,32 +153,35 @@ class Odometry:
         lines until then is taken back.
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
+        said, witness = speeds.as_tuple(), self._witness
         rolled = self._rolling.take(feedback, self.speeds)
         if feedback.counted is not None and feedback.steps is not self._steps_seen:
             self._see(feedback)
         turn, by_wheels = None, 0.0
         if gyro is not None:
             by_wheels = self._wheels_turn(rolled)
-            still = self.believed(speeds) == STILL
+            still = witness.believed(said) == NOWHERE
             turn = gyro.turn(feedback.at.mono_ns, rolled.known, by_wheels, still)
         by_gyro = None if turn is None else turn.wheels
-        if self._witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
+        if witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
             self._take_back(gyro)
-        believed = self._witness.believed(speeds)
-        twist = self._kinematics.twist(believed)
-        if self._share != 1.0:
-            twist = Twist(twist.linear, twist.angular / self._share)
-        self._still = self._still + dt if believed == STILL else 0.0
+        slips = witness.slips or (turn is not None and turn.slips)
+        believed = witness.believed(said)
+        linear, angular = self._kinematics.moved(believed)
+        twist = Twist(linear, angular / self._share)
+        self._still = self._still + dt if believed == NOWHERE else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
-        turned = self._move(self._settled(rolled, at_rest), turn, speeds, gyro)
-        if gyro is not None and gyro.owes and turned != by_wheels:
+        pieces = self._settled(rolled, at_rest)
+        on_trial = gyro is not None and gyro.owes
+        turned = self._move(pieces, turn, speeds, on_trial, slips)
+        if gyro is not None and on_trial and turned != by_wheels:
             gyro.taken_back(turned - by_wheels)
         self._go_on(rolled.bridged, feedback, before, twist)
-        variances = self._twist_variances(twist, feedback, at_rest, turn)
+        variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
-            twist = Twist(twist.linear, turn.rate)
+            twist = Twist(linear, turn.rate)
         self.twist, self.speeds = twist, speeds
         return Estimate(
             feedback.at,
@@ -208,7 +207,7 @@ class Odometry:
         turned = rolled.turned
         for piece in rolled.pieces:
             turned = plus(turned, piece)
-        return self._kinematics.twist(self.believed(WheelSpeeds(*turned))).angular
+        return self._kinematics.moved(self._witness.believed(turned))[1]
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """The wheel angles to advance by; at rest counts are held until it is clear where to."""
@@ -251,27 +250,30 @@ class Odometry:
 
         A gyro tells one turn for all of them, else a track of this share of the configured one.
         """
-        rolled = [self._witness.believed(WheelSpeeds(*one)) for one in pieces]
-        moved = [self._kinematics.twist(one) for one in rolled]
+        believed, kinematics = self._witness.believed, self._kinematics
+        moved = [kinematics.moved(believed(one)) for one in pieces]
         if gyro is not None:
-            return [(math.fsum([one.linear for one in moved]), gyro.angle)]
-        return [(one.linear, one.angular / share) for one in moved]
+            return [(math.fsum([distance for distance, _ in moved]), gyro.angle)]
+        return [(distance, angle / share) for distance, angle in moved]
 
     def _move(
         self,
         pieces: tuple[Motors, ...],
         turn: Turn | None,
         speeds: WheelSpeeds,
-        gyro: Heading | None,
+        on_trial: bool,
+        slips: bool,
     ) -> float:
         """Advance by wheel angles in rad, an arc for each piece; by how many rad it turned."""
-        pose, turned = self._path.pose, 0.0
+        path, turned = self._path, 0.0
+        pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
             self._positions = plus(self._positions, piece)
         for distance, angle in self._arcs(pieces, turn, self._share):
             turned += angle
-            self._advance(distance, angle, turn)
-        on_trial = gyro is not None and gyro.owes
+            self.travelled += abs(distance)
+            dx, dy, heading = path.advance(distance, angle)
+            self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
         self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
         return turned
 
@@ -285,28 +287,18 @@ class Odometry:
         else:
             self._gaps.follow(twist, feedback.dt)
 
-    def _slips(self, gyro: Turn | None) -> bool:
-        """Front and rear of a side contradict each other, or the gyro all of them."""
-        return self._witness.slips or (gyro is not None and gyro.slips)
-
     def _twist_variances(
-        self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None
+        self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None, slips: bool
     ) -> TwistVariances:
         spread, step = self._twist_uncertainty, 0.0
         if feedback.counted is not None:
             step = self._coarsest
         variances = spread.at_rest(self._still) if at_rest else spread.of(twist, feedback.dt, step)
-        if self._slips(gyro):
+        if slips:
             variances = spread.slipping(variances)
         if gyro is not None and feedback.dt > 0.0:
             variances = spread.with_gyro(variances, gyro.rate_variance)
         return variances
-
-    def _advance(self, distance: float, turn: float, gyro: Turn | None) -> None:
-        self.travelled += abs(distance)
-        dx, dy, heading = self._path.advance(distance, turn)
-        variance = None if gyro is None else gyro.variance
-        self._uncertainty.advance(distance, turn, dx, dy, heading, variance, self._slips(gyro))
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
         """What the robot did in so many seconds between two twists is unknown: it has not moved."""

@@ -66,16 +66,16 @@ class Residual:
         `keep` is what is left of the sums after it, `count` the angle of an encoder's count.
         """
         mean = (front + rear) / 2
-        off = front - rear - self.ratio * mean
-        self._off = keep * (self._off + off)
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
-        self._way = keep * (self._way + size)
+        off = front - rear - self.ratio * mean
+        total = self._off = keep * (self._off + off)
+        way = self._way = keep * (self._way + size)
         self._net = keep * (self._net + mean)
-        most = SHARE * self._way + COUNTS * count + LEAST
-        if abs(self._off) > most:
+        most = SHARE * way + COUNTS * count + LEAST
+        if abs(total) > most:
             # One motor may be later than the other while the speed changes.
             late = LAG_S * abs(mean / dt - self._net / MEMORY_S)
-            self.slips = abs(self._off) > most + late
+            self.slips = abs(total) > most + late
             self._learn(math.copysign(WILD, off * mean) * dt / DOUBTED_S)
             return False
         if abs(mean) > SLOWEST * dt:
@@ -94,4 +94,5 @@ class Residual:
 
     def _learn(self, more: float) -> None:
         if self.learns:
-            self.ratio = max(-UNEQUAL, min(UNEQUAL, self.ratio + more))
+            ratio = self.ratio + more
+            self.ratio = ratio if abs(ratio) <= UNEQUAL else math.copysign(UNEQUAL, ratio)

@@ -33,6 +33,10 @@ class Stuck:
         self._slow, self._command = slow, command
         self._seconds = self._followed = self._other = 0.0
 
+    def left_by(self, command: float) -> bool:
+        """The command, rad/s, is another one than that at which it began to say the same."""
+        return abs(command - self._command) >= LEAVES
+
     def says(
         self, same: bool, apart: float, dt: float, count: float, slow: float, command: float
     ) -> bool:

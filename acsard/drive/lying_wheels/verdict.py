@@ -10,7 +10,6 @@ like one with a dead encoder, and is left out too: the other one is what is driv
 from __future__ import annotations
 
 import math
-from operator import eq
 
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.lying_wheels.residual import MEMORY_S, Residual
@@ -38,7 +37,10 @@ SLIP_TOLD_S = 0.1
 BACK_S = 0.5
 """s for which a wheel that was left out must agree, rolling, to be believed again."""
 
-NONE = [False] * 4
+Same = tuple[bool, bool, bool, bool]
+"""Which wheels say the very speed of the line before, in `WHEELS` order."""
+
+NONE: Same = (False, False, False, False)
 
 LEFT, RIGHT = (1, 2), (0, 3)
 """The front and the rear wheel of each side, in `WHEELS` order."""
@@ -90,17 +92,18 @@ class _Side:
             self.out, self.residual.learns = None, True
 
     def stands_still(
-        self, turned: Motors, same: list[bool], dt: float, count: float, slow: float, wish: float
+        self, turned: Motors, same: Same, dt: float, count: float, slow: float, wish: float
     ) -> bool:
-        """Whether a wheel is left out from now on: its speed stays while all else changes."""
+        """Whether a wheel is left out from now on: it turns, and its speed stays while all else
+        changes."""
         if self.out is not None:
             return False
-        front, rear = self.wheels
-        for i, (own, other) in enumerate(((front, rear), (rear, front))):
-            apart = 0.0
-            if same[own]:
+        for i, stuck in enumerate(self._stuck):
+            own, other = self.wheels[i], self.wheels[1 - i]
+            turns, apart = same[own] and turned[own] != 0.0, 0.0
+            if turns and stuck.left_by(wish):
                 apart = turned[other] - turned[own] * self.residual.stand_in(front=i == 1)
-            if self._stuck[i].says(same[own], apart, dt, count, slow, wish):
+            if stuck.says(turns, apart, dt, count, slow, wish):
                 self._leave_out(i, "stuck")
                 return True
         return False
@@ -182,16 +185,17 @@ class Witness:
             differ=(self._left.residual.ratio, self._right.residual.ratio),
         )
 
-    def believed(self, wheels: WheelSpeeds) -> WheelSpeeds:
+    def believed(self, wheels: Motors) -> Motors:
         """What four wheels say, rad or rad/s, with others in place of those that are left out."""
         if not self._leaves_out:
             return wheels
-        said = list(wheels.as_tuple())
+        said = list(wheels)
         for side in self._sides:
             if side.out is not None:
                 share = side.residual.stand_in(front=side.out == 0)
                 said[side.wheels[side.out]] = share * said[side.wheels[1 - side.out]]
-        return WheelSpeeds(*said)
+        front_right, front_left, rear_left, rear_right = said
+        return front_right, front_left, rear_left, rear_right
 
     def hear(
         self,
@@ -222,7 +226,12 @@ class Witness:
         left = self._left.residual.add(front_left, rear_left, keep, dt, count)
         right = self._right.residual.add(front_right, rear_right, keep, dt, count)
         last, self._last = self._last, speeds
-        same = list(map(eq, speeds.as_tuple(), last.as_tuple()))
+        same = (
+            speeds.front_right == last.front_right,
+            speeds.front_left == last.front_left,
+            speeds.rear_left == last.rear_left,
+            speeds.rear_right == last.rear_right,
+        )
         stood, self._stands = self._stands, True in same
         self._found = None
         if stood or self._stands:
@@ -244,19 +253,15 @@ class Witness:
         return self._found is not None
 
     def _standing(
-        self, turned: Motors, same: list[bool], dt: float, told: WheelSpeeds | None
+        self, turned: Motors, same: Same, dt: float, told: WheelSpeeds | None
     ) -> _Side | None:
         """The side of which a wheel is stuck, of wheels that turn."""
         if told is None:
             return None
-        found = None
-        turns = [one and angle != 0.0 for one, angle in zip(same, turned, strict=True)]
-        slow = self._slow_left, self._slow_right
-        wish = told.front_left, told.front_right
-        for side, slowly, command in zip(self._sides, slow, wish, strict=True):
-            if side.stands_still(turned, turns, dt, self._count, slowly, command):
-                found = side
-        return found
+        left, right, count = self._left, self._right, self._count
+        of_left = left.stands_still(turned, same, dt, count, self._slow_left, told.front_left)
+        of_right = right.stands_still(turned, same, dt, count, self._slow_right, told.front_right)
+        return right if of_right else left if of_left else None
 
     def lied(self, before: WheelSpeeds) -> bool:
         """Of the wheel that the last line has shown to lie: it may have lied in that line too."""
