@@ -92,6 +92,32 @@ def added(
     )
 
 
+def stepped(
+    p: PoseCovariance,
+    dx: float,
+    dy: float,
+    along: float,
+    yaw: float,
+    both: float,
+    c: float,
+    s: float,
+) -> PoseCovariance:
+    """`p` seen from `dx`, `dy` m further, and the noise of the step there.
+
+    What `carried` and `added` say one after the other, in one: each line takes a step.
+    """
+    xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
+    cc, cs = along * c, along * s
+    return PoseCovariance(
+        p.xx - 2 * dy * xyaw + dy * dy * yawyaw + cc * c,
+        p.xy + dx * xyaw - dy * yyaw - dx * dy * yawyaw + cc * s,
+        xyaw - dy * yawyaw + both * c,
+        p.yy + 2 * dx * yyaw + dx * dx * yawyaw + cs * s,
+        yyaw + dx * yawyaw + both * s,
+        yawyaw + yaw,
+    )
+
+
 def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
     """p + q"""
     return PoseCovariance(

@@ -31,6 +31,7 @@ from acsard.drive.se2 import (
     difference,
     plus,
     seen_from,
+    stepped,
     total,
 )
 from acsard.drive.second_order import SecondOrder
@@ -145,10 +146,11 @@ class PoseUncertainty:
             along, yaw, both = SLIPPING * along, SLIPPING * yaw, SLIPPING * both
         if variance is not None:
             yaw, both = variance, 0.0
-        self._p = added(carried(self._p, dx, dy), along, yaw, both, c, s)
+        self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
         if self._effects:
             self._bend(distance, turn, dx, dy, by_wheels=variance is None)
-        self._dx, self._dy = self._dx + dx, self._dy + dy
+        self._dx += dx
+        self._dy += dy
         self._rolled += abs(distance) + self._half * abs(turn)
         if self._rolled > STRETCH:
             self._end_stretch()
@@ -201,10 +203,13 @@ class PoseUncertainty:
 
     def _bend(self, distance: float, turn: float, dx: float, dy: float, by_wheels: bool) -> None:
         """F J + G_p; half of the step's own turn, as far as wheels tell it, has it as its lever."""
-        c, s, columns = self._cos, self._sin, []
+        c, s, columns, more = self._cos, self._sin, [], 0.0
+        # Of four columns at 100 Hz: names cost less than places in a tuple.
         for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
-            along = effect[0] * distance + effect[1] * turn
-            more = effect[2] * distance + effect[3] * turn if by_wheels else 0.0
+            of_distance, of_turn, turn_of_distance, turn_of_turn = effect
+            along = of_distance * distance + of_turn * turn
+            if by_wheels:
+                more = turn_of_distance * distance + turn_of_turn * turn
             lever = yaw + more / 2
             columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
         self._columns = columns
@@ -232,12 +237,17 @@ class PoseUncertainty:
         xx, xy, yy = p.xx + second.xx, p.xy + second.xy, p.yy + second.yy
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in self._columns:
-            xx, xy, xyaw = xx + x * x, xy + x * y, xyaw + x * yaw
-            yy, yyaw, yawyaw = yy + y * y, yyaw + y * yaw, yawyaw + yaw * yaw
+            xx += x * x
+            xy += x * y
+            xyaw += x * yaw
+            yy += y * y
+            yyaw += y * yaw
+            yawyaw += yaw * yaw
         published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)
         if self._counted:
-            published = added(published, *self._phase, self._cos, self._sin)
-        if max(xx, yy, yawyaw) >= MAX_VARIANCE:
+            along, turning, both = self._phase
+            published = added(published, along, turning, both, self._cos, self._sin)
+        if xx >= MAX_VARIANCE or yy >= MAX_VARIANCE or yawyaw >= MAX_VARIANCE:
             self._lost = True
             published = _capped(published)
         self.covariance = published
