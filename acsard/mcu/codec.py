@@ -90,9 +90,10 @@ class Codec:
         if match is None:
             raise FrameError("malformed", line)
         wheel: list[float | None] = [None] * 4
-        parts = match.groups()
-        for word, digits in zip(parts[::2], parts[1::2], strict=True):
-            index, sign = self._by_word[word]
+        a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
+        places = self._by_word
+        for word, digits in (a, of_a), (b, of_b), (c, of_c), (d, of_d):
+            index, sign = places[word]
             speed = float(digits)
             if speed > MAX_SPEED:
                 raise FrameError("over_range", line)

@@ -37,7 +37,7 @@ FULL_READ = 1024
 """Bytes that the port reads at once: behind so many there may be more."""
 
 
-class Feedback(Struct, frozen=True):
+class Feedback(Struct, frozen=True, gc=False):
     """One good line: its sample was made at `at`, `dt` s after the previous one's.
 
     After a gap `dt` is 0 (how the robot moved in it is unknown) and `gap` is its length in s.
@@ -126,8 +126,10 @@ class Timeline:
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """So many lines come of a read of `size` bytes, `following` of them behind the last."""
-        before = self._end_ns
-        end_ns = self._end_ns = max(before, at.mono_ns - wire_ns(following, self._baud_rate))
+        before, end_ns = self._end_ns, at.mono_ns
+        if following:
+            end_ns -= wire_ns(following, self._baud_rate)
+        end_ns = self._end_ns = max(before, end_ns)
         self._at, self._rest = at, lines
         self._share_ns = (end_ns - before) / lines
         habit, slots = self._habit, self._slots
@@ -159,7 +161,10 @@ class Timeline:
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
-        came_ns = max(self._at.mono_ns - wire_ns(following, self._baud_rate), self._heard_ns)
+        came_ns = self._at.mono_ns
+        if following:
+            came_ns -= wire_ns(following, self._baud_rate)
+        came_ns = max(came_ns, self._heard_ns)
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
         told = self._told_by(asked_ns, came_ns)
         dt, bridged = self._since_last(told)
@@ -199,14 +204,14 @@ class Timeline:
             answered = None
         if slots.period is None:
             return self._told_by_reads()
-        place, due_ns = slots.place(self._rest), min(slots.time_ns(self._rest), came_ns)
-        last = self._told
+        place, slot_ns, last = slots.place(self._rest), slots.time_ns(self._rest), self._told
+        due_ns = min(slot_ns, came_ns)
         if answered is not None:
-            self._compare(answered.due_ns - slots.time_ns(self._rest))
+            self._compare(answered.due_ns - slot_ns)
         if last.clock != "slots" or last.found != slots.found:
             return Told("slots", due_ns, place=place, found=slots.found)
-        passed = max(0.0, place - last.place)
-        missing = max(0.0, passed - 1.0)
+        passed = place - last.place if place > last.place else 0.0
+        missing = passed - 1.0 if passed > 1.0 else 0.0
         dt, bridged = passed * slots.period, missing * slots.period
         return Told("slots", due_ns, dt, bridged, place, slots.found)
 
@@ -220,11 +225,15 @@ class Timeline:
         no change of clocks adds up.
         """
         last = self._told
+        back = told.due_ns < last.due_ns
+        self._told = replace(told, due_ns=last.due_ns) if back else told
+        by_clock = told.dt if told.clock == last.clock else None
+        if by_clock is not None and not last.early:
+            return by_clock, told.bridged
         late_ns = self._late_ns(told.clock) - self._late_ns(last.clock)
         dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
-        self._told = replace(told, due_ns=max(told.due_ns, last.due_ns))
-        if told.dt is not None and told.clock == last.clock:
-            return dt if last.early else told.dt, told.bridged
+        if by_clock is not None:
+            return dt, told.bridged
         period = self._usual_ns / NS_PER_S
         missing = dt > 1.5 * period and self._habit.speaks is not False
         return dt, dt - period if missing else 0.0
@@ -247,8 +256,7 @@ class Timeline:
 
     def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
         """When the sample of a line was made: its own bytes were on the wire after that."""
-        late = max(0, came_ns - told.due_ns)
-        mono_ns = came_ns - late - wire_ns(length, self._baud_rate)
+        mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
         if last is not None and mono_ns < last.mono_ns + APART_NS:

@@ -31,7 +31,8 @@ class LineReader:
         after the line was complete, so they tell how long ago that was.
         """
         lines = []
-        *ends, rest = data.split(b"\n")
+        ends = data.split(b"\n")
+        rest = ends.pop()
         following = len(data)
         for piece in ends:
             following -= len(piece) + 1

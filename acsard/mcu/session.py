@@ -225,7 +225,8 @@ class McuSession:
     def _read(self, piece: Received) -> list[Feedback]:
         """The good lines of one read; of each line the timeline hears."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
-        if self.link != "up":
+        link = self._link
+        if link.state != "up":
             self._hearing.now.take(piece.data)
         if lines:
             timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
@@ -235,7 +236,7 @@ class McuSession:
                 timeline.spoilt()
             else:
                 feedback.append(got)
-            if self.link != "up":
+            if link.state != "up":
                 self._hearing.now.line(line, got is not None)
         return feedback
 
@@ -244,13 +245,14 @@ class McuSession:
             self._restart(f"has started: {line.decode('ascii', 'replace')}")
             return None
         check = self.negotiation
-        if check.asking and check.echoed(line):
+        asking = check.asking
+        if asking and check.echoed(line):
             self._reject("echo")
             self._link.missed()
             return None
         reading, asked_ns = None, None
         try:
-            if check.checked or (check.asking and b"#" in line):
+            if check.checked or (asking and b"#" in line):
                 reply = unseal(line)
                 speeds, reading = self.codec.decode(reply.plain), reply.reading
                 asked_ns = check.answered(reply, read_at.mono_ns)
@@ -260,7 +262,7 @@ class McuSession:
             self._reject(error.reason, text=f"{line[:60]!r}")
             self._bad()
             return None
-        if asked_ns is None and check.asking:
+        if asked_ns is None and asking:
             check.heard_plain()
             return None
         return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
