@@ -1,7 +1,7 @@
 """The nouns of acsard, in SI units; every other module speaks in these.
 
-What lives here: frozen values without behaviour beyond simple arithmetic on themselves.
-What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere in the host.
+What lives here: frozen values without behaviour beyond simple arithmetic on themselves (`gc=False`:
+they are in no cycle). What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ class AcsardError(Exception):
     """Base of the errors acsard raises on purpose; anything else that is raised is a bug."""
 
 
-class Instant(Struct, frozen=True):
+class Instant(Struct, frozen=True, gc=False):
     """One reading of both clocks: ages and periods use `mono_ns`, published stamps `wall_ns`."""
 
     mono_ns: int
     wall_ns: int
 
 
-class Twist(Struct, frozen=True):
+class Twist(Struct, frozen=True, gc=False):
     """Velocity of base_link in base_link: `linear` m/s along x, `angular` rad/s, left is +."""
 
     linear: float = 0.0
     angular: float = 0.0
 
 
-class Pose(Struct, frozen=True):
+class Pose(Struct, frozen=True, gc=False):
     """Planar pose of base_link in odom: `x`, `y` in m, `yaw` in rad within [-pi, pi]."""
 
     x: float = 0.0
@@ -51,7 +51,7 @@ class Pose(Struct, frozen=True):
     yaw: float = 0.0
 
 
-class WheelSpeeds(Struct, frozen=True):
+class WheelSpeeds(Struct, frozen=True, gc=False):
     """Angular velocity of each wheel in rad/s, positive when it drives the robot forward."""
 
     front_right: float = 0.0
@@ -68,7 +68,7 @@ REST = Twist()
 STILL = WheelSpeeds()
 
 
-class PoseCovariance(Struct, frozen=True):
+class PoseCovariance(Struct, frozen=True, gc=False):
     """Upper triangle of the covariance of (x, y, yaw) in odom: m2, m rad and rad2."""
 
     xx: float
@@ -79,7 +79,7 @@ class PoseCovariance(Struct, frozen=True):
     yawyaw: float
 
 
-class TwistVariances(Struct, frozen=True):
+class TwistVariances(Struct, frozen=True, gc=False):
     """Variances of one report in base_link: along x and y in m2/s2, of the turning in rad2/s2."""
 
     linear: float
@@ -197,7 +197,7 @@ class Event(Struct, frozen=True):
     """False for more of the same: that may wait for its second."""
 
 
-class Estimate(Struct, frozen=True):
+class Estimate(Struct, frozen=True, gc=False):
     """One feedback line folded into odometry; all its parts share the stamp `at`."""
 
     at: Instant

@@ -70,7 +70,7 @@ WORDS: dict[GyroDoes, str] = {
 }
 
 
-class Turn(Struct, frozen=True):
+class Turn(Struct, frozen=True, gc=False):
     """By how much the robot turned since the line before: rad, and its variance, rad2."""
 
     angle: float
@@ -212,8 +212,9 @@ class Gyro:
             span_ns = SILENT_NS if self._told_ns is None else time_ns - self._told_ns
             self._hole |= span_ns >= SILENT_NS
             self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
-            span = max(0, span_ns) / NS_PER_S if span_ns < SILENT_NS else 0.0
-            bias.drift(max(0, span_ns) / NS_PER_S)
+            passed = max(0, span_ns) / NS_PER_S
+            span = passed if span_ns < SILENT_NS else 0.0
+            bias.drift(passed)
             stands = resting and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
             self._noise = max(bias.noise, sample.variance)

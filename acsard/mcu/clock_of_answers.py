@@ -56,7 +56,7 @@ BATCH_NS = 2_000_000
 """A mean deviation that no MCU makes: an adapter holds the lines back."""
 
 
-class Answered(Struct, frozen=True):
+class Answered(Struct, frozen=True, gc=False):
     """How a reply's line is apart from that of the reply before it; None for a first one.
 
     In s; `bridged` of it are without a reply. `due_ns` is when the reply should be complete.
