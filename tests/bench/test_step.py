@@ -37,7 +37,7 @@ ROUNDS, SECONDS = 7, 10.0
 ALLOWED, STEP = 15.0, 63.0
 """us that a step may have grown by, and that it took before."""
 
-ASSERTED = 2.5
+ASSERTED = 2.0
 """Times the rest of the step that the parts may take, as they are."""
 
 ALL = Config(
