@@ -155,10 +155,8 @@ class Odometry:
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
         said, witness = speeds.as_tuple(), self._witness
         rolled = self._rolling.take(feedback, self.speeds)
-        if feedback.steps is not self._steps_of:
-            self._steps_of = feedback.steps
-            self._coarsest = max([one for one in feedback.steps if one < math.inf], default=0.0)
-        if feedback.counted is not None and feedback.steps is not self._steps_seen:
+        steps = feedback.steps
+        if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
             self._see(feedback)
         turn, by_wheels = None, 0.0
         if gyro is not None:
@@ -199,7 +197,13 @@ class Odometry:
         )
 
     def _see(self, line: Feedback) -> None:
-        """The counts that a line shows are the covariance's; all four, once every wheel turns."""
+        """How coarse its speeds are is the twist's covariance; the counts that it shows are the
+        pose's: all four, once every wheel turns."""
+        if line.steps is not self._steps_of:
+            self._steps_of = line.steps
+            self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
+        if line.counted is None or line.steps is self._steps_seen:
+            return
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
         self._uncertainty.show_count(count_of(line))

@@ -51,8 +51,8 @@ async def in_thread(
     thread = threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True)
     try:
         thread.start()
-    except RuntimeError:
-        raise TimeoutError("this process has no room for another thread") from None
+    except RuntimeError as error:
+        raise TimeoutError(f"this process has no room for another thread ({error})") from None
     try:
         # Not wait_for: before Python 3.12 it swallows a cancel that meets the result.
         async with asyncio.timeout(timeout):
