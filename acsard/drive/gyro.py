@@ -44,9 +44,6 @@ DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 LEAST_DELAY_S = 0.002
 """Less is not worth moving it for."""
 
-SCALE_VARIANCE = 1e-4
-"""rad2 per rad turned, for the gyro's scale: 1.4 degrees after a turn."""
-
 SLIP_S = 0.5
 """s after the last contradiction for which it slips on."""
 
@@ -71,7 +68,10 @@ WORDS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True):
-    """By how much the robot turned since the line before: rad, and its variance, rad2."""
+    """By how much the robot turned since the line before: rad, and its variance, rad2.
+
+    How far the gyro's scale is off is no part of that: it does not average out (`uncertainty.py`).
+    """
 
     angle: float
     variance: float
@@ -162,7 +162,6 @@ class Gyro:
         self._given, self._variance = self._angle + held, 0.0
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
-        variance += SCALE_VARIANCE * abs(angle)
         self.owes = False
         tried = not silent and dt > 0.0 and self._try(wheels, angle, variance, dt)
         if not silent and self._bias.known and dt > 0.0 and not self._trial.open:
