@@ -323,11 +323,10 @@ class Robot:
                 return "active"
             case "deactivate":
                 return life.deactivate()
-            case "reset_odometry":
-                self._odometry.set_pose(Pose())
-                return "pose is x 0, y 0, yaw 0"
-            case "set_pose":
+            case "set_pose" | "reset_odometry":
                 self._odometry.set_pose(request.pose or Pose())
+                if self._gyro is not None:
+                    self._gyro.forgive()
                 pose = self._odometry.pose
                 return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
             case "set":
