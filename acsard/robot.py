@@ -323,9 +323,7 @@ class Robot:
                 return "active"
             case "deactivate":
                 return life.deactivate()
-            case "reset_odometry":
-                return self._place(Pose())
-            case "set_pose":
+            case "set_pose" | "reset_odometry":
                 return self._place(request.pose or Pose())
             case "set":
                 return self._set(request.settings, now_ns)
@@ -334,6 +332,8 @@ class Robot:
         """It is there from now on; to the pose before nothing is owed."""
         self._odometry.set_pose(pose)
         self.session.snapping.forgive()
+        if self._gyro is not None:
+            self._gyro.forgive()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 

@@ -264,10 +264,10 @@ class RoutersStatus(Struct, frozen=True):
     """Those of the connected that are no routers, and hand on nothing."""
 
 
-class GyroSample(Struct, frozen=True):
+class GyroSample(Struct, frozen=True, omit_defaults=True):
     """What a gyro said: `rate` rad/s about base_link's z, left is +, and its `variance`, rad2/s2.
 
-    A variance of 0 is one that the gyro does not tell.
+    A variance of 0 is one that the gyro does not tell. `anew`: the first of another gyro.
     """
 
     at_ns: int
@@ -276,6 +276,7 @@ class GyroSample(Struct, frozen=True):
     """When it was measured by the sender's clock; None where that is not told."""
     rate: float
     variance: float = 0.0
+    anew: bool = False
 
 
 GyroDoes = Literal[
@@ -283,7 +284,6 @@ GyroDoes = Literal[
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
 """Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
-
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
 """Of the effective track that a gyro implies; the configured one is in use unless it is `used`."""

@@ -3,9 +3,9 @@
 Gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
 odometry in mobile robots, 1996): a gyro knows nothing of skidding wheels, wheels nothing of its
 bias. The bias is what it says at rest (`gyro_bias.py`), its delay and the track it implies come
-from comparing both (`gyro_match.py`). Its first turn is the wheels' until
-both agree, and then made up for: a gyro that says the opposite, degrees or nothing is named and not
-used (`gyro_trial.py`). Silent, or out of all proportion to the wheels, it leaves them alone.
+from comparing both (`gyro_match.py`). Until both have agreed in a turn the wheels tell every way,
+which is made up for then: a gyro that says the opposite, degrees or nothing is named and not used
+(`gyro_trial.py`). Silent, or out of all proportion to the wheels, it leaves them alone.
 
 What has been handed out is remembered and not the time: whatever came late or was held over for a
 moment is in the next line's turn, and no error of that kind adds up.
@@ -44,9 +44,6 @@ DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 LEAST_DELAY_S = 0.002
 """Less is not worth moving it for."""
 
-SCALE_VARIANCE = 1e-4
-"""rad2 per rad turned, for the gyro's scale: 1.4 degrees after a turn."""
-
 SLIP_S = 0.5
 """s after the last contradiction for which it slips on."""
 
@@ -71,7 +68,10 @@ WORDS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """By how much the robot turned since the line before: rad, and its variance, rad2."""
+    """By how much the robot turned since the line before: rad, and its variance, rad2.
+
+    How far the gyro's scale is off is no part of that: it does not average out (`uncertainty.py`).
+    """
 
     angle: float
     variance: float
@@ -98,6 +98,18 @@ class Gyro:
     """One gyro beside the wheels: `hear` its samples, then ask each line's `turn`."""
 
     def __init__(self) -> None:
+        self._rest_s = self._since_rest_s = 0.0
+        self._learned: Track | None = None
+        """What the gyro before this one taught."""
+        self.owes = False
+        """The wheels told the turn of the last line, until the trial ends."""
+        self._does: GyroDoes = "silent"
+        self.events: list[Event] = []
+        """What the last `turn` found worth a log line."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Of this gyro nothing is known, neither bias nor delay nor which way it turns."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples of times that no line has reached yet."""
@@ -111,18 +123,12 @@ class Gyro:
         """rad turned by all samples taken, and what of it was handed out."""
         self._variance = 0.0
         """rad2 of what was not handed out yet."""
-        self._rest_s = self._since_rest_s = self._slip_s = self._slipped_s = 0.0
+        self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the last sample."""
-        self._owed = self._owed_variance = 0.0
-        """rad by which it told more than the wheels while it was on trial: owed if it is proved."""
-        self.owes = False
-        """The wheels told the turn of the last line, until the trial ends."""
         self._hole = False
-        """Since the last line some of the turn was not heard."""
-        self._does: GyroDoes = "silent"
-        self.events: list[Event] = []
-        """What the last `turn` found worth a log line."""
+        """Since the last line, or in it, some of the turn was not heard."""
+        self.forgive()
 
     @property
     def status(self) -> GyroStatus:
@@ -136,12 +142,15 @@ class Gyro:
         """The effective track it implies; None until it has turned with the wheels for a while."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
-            return None
+            return self._learned
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
         """What came since the last step, in order."""
         for sample in samples:
+            if sample.anew:
+                self._learned = self.learned  # the wheels' and the floor's, whoever told it
+                self._begin()
             self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
 
@@ -151,33 +160,38 @@ class Gyro:
         `wheels` rad over `dt` s is what they say; `still` that all four stood. After a gap `dt` is
         0 and the turn is all that came about in it.
         """
-        self.events = []
+        self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
         resting = self._rest_s > REST_S
         self._take(at_ns, resting)
         ahead = SILENT_NS if self._told_ns is None else at_ns - self._told_ns
-        silent = ahead >= SILENT_NS
+        silent = ahead - max(0, self._delay_ns) >= SILENT_NS
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
+        # What is heard of a silence only after it the wheels have told: the line after is theirs.
+        lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
-        variance += SCALE_VARIANCE * abs(angle)
-        self.owes = False
-        tried = not silent and dt > 0.0 and self._try(wheels, angle, variance, dt)
-        if not silent and self._bias.known and dt > 0.0 and not self._trial.open:
+        tried = False if lost else self._try(wheels, angle, variance, dt, resting)
+        if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
         if resting:
             self._shift()
         self._judge(silent)
-        hole, self._hole = self._hole, False
-        if hole or tried or self._does not in ("used", "disagrees"):
+        if lost or tried or self._does not in ("used", "disagrees"):
             return None
         rolled = angle / max(PROPORTIONS[0], self._match.ratio)
-        angle, variance = angle + self._owed, variance + self._owed_variance
-        self._owed = self._owed_variance = 0.0
+        if not self._trial.open:
+            angle, variance = angle + self._owed, variance + self._owed_variance
+            self.forgive()
         noise = self._noise + self._bias.variance
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
+
+    def forgive(self) -> None:
+        """Owe nothing: the pose was set, and what it was before is of no account."""
+        self._owed = self._owed_variance = 0.0
+        """rad by which it told more than the wheels while it was on trial: owed if it is proved."""
 
     def taken_back(self, turn: float) -> float:
         """Of lines that it `owes`, the wheels' turn has become another one, by so many rad.
@@ -224,14 +238,16 @@ class Gyro:
 
     # beside the wheels
 
-    def _try(self, wheels: float, angle: float, variance: float, dt: float) -> bool:
-        """Until a turn has proved it: whether this line is one that the wheels tell."""
+    def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
+        """Until a turn has proved it: whether this line is one that the wheels tell.
+
+        That is every one but at rest, where they would not see that somebody turns the robot.
+        """
         trial, known = self._trial, self._bias.known
-        if not trial.open:
+        if not trial.open or resting:
             return False
-        if not trial.add(wheels, angle, dt, known):
-            # In degrees it is a turn already where the wheels only begin one.
-            return wheels != 0.0 and abs(angle) > PROPORTIONS[1] * abs(wheels)
+        if dt > 0.0:
+            trial.add(wheels, angle, dt, known)
         if not trial.open:
             return False
         if known and trial.verdict == "none yet":
@@ -239,7 +255,7 @@ class Gyro:
             self._owed_variance += variance
             self.owes = True
         else:
-            self._owed = self._owed_variance = 0.0
+            self.forgive()
         return True
 
     def _compare(self, wheels: float, angle: float, dt: float) -> None:

@@ -11,7 +11,12 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""rad/s by the wheels; slower turns tell nothing."""
+"""rad/s by the wheels, from which on a line to the other side is another turn, and no count more or
+less."""
+
+SLOWEST, STRETCH_S = 0.05, 0.5
+"""rad/s by the wheels, in the mean over so many s; slower is no turn: of unequal tyres the wheels
+say one on a straight."""
 
 PROPORTIONS = (0.25, 2.5)
 """Between these a robot turns per turn of its wheels, whatever it skids."""
@@ -34,28 +39,37 @@ class Trial:
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
+        self._stretch = self._stretch_s = 0.0
+        """rad by the wheels, and s, of this stretch."""
 
     @property
     def open(self) -> bool:
         """It has not proved itself."""
         return self.verdict != "good"
 
-    def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> bool:
-        """A line: rad that wheels and gyro say it turned in its `dt` s; whether it is a turn.
+    def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
+        """A line: rad that wheels and gyro say it turned in its `dt` s.
 
         Without a certain bias it is only seen that it tells degrees.
         """
-        if abs(wheels) < LEAST_RATE * dt or wheels * self._wheels < 0.0:
+        self._stretch += wheels
+        self._stretch_s += dt
+        if self._stretch_s >= STRETCH_S:
+            if abs(self._stretch) < SLOWEST * self._stretch_s:
+                self._wheels = self._gyro = self._seconds = 0.0
+            self._stretch = self._stretch_s = 0.0
+        if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
             # Of a turn to the other side a late gyro still tells the one before.
             self._wheels = self._gyro = self._seconds = 0.0
-            return abs(wheels) >= LEAST_RATE * dt
+            return
         self._wheels += wheels
         self._gyro += gyro
-        self._seconds += dt
+        self._seconds += dt if abs(wheels) >= SLOWEST * dt else 0.0
+        if self._wheels == 0.0:
+            return
         verdict = self._verdict(self._gyro / self._wheels)
         if verdict != "none yet" and (certain or verdict == "in degrees"):
             self.verdict = verdict
-        return True
 
     def _verdict(self, ratio: float) -> Verdict:
         least, most = PROPORTIONS

@@ -48,6 +48,10 @@ SAME_COUNT = 0.02
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
+GYRO_SCALE = 0.004
+"""Standard deviation of a gyro's scale, as a share: 1.4 degrees after a turn, 29 after twenty to
+the same side, and none once they are turned back."""
+
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
 STRETCH = 0.2
@@ -80,8 +84,8 @@ class PoseUncertainty:
     def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
         """By these columns from now on, as many as before, and by wheels that are `track` m apart;
         what they did until now stays."""
-        of_gaps = self._effects[len(self._parameters) :]
-        self._effects = (*parameters, *of_gaps)
+        beside = self._effects[len(self._parameters) :]
+        self._effects = (*parameters, *beside)
         self._parameters = parameters
         self._track, self._half = track, track / 2
         self._noise = Noise(self._odometry, track)
@@ -102,7 +106,9 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """J, column by column; the last is what it may have gone on by in gaps, once there are."""
+        """J, column by column; behind the parameters' come those that are only once they err."""
+        self._of_gyro = self._of_gaps = -1
+        """Which of them has the turns that a gyro told, and which what went on in gaps."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -129,13 +135,13 @@ class PoseUncertainty:
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None, slips: bool = False,
+        variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
     ) -> None:  # fmt: skip
         """An arc of `distance` m through `turn` rad has moved the robot by `dx`, `dy` m in odom.
 
         `heading` is that of its chord. `variance` is that of the turn, rad2, where it is not the
-        wheels that tell it: then their parameters bend the distance only. `slips` says that the
-        wheels do.
+        wheels that tell it but a gyro: then their parameters bend the distance only, and its
+        `scale`, so uncertain, the turn. `slips` says that the wheels do.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -147,8 +153,10 @@ class PoseUncertainty:
         if variance is not None:
             yaw, both = variance, 0.0
         self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
+        if variance is not None and scale and self._of_gyro < 0:
+            self._of_gyro = self._widen()
         if self._effects:
-            self._bend(distance, turn, dx, dy, by_wheels=variance is None)
+            self._bend(distance, turn, dx, dy, None if variance is None else scale)
         self._dx += dx
         self._dy += dy
         self._rolled += abs(distance) + self._half * abs(turn)
@@ -172,19 +180,25 @@ class PoseUncertainty:
             self._forget_where(distance, turn)
             return
         c, s = self._cos, self._sin
-        if len(self._effects) == len(self._parameters):
-            self._effects = (*self._parameters, NO_EFFECT)
-            self._columns = [*self._columns, ORIGIN]
-            self._columns_before = [*self._columns_before, ORIGIN]
-            self._second.widen()
-        gone_on = plus(self._columns[-1], (c * distance, s * distance, turn))
-        self._columns = [*self._columns[:-1], gone_on]
+        if self._of_gaps < 0:
+            self._of_gaps = self._widen()
+        self._columns = [*self._columns]
+        gone_on = plus(self._columns[self._of_gaps], (c * distance, s * distance, turn))
+        self._columns[self._of_gaps] = gone_on
         # An unknown arc leads to any side.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
         way_along, way_yaw, both = self._noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
         self._p = added(p, aside, 0.0, 0.0, -s, c)
         self._publish()
+
+    def _widen(self) -> int:
+        """One column more, of which nothing has come so far; which it is."""
+        self._effects = (*self._effects, NO_EFFECT)
+        self._columns = [*self._columns, ORIGIN]
+        self._columns_before = [*self._columns_before, ORIGIN]
+        self._second.widen()
+        return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
         """Who moves without a known heading, or place, knows neither."""
@@ -201,15 +215,22 @@ class PoseUncertainty:
         self._middle += math.copysign(beyond, off)
         return beyond
 
-    def _bend(self, distance: float, turn: float, dx: float, dy: float, by_wheels: bool) -> None:
-        """F J + G_p; half of the step's own turn, as far as wheels tell it, has it as its lever."""
+    def _bend(
+        self, distance: float, turn: float, dx: float, dy: float, scale: float | None
+    ) -> None:
+        """F J + G_p; half of what the step itself errs by in its turn has it as its lever.
+
+        `scale` is the gyro's that tells the turn; None is that the wheels do.
+        """
         c, s, columns, more = self._cos, self._sin, [], 0.0
         # Of four columns at 100 Hz: names cost less than places in a tuple.
         for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
             of_distance, of_turn, turn_of_distance, turn_of_turn = effect
             along = of_distance * distance + of_turn * turn
-            if by_wheels:
+            if scale is None:
                 more = turn_of_distance * distance + turn_of_turn * turn
+            else:
+                more = scale * turn if len(columns) == self._of_gyro else 0.0
             lever = yaw + more / 2
             columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
         self._columns = columns

@@ -260,7 +260,8 @@ def _driven(
     rolled = turned = 0.0
     for step in cycle(steps):
         dx, dy, heading = path.advance(step.distance, step.turn)
-        pose.advance(step.distance, step.turn, dx, dy, heading, step.by_gyro)
+        # What is odometry's for its gyro's scale is measured with the rest, if that is asked for.
+        pose.advance(step.distance, step.turn, dx, dy, heading, step.by_gyro, scale=0.0)
         if step.along or step.yaw:
             pose.doubt(step.along, step.yaw)
         if step.stood is not None:

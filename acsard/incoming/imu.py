@@ -2,7 +2,7 @@
 
 A sensor_msgs/Imu in any encoding; of JSON and msgpack only `angular_velocity` is required. Its z
 points up: a turn to the left is positive. Of several that send the first is followed, and another
-one once that is silent: two gyros have two biases.
+one once that is silent: two gyros have two biases, so that its first sample is marked.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import MutableMapping
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, sender
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
@@ -62,18 +63,20 @@ class ImuTold:
         """The sample; None for one that is refused, which is counted and told by its reason."""
         try:
             sample = reading(arrival)
-            self._follow(sender(arrival), arrival.arrived_ns)
+            anew = self._follow(sender(arrival), arrival.arrived_ns)
         except DecodeError as error:
             counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
             events.append(Event("imu_refused", str(error), "warning", kind=error.reason))
             return None
-        return sample
+        return replace(sample, anew=True) if anew else sample
 
-    def _follow(self, who: str, now_ns: int) -> None:
+    def _follow(self, who: str, now_ns: int) -> bool:
+        """Whether another one was followed until now."""
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
             raise DecodeError("second_sender", f"{who[:MOST_WHO]} sends beside {self._followed}")
-        self._followed, self._heard_ns = who, now_ns
+        before, self._followed, self._heard_ns = self._followed, who, now_ns
+        return other and before != ""
 
 
 def reading(arrival: Arrival) -> GyroSample:

@@ -133,6 +133,24 @@ def test_a_gyro_that_dies_is_told_and_the_wheels_go_on() -> None:
     assert told == ["waiting for rest", "used", "silent", "used"]
 
 
+@pytest.mark.parametrize(
+    ("verb", "pose"), [("reset_odometry", b""), ("set_pose", b'{"x": 1.0, "y": 0.0, "yaw": 1.0}')]
+)
+def test_where_the_pose_is_set_what_the_wheels_told_before_is_of_no_account(
+    verb: str, pose: bytes
+) -> None:
+    made = world()
+    made.drive(0.0, 0.25, 0.3)
+    made.drive(0.0, 0.0, 0.5)
+    assert made.state.yaw - made.mcu.vehicle.turned > 0.02
+    made.call(verb, pose)
+    drive = Drive(made)
+    drive.hold(0.0, 0.5, 2.0)
+    drive.hold(0.0, 0.0, 1.0)
+    assert made.state.gyro == "used"
+    assert drive.told == pytest.approx(drive.all, abs=0.005)
+
+
 @pytest.mark.slow
 def test_wheels_that_lose_their_grip_are_told() -> None:
     made = world()

@@ -8,8 +8,9 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.drive.gyro import SILENT_NS, WORDS, Gyro
+from acsard.drive.gyro import SILENT_NS, WORDS, Gyro, Turn
 from acsard.drive.learned_track import LEAST
 from acsard.sim.noise import gauss
 from acsard.values import NS_PER_S, GyroDoes, GyroSample
@@ -47,9 +48,13 @@ class Bench:
         self.none = 0
         self.silent = False
         self.does: list[GyroDoes] = []
+        self.other = False
+        """The next sample is the first of another sender."""
         self._sampled_ns, self._sampled = self.now_ns, 0.0
         self._samples = first
         self._way: list[GyroSample] = []
+        self.held_back_ns = 0
+        """Until then no sample arrives; all that waited come then."""
 
     def run(
         self,
@@ -66,8 +71,13 @@ class Bench:
                 self.now_ns += LINE_NS // 10
                 self.true += now * DT / 10
                 self._sample()
-            heard = tuple(one for one in self._way if one.at_ns <= self.now_ns)
-            self._way = [one for one in self._way if one.at_ns > self.now_ns]
+            heard: tuple[GyroSample, ...] = ()
+            if self.now_ns > self.held_back_ns:
+                heard = tuple(one for one in self._way if one.at_ns <= self.now_ns)
+                heard = tuple(
+                    replace(one, at_ns=max(one.at_ns, self.held_back_ns)) for one in heard
+                )
+                self._way = [one for one in self._way if one.at_ns > self.now_ns]
             self.gyro.hear(heard)
             wheels = now * (self.skid if skid is None else skid) * DT
             stands = now == 0.0 if still is None else still
@@ -86,7 +96,8 @@ class Bench:
         at_ns = self.now_ns + self.late_ns
         stamp_ns = self.now_ns + 10**18 if self.stamped else None
         if not self.silent:
-            self._way.append(GyroSample(at_ns, stamp_ns, said))
+            self._way.append(GyroSample(at_ns, stamp_ns, said, anew=self.other))
+            self.other = False
         self._sampled_ns, self._sampled, self._samples = self.now_ns, self.true, self._samples + 1
 
     def says(self) -> GyroDoes:
@@ -95,6 +106,17 @@ class Bench:
 
 def stirring(t: float) -> float:
     return 0.8 * math.sin(1.3 * t) + 0.5 * math.sin(3.1 * t + 1.0) + 1e-3
+
+
+def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
+    """No line for so long, then one that knows nothing of it."""
+    for _ in range(round(seconds / DT)):
+        bench.now_ns += LINE_NS
+        bench.true += rate * DT
+        bench._sample()
+    bench.gyro.hear(tuple(bench._way))
+    bench._way = []
+    return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
 
 
 # used
@@ -146,6 +168,8 @@ def test_in_the_end_the_turn_is_whole_however_late_it_came(
 ) -> None:
     bench = Bench(late_ms=late_ms)
     bench.run(REST_FIRST)
+    bench.run(0.5, 1.0)
+    bench.run(1.0)
     for rate in rates:
         bench.run(0.5, rate)
     bench.run(1.0)
@@ -156,13 +180,7 @@ def test_a_gap_in_the_wheels_lines_is_no_gap_in_the_turn() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
-    for _ in range(30):
-        bench.now_ns += LINE_NS
-        bench.true += 0.5 * DT
-        bench._sample()
-    bench.gyro.hear(tuple(bench._way))
-    bench._way = []
-    turn = bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
+    turn = over_a_gap(bench, 0.3, 0.5)
     assert turn is not None
     assert turn.angle == pytest.approx(0.15, abs=1e-6)
 
@@ -223,6 +241,35 @@ def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> No
     assert bench.does == ["waiting for rest", "used", "silent", "used"]
 
 
+@pytest.mark.parametrize("back_ms", [150, 210, 230, 290, 400])
+@pytest.mark.parametrize("rate", [1.0, -2.0])
+def test_what_was_told_of_a_silence_is_not_told_again(back_ms: int, rate: float) -> None:
+    bench = Bench(stamped=True, skid=1.0)
+    bench.run(REST_FIRST)
+    bench.run(1.0, rate)
+    bench.held_back_ns = bench.now_ns + back_ms * MS
+    bench.run(2.0, rate)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=0.01 * abs(rate))
+
+
+@pytest.mark.parametrize("late_ms", [150, 250])
+def test_one_that_is_late_is_not_silent(late_ms: int) -> None:
+    bench = Bench(late_ms=late_ms, sample_ms=100)
+    bench.run(REST_FIRST)
+    for _ in range(5):
+        bench.run(math.tau, lambda t: 0.6 * math.sin(t))
+        bench.run(1.0)
+    assert bench.gyro.status.delay == pytest.approx(late_ms / 1000, abs=0.08)
+    bench.does.clear()
+    none, begun, true = bench.none, bench.told, bench.true
+    bench.run(5.0, 0.5)
+    bench.run(1.0)
+    assert bench.none == none
+    assert "silent" not in bench.does
+    assert bench.told - begun == pytest.approx(bench.true - true, abs=0.03)
+
+
 def test_for_a_moment_without_samples_it_turns_on_as_it_did() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
@@ -258,6 +305,71 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
     assert bench.none - none == 500
 
 
+@pytest.mark.parametrize(("sign", "named"), [(-1.0, "reversed"), (0.0, "dead")])
+@pytest.mark.parametrize("rate", [0.02, 0.05])
+def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
+    sign: float, named: GyroDoes, rate: float
+) -> None:
+    bench = Bench(sign=sign)
+    bench.run(REST_FIRST)
+    bench.run(60.0, rate)
+    assert bench.told == pytest.approx(60.0 * rate * 1.6)
+    assert (bench.says() == named) == (rate == 0.05)
+    bench.run(1.0)
+    assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it owed at rest"
+
+
+def test_a_slow_turn_proves_a_gyro_and_what_it_had_to_say_is_made_up_for() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(5.0, 0.02)
+    assert bench.told == pytest.approx(bench.true * 1.6)
+    bench.run(5.0, 0.05)
+    assert bench.told == pytest.approx(bench.true, abs=1e-3)
+
+
+def test_a_gap_on_trial_is_the_wheels_until_the_gyro_is_proved() -> None:
+    reversed_one = Bench(sign=-1.0)
+    reversed_one.run(REST_FIRST)
+    assert over_a_gap(reversed_one, 0.3, 0.5) is None
+    bench = Bench()
+    bench.run(REST_FIRST)
+    assert over_a_gap(bench, 0.3, 0.5) is None
+    bench.run(1.0, 0.5)
+    assert bench.told == pytest.approx(bench.true, abs=1e-3)
+
+
+def test_where_the_pose_is_set_it_owes_nothing_of_what_was_before() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(0.1, 0.5)
+    assert bench.gyro.owes
+    bench.gyro.forgive()
+    begun, true = bench.told, bench.true
+    bench.run(1.0, 0.5)
+    assert bench.says() == "used"
+    assert bench.told - begun == pytest.approx(bench.true - true, abs=1e-6)
+
+
+def test_another_gyro_stands_first_and_proves_itself() -> None:
+    bench = Bench(bias=0.05)
+    bench.run(REST_FIRST)
+    bench.run(20.0, stirring)
+    bench.run(1.0)
+    learned = bench.gyro.learned
+    assert learned is not None
+    bench.bias, bench.sign, bench.other = -0.1, -1.0, True
+    bench.does.clear()
+    begun, true = bench.told, bench.true
+    bench.run(1.0, 0.5)
+    assert bench.told - begun == pytest.approx((bench.true - true) * 1.6)
+    assert bench.gyro.status.bias is None
+    assert bench.gyro.learned == learned, "of the floor, whoever told it"
+    bench.run(REST_FIRST)
+    bench.run(2.0, 0.5)
+    assert bench.does == ["waiting for rest", "used", "reversed"]
+
+
 def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
     bench = Bench(skid=1.7)
     bench.run(REST_FIRST)
@@ -290,6 +402,8 @@ def test_its_variance_is_that_of_its_errors() -> None:
     squares = []
     for seed in range(60):
         bench = Bench(noise=0.02, bias=0.01, first=10_000 * seed)
+        bench.run(2.0)
+        bench.run(0.5, 0.5)
         bench.run(2.0)
         bench.told = bench.variance = 0.0
         bench.run(10.0, still=False)

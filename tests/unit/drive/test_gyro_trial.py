@@ -61,16 +61,37 @@ def test_one_that_was_refuted_may_still_prove_itself() -> None:
 
 def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
     trial = Trial()
-    assert turned(trial, 0.05, -1.0, 60.0) == "none yet"
+    assert turned(trial, 0.04, -1.0, 60.0) == "none yet"
     for _ in range(10):
         turned(trial, 1.0, 0.0, 0.09)
         turned(trial, -1.0, 0.0, 0.09)
     assert trial.verdict == "none yet"
 
 
+@pytest.mark.parametrize(("share", "verdict"), [(0.6, "good"), (-0.6, "reversed"), (0.0, "dead")])
+def test_slow_lines_add_up_to_a_verdict(share: float, verdict: Verdict) -> None:
+    assert turned(Trial(), 0.08, share, 6.0) == verdict
+
+
+def test_a_straight_between_two_turns_begins_anew() -> None:
+    trial = Trial()
+    for _ in range(20):
+        turned(trial, 1.0, 0.0, 0.09)
+        turned(trial, 0.01, 0.0, 1.1)
+    assert trial.verdict == "none yet"
+
+
+def test_to_stand_is_no_turning() -> None:
+    """A late one has told nothing yet, however long it stood before."""
+    trial = Trial()
+    turned(trial, 1.0, 0.0, 0.05)
+    turned(trial, 0.0, 0.0, 0.4)
+    assert turned(trial, 4.0, 0.0, 0.1) == "none yet"
+
+
 def test_without_a_bias_degrees_are_seen_and_nothing_else() -> None:
     for share, verdict in ((57.3, "in degrees"), (-1.0, "none yet"), (1.0, "none yet")):
         trial = Trial()
         for _ in range(100):
-            assert trial.add(DT, share * DT, DT, certain=False)
+            trial.add(DT, share * DT, DT, certain=False)
         assert trial.verdict == verdict

@@ -13,6 +13,7 @@ from acsard.config.settings import DriveConfig, OdometryConfig
 from acsard.drive.gyro import Gyro, Turn
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.odometry import Odometry
+from acsard.drive.uncertainty import GYRO_SCALE
 from acsard.mcu.feedback import Feedback
 from acsard.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
 
@@ -106,7 +107,9 @@ def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
 class Turning:
     """A robot with a true gyro: it stands for a second, then does as told."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float = 1.0) -> None:
+        """Its gyro says `scale` times as much."""
+        self.scale = scale
         self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
         self.does: list[str] = []
@@ -126,11 +129,12 @@ class Turning:
             rate = before + (twist.angular - before) * share
             self.true += (rate + self.rate) / 200 if gap else rate / 100
             self.rate = rate
-            self.gyro.hear((GyroSample(self.now_ns, None, rate),))
+            self.gyro.hear((GyroSample(self.now_ns, None, rate * self.scale),))
             if gap and number < lines:
                 continue
             at = Instant(self.now_ns, self.now_ns)
-            self.robot.fold(Feedback(at, speeds, dt, bridged=bridged), self.gyro, told)
+            line = Feedback(at, speeds, dt, bridged=bridged)
+            self.yaw_variance = self.robot.fold(line, self.gyro, told).covariance.yawyaw
             self.does += [event.kind for event in self.gyro.events]
 
     @property
@@ -171,3 +175,33 @@ def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
     bench.run(2.0, Twist(ahead, turning), dead=True)
     assert bench.gyro.status.does == "used"
     assert bench.off == pytest.approx(0.0, abs=2e-3)
+
+
+def proved(scale: float) -> Turning:
+    """One that tells the turns from now on."""
+    bench = Turning(scale)
+    bench.run(0.5, Twist(0.0, 1.0))
+    bench.run(1.0, Twist())
+    assert bench.gyro.status.does == "used"
+    return bench
+
+
+@pytest.mark.parametrize("turns", [2, 20])
+def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
+    bench = proved(1 + GYRO_SCALE)
+    off, variance = bench.off, bench.yaw_variance
+    bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
+    bench.run(1.0, Twist())
+    off, variance = bench.off - off, bench.yaw_variance - variance
+    assert off == pytest.approx(GYRO_SCALE * turns * math.tau, rel=0.05)
+    assert off**2 / variance == pytest.approx(1.0, rel=0.25)
+
+
+def test_the_error_of_a_gyros_scale_is_turned_back() -> None:
+    bench = proved(1 + GYRO_SCALE)
+    off, variance = bench.off, bench.yaw_variance
+    for rate in (2.0, -2.0):
+        bench.run(10.0, Twist(0.0, rate))
+    bench.run(1.0, Twist())
+    assert bench.off == pytest.approx(off, abs=0.01)
+    assert bench.yaw_variance - variance < (GYRO_SCALE * 20.0) ** 2 / 20

@@ -16,7 +16,7 @@ from acsard.config.settings import DriveConfig, McuConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.learned_track import CONFIGURED, Track
 from acsard.drive.odometry import Odometry
-from acsard.drive.uncertainty import PoseUncertainty
+from acsard.drive.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.mcu.feedback import Feedback
 from acsard.mcu.session import McuSession
 from acsard.values import Instant, Received, WheelSpeeds
@@ -317,3 +317,26 @@ def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
     assert turned(0.5)[1] == pytest.approx(0.05**2 + (0.02 * 1.5 / 1.6) ** 2)
     robot.turn_by(CONFIGURED)
     assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)
+
+
+def test_what_a_gyro_and_what_gaps_make_wrong_is_kept_apart_whichever_came_first() -> None:
+    gaps_first, gyro_first = uncertainty(), uncertainty()
+    before = gyro_first.covariance.yawyaw
+    gaps_first.stand(0.0, 0.0, 0.0, 0.0)
+    for one in (gaps_first, gyro_first):
+        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        one.stand(0.0, 0.2, 0.0, 0.0)
+        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        one.stand(0.0, -0.2, 0.0, 0.0)
+    of_skidding = 0.4 * DEFAULT.skid
+    for one in (gaps_first, gyro_first):
+        grown = one.covariance.yawyaw - before
+        assert grown == pytest.approx((20.0 * GYRO_SCALE) ** 2 + of_skidding, rel=0.01)
+
+
+def test_wheels_that_tell_a_turn_bend_nothing_by_a_gyros_scale() -> None:
+    one, plain_one = uncertainty(), uncertainty()
+    one.advance(0.0, 0.0, 0.0, 0.0, 0.0, variance=0.0)
+    for each in (one, plain_one):
+        each.advance(0.0, 10.0, 0.0, 0.0, 0.0)
+    assert one.covariance == plain_one.covariance

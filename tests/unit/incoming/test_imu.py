@@ -125,6 +125,23 @@ def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
     assert not daemon.hears(0.1, 2 * FOLLOWED_NS + 1, "one")
 
 
+def test_the_first_sample_of_another_gyro_says_that_it_is_one() -> None:
+    told, anew = ImuTold(), []
+    heard = [(0, "one"), (1, "one"), (FOLLOWED_NS + 1, "other"), (FOLLOWED_NS + 2, "other")]
+    for at_ns, who in heard:
+        sample = told.hear(turning(0.1, at_ns, who), Counter(), [])
+        assert sample is not None
+        anew.append(sample.anew)
+    assert anew == [False, False, True, False]
+
+
+def test_who_comes_back_after_a_silence_is_no_other() -> None:
+    told = ImuTold()
+    for at_ns in (0, 10 * FOLLOWED_NS):
+        sample = told.hear(turning(0.1, at_ns, "one"), Counter(), [])
+        assert sample == GyroSample(at_ns, None, 0.1)
+
+
 def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
     counters, events = Counter[str](), list[Event]()
     told = ImuTold(own=True)
