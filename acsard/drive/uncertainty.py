@@ -222,7 +222,8 @@ class PoseUncertainty:
 
         `scale` is the gyro's that tells the turn; None is that the wheels do.
         """
-        c, s, columns, more = self._cos, self._sin, [], 0.0
+        c, s, more = self._cos, self._sin, 0.0
+        columns: list[Vector] = []
         # Of four columns at 100 Hz: names cost less than places in a tuple.
         for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
             of_distance, of_turn, turn_of_distance, turn_of_turn = effect
