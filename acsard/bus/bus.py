@@ -137,11 +137,13 @@ class ZenohBus:
                 f"another daemon on this bus already is {self._id}; "
                 "give this robot its own robot.id"
             )
-        if seen:
+        ways = [way for way in ("bridge", "rmw") if any(f"/@ros/{way}/" in one for one in seen)]
+        if ways:
+            off = " and ".join(f"ros.{way} = false" for way in ways)
             return (
                 f'another robot on this bus already has ros.namespace = "{self._ros.namespace}": '
-                "one cmd_vel of ROS would drive both; give this robot its own, in [ros] namespace "
-                "or by `acsard run --namespace NAME`, or no ROS (ros.bridge, ros.rmw = false)"
+                f"one cmd_vel of ROS, by {' or '.join(ways)}, would drive both; give this robot "
+                f"its own, in [ros] namespace or by `acsard run --namespace NAME`, or {off}"
             )
         return ""
 

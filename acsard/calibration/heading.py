@@ -155,6 +155,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
     kept = samples[off <= max(OUTLIER * float(np.median(off)), 1.01 * step)]
+    kept = kept if len(kept) >= LEAST_SAMPLES else samples
     parts = [float(part.mean()) for part in np.array_split(kept, LEAST_SAMPLES)]
     few = step**2 / 12 if len(np.unique(kept)) <= 2 else 0.0
     return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few

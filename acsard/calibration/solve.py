@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from acsard.calibration import fit as fitting
 from acsard.calibration import heading, places, turning
 from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
-from acsard.calibration.evidence import DRIFT, LATE, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.evidence import DRIFT, LATE, LEFT, RATE, RIGHT, STRETCH, TURN, Base
 from acsard.calibration.excitation import DRIVE, sure_enough, told_apart, turns_enough
 from acsard.calibration.fit import Fit, fit
 from acsard.calibration.gain import Gain, gain, seen_by_places
@@ -131,11 +131,11 @@ def _calibration(
     told_apart(fitted.apart())
     by_wheels = turning.turned(rows, base, fitted.parameters)
     bias = headings.bias if headings is not None else 0.0
-    drift = float(fitted.parameters[DRIFT])
+    drift, scale_of_gyro = float(fitted.parameters[DRIFT]), 1 + float(fitted.parameters[STRETCH])
     if headings is not None and headings.drifts:
-        drift = turning.bias(rows, by_wheels)
+        drift = turning.bias(rows, by_wheels * scale_of_gyro)
     bias += drift
-    rows = replace(rows, turned=rows.turned - drift * rows.seconds)
+    rows = replace(rows, turned=(rows.turned - drift * rows.seconds) / scale_of_gyro)
     rate, truth = rates(rows, by_wheels), rows.turned
     if headings is None:
         turns_enough(by_wheels)

@@ -20,6 +20,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     add_config(parser)
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
+    parser.add_argument("--namespace", metavar="NAME", help="its namespace in ROS")
     parser.add_argument(
         "--held", action="store_true", help="end with standard input; so `acsard run` starts it"
     )
@@ -36,7 +37,10 @@ def main(args: argparse.Namespace) -> int:
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 
-    where, config = load(args.config, {"robot": {"id": args.id}} if args.id else {})
+    given: dict[str, dict[str, object]] = {"robot": {"id": args.id}} if args.id else {}
+    if args.namespace is not None:
+        given["ros"] = {"namespace": args.namespace}
+    where, config = load(args.config, given)
     if not config.bus.outside:
         raise ExitError(
             Exit.USAGE, f"{where} has no tls/ endpoint in bus.listen; `acsard lan init --write`"

@@ -117,6 +117,7 @@ def main(args: argparse.Namespace) -> int:
             log.event(Event("configuration", text, "warning"))
 
     door = ["door", *(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
+    door += ["--namespace", config.ros.namespace]
     # The watchdog ends a daemon that hangs by SIGABRT: where it hung goes to standard error.
     if sys.stderr is not None:  # None when it was closed before the start
         faulthandler.enable()

@@ -228,8 +228,10 @@ class Answers:
 
     def news(self, answer: RobotState, held: RobotState | None) -> bool:
         """It is newer than the state held so far; or, where the robot's clock was set back since
-        that came, than the answer before it."""
+        that came, than the answer before it. What is held already is no news."""
         before, self._last = (held, self._last), answer
+        if held is not None and answer.stamp == held.stamp:
+            return False
         return any(one is not None and answer.stamp.to_ns() > one.stamp.to_ns() for one in before)
 
 

@@ -39,7 +39,7 @@ def examine(
             yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
         return
     yield Finding("configuration", "ok", where)
-    address = told(config)
+    address, written = told(config), ""
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
         elsewhere = f"runs on another machine (its pid {running.info.pid} is none of acsard's here)"
@@ -49,7 +49,7 @@ def examine(
         return
     if isinstance(running, Running):
         yield from compared(running, config)
-        config = running.config
+        config, written = running.config, config.bus.tls
     for warning in warnings(config):
         yield Finding("configuration", "warning", warning, "see acsard.toml")
     yield from serial_port(config)
@@ -58,7 +58,8 @@ def examine(
     yield from scheduling(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
-    for directory in dict.fromkeys((config.bus.tls, address.tls)):
+    # The service has copies of its own, as they were: a file that is gone is missed in its place.
+    for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)
     if isinstance(running, Running):

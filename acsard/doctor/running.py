@@ -32,6 +32,7 @@ SHOWN = 6
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
+    "ros.namespace",
 )  # fmt: skip
 """What `acsard run` takes as options: whoever gave one meant it."""
 

@@ -16,7 +16,7 @@ less."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
 """rad/s by the wheels, in the mean over so many s; slower is no turn: of unequal tyres the wheels
-say one on a straight."""
+say one on a straight, beside which below `LEAST_RATE` no gyro is dead that says nothing."""
 
 PROPORTIONS = (0.25, 2.5)
 """Between these a robot turns per turn of its wheels, whatever it skids."""
@@ -68,6 +68,8 @@ class Trial:
         if self._wheels == 0.0:
             return
         verdict = self._verdict(self._gyro / self._wheels)
+        if verdict == "dead" and abs(self._wheels) < LEAST_RATE * self._seconds:
+            verdict = "none yet"
         if verdict != "none yet" and (certain or verdict == "in degrees"):
             self.verdict = verdict
 

@@ -23,7 +23,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.drive.noise import columns
 from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import DECIMAL, TwistUncertainty
-from acsard.drive.uncertainty import PoseUncertainty
+from acsard.drive.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.error_budget.drive_log import Line, Motion, motion
 from acsard.error_budget.rounding import rounding
 from acsard.error_budget.steps import Driving, Step, mirrored
@@ -223,20 +223,23 @@ class _Driven:
         yield self._share("parameters", basis, kind, driving.plain())
         if heard.gyro:
             told: Basis = "measured" if odometry.covariance == "model" else "unknown"
-            yield self._share("gyro", told, _only(odometry), driving.turned_by_gyro())
+            steps = driving.turned_by_gyro()
+            yield self._share("gyro", told, _only(odometry), steps, scale=GYRO_SCALE)
 
     def _share(
         self, cause: Cause, basis: Basis, odometry: OdometryConfig, steps: Sequence[Step],
-        counts: int = 0,
+        counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
         if basis == "unknown":
             return Share(cause, None, None, basis)
         millimetres = degrees = None
         if self.rolled >= LEAST_M:
-            millimetres = _mm(_driven(odometry, self._kinematics, counts, steps, self._metres))
+            millimetres = _mm(
+                _driven(odometry, self._kinematics, counts, steps, self._metres, scale=scale)
+            )
         if self.turned >= LEAST_RAD:
             left = [mirrored(step) for step in steps]
-            driven = _driven(odometry, self._kinematics, counts, left, math.inf, math.tau)
+            driven = _driven(odometry, self._kinematics, counts, left, math.inf, math.tau, scale)
             degrees = _deg(driven)
         return Share(cause, millimetres, degrees, basis)
 
@@ -251,17 +254,19 @@ def _declared(
 
 def _driven(
     odometry: OdometryConfig, kinematics: Kinematics, counts: int, steps: Sequence[Step],
-    metres: float, turns: float = math.inf,
+    metres: float, turns: float = math.inf, scale: float = 0.0,
 ) -> PoseUncertainty | None:  # fmt: skip
-    """The error after so many m or rad of these steps, again and again; None without steps."""
+    """The error after so many m or rad of these steps, again and again; None without steps.
+
+    `scale` is what a gyro's is off by.
+    """
     if not steps:
         return None
     pose, path = PoseUncertainty(odometry, kinematics, counts), Path()
     rolled = turned = 0.0
     for step in cycle(steps):
         dx, dy, heading = path.advance(step.distance, step.turn)
-        # What is odometry's for its gyro's scale is measured with the rest, if that is asked for.
-        pose.advance(step.distance, step.turn, dx, dy, heading, step.by_gyro, scale=0.0)
+        pose.advance(step.distance, step.turn, dx, dy, heading, step.by_gyro, scale=scale)
         if step.along or step.yaw:
             pose.doubt(step.along, step.yaw)
         if step.stood is not None:

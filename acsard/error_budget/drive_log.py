@@ -19,6 +19,9 @@ Floats = npt.NDArray[np.float64]
 BLOCK_S = 0.5
 """Errors of time hang together for as long: the longest stall of a host is 0.3 s."""
 
+QUIET, LEAST_QUIET = 0.02, 20
+"""rad/s, slower than which a line turns by nothing; and so many such lines tell what that costs."""
+
 LATEST_S = 0.1
 """A line that is later tells when it was read; its way is looked at as a gap's."""
 
@@ -87,7 +90,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         for a, b in pairwise(lines)
     ]
     turns = [math.remainder(b.yaw - a.yaw, math.tau) for a, b in pairwise(lines)]
-    growth = np.maximum(0.0, np.diff([line.yaw_variance for line in lines]))
+    growth = _noise(t, np.array(turns), np.array([line.yaw_variance for line in lines]))
     seen = _Gaps(t, twists, rolled, found, whole)
     late = _late(t, twists, found)
     late[[k for k in seen.stood if k < len(late)]] = 0.0
@@ -96,6 +99,16 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), seen.bridged,
         seen.stood, seen.missing, seen.unseen,
     )  # fmt: skip
+
+
+def _noise(t: Floats, turns: Floats, variances: Floats) -> Floats:
+    """rad2 by which the heading's variance grows with time alone: what its scale errs by, which is
+    squared with all that was turned before, is seen where it turns."""
+    growth, dt = np.maximum(0.0, np.diff(variances)), np.diff(t)
+    quiet = (np.abs(turns) < QUIET * dt) & (dt > 0.0)
+    if np.count_nonzero(quiet) < LEAST_QUIET:
+        quiet = np.abs(turns) <= np.quantile(np.abs(turns), 0.1)
+    return np.asarray(growth[quiet].sum() / max(1e-9, float(dt[quiet].sum())) * dt)
 
 
 def _late(t: Floats, twists: list[Twist], found: Places) -> Floats:

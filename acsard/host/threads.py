@@ -14,11 +14,15 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
+class NoThreadError(TimeoutError):
+    """No thread was to be had: the call has not begun."""
+
+
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever), and at once
-    where no thread is to be had.
+    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever), at once
+    `NoThreadError`.
 
     `late` gets (in the thread) a result that nobody waits for any more, to give it back.
     """
@@ -52,7 +56,7 @@ async def in_thread(
     try:
         thread.start()
     except RuntimeError as error:
-        raise TimeoutError(f"this process has no room for another thread ({error})") from None
+        raise NoThreadError(f"this process has no room for another thread ({error})") from None
     try:
         # Not wait_for: before Python 3.12 it swallows a cancel that meets the result.
         async with asyncio.timeout(timeout):

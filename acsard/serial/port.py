@@ -21,7 +21,7 @@ import serial_asyncio
 from acsard.host import clock
 from acsard.host.asleep import Asleep
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, in_thread
 from acsard.mcu.gate import Gate, Offered
 from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
@@ -165,6 +165,9 @@ class SerialPort:
 
         try:
             device = await in_thread(open_port, OPEN_TIMEOUT_S, late=lambda late: late.close())
+        except NoThreadError as error:
+            opening.discard(which)
+            raise OSError(errno.EIO, str(error)) from None
         except TimeoutError:
             raise OSError(errno.EIO, HUNG) from None
         self._lost.clear()

@@ -90,10 +90,9 @@ class Guide:
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
-        """He is told who goes through what."""
+        """He is told who goes through what; or that nobody does any more, if he was away."""
         self._viewers[viewer] = say
-        if self._errand is not None:
-            say(self._errand.about(viewer))
+        say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
 
     def leave(self, viewer: object) -> None:
         """His connection has ended, and what he has begun ends with it."""

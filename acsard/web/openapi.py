@@ -126,7 +126,15 @@ def _service(verb: Any) -> Described:
     if verb in PAYLOADS:
         body = {"application/json": {"schema": _ref(PAYLOADS[verb])}}
         told["requestBody"] = {"required": True, "content": body}
+    elif verb == "stop":
+        told["requestBody"] = {"content": {"application/json": {"schema": _WHICH}}}
     return told
+
+
+_WHICH: Described = {
+    "type": "object",
+    "properties": {"robot": {"type": "string", "description": "another one of the same router"}},
+}
 
 
 _NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}}

@@ -87,7 +87,7 @@ class Rows(Struct, frozen=True):
 
     fleet: Sequence[Row]
     note: str
-    """Why there are no more; "" behind a router."""
+    """Why there are no more; "" where all of a router are seen."""
 
 
 class Pong(Struct, frozen=True):

@@ -19,12 +19,15 @@ from rclpy.utilities import remove_ros_args
 PERIOD_S = 0.05
 PATIENCE_S = 10.0
 """How long to wait for somebody who listens; a bridge makes its route only now."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
 """By a bridge, a zero counts a second after the last speed of whomever."""
 
 
 def end(number: int, frame: object) -> NoReturn:
-    """Ended by a signal, after the zeros."""
+    """Ended by a signal, after the zeros; another one takes none of them away."""
+    for one in SIGNALS:
+        signal.signal(one, signal.SIG_IGN)
     sys.exit(128 + number)
 
 
@@ -33,8 +36,10 @@ def main(argv: list[str]) -> None:
     linear, angular, seconds = given + [0.2, 0.0, 3.0][len(given) :]
     # Its own handlers would end the context first, and no zero could be sent any more.
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
+    for number in SIGNALS:
+        # Whoever began it by nohup wants it to go on without its terminal.
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
     try:
         drive(linear, angular, seconds)
     finally:

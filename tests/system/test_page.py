@@ -516,13 +516,25 @@ def test_what_is_set_and_switched_on_the_page_is_so(page: Phone) -> None:
     page.shows("mode", "READY")
 
 
-DRAWN = "document.getElementById('map').toDataURL()"
+DRAWN = (
+    "new Promise(done => setTimeout(() => done(document.getElementById('map').toDataURL()), 100))"
+)
+STEADY = 5
+"""Looks, one every 100 ms, at which nothing has changed any more."""
 
 
 def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
     """Each button changes what is drawn, and the way back is the way there."""
     browser = page.browser
-    begun = browser.js(DRAWN)
+    # What comes in the beginning (the robot's place, a banner that goes) changes it too.
+    looks = [str(n) for n in range(STEADY)]
+
+    def stands() -> bool:
+        looks.append(browser.js(DRAWN))
+        return len({*looks[-STEADY:]}) == 1
+
+    until(stands, 5.0, "it stands")
+    begun = looks[-1]
 
     def drawn(anew: bool, what: str) -> None:
         until(lambda: (browser.js(DRAWN) != begun) is anew, 5.0, what)
@@ -755,6 +767,57 @@ HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
 def by_hand(page: Phone, script: str) -> list[Any]:
     """What the pure part says, run where it runs."""
     return list(page.browser.js(HAND.replace("SCRIPT", script)))
+
+
+STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
+    const out = [], now = Date.now;
+    let ok = false;
+    const send = async () => (out.push("sent"), {ok, text: "no answer"});
+    const stopping = new Stopping(send, (told) => out.push(told));
+    const pressed = stopping.press();
+    await new Promise((done) => setTimeout(done, 100)); // it was sent once
+    SCRIPT
+    await pressed;
+    Date.now = now;
+    return out;
+})"""
+
+FAILS = ["sent", "STOP: no answer; it is sent again"]
+"""What a first one without an answer does."""
+
+
+@pytest.mark.parametrize(
+    ("script", "then"),
+    [
+        ("ok = true", ["sent", ""]),
+        ("stopping.heard(performance.now())", [""]),
+        ("stopping.heard(-Infinity); ok = true", ["sent", ""]),
+        ("stopping.over()", []),
+        ("Date.now = () => now() + 31000", ["STOP was not confirmed"]),
+        ("stopping.heard(performance.now()); ok = true; stopping.press()", ["sent", ""]),
+    ],
+    ids=["answered", "arrived", "stopped before", "cleared", "asleep", "pressed again"],
+)
+def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_pressed(
+    page: Phone, script: str, then: list[str]
+) -> None:
+    told = list(page.browser.js(STOPPING.replace("SCRIPT", script)))
+    assert told[:2] == FAILS
+    assert len(told) == 2 + len(then), told
+    assert all(one.startswith(begun) for one, begun in zip(told[2:], then, strict=True))
+
+
+def test_a_page_that_is_hidden_says_its_zero_once(page: Phone) -> None:
+    """Its timers run late, when somebody else may drive."""
+    page.hold()
+    page.browser.js(JAM)
+    page.browser.js(
+        "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+        "document.dispatchEvent(new Event('visibilitychange'))"
+    )
+    page.bus.at_rest()
+    sent = [json.loads(one) for one in page.browser.js("window.sent")]
+    assert [one["cmd"]["linear_x"] for one in sent if "cmd" in one] == [0]
 
 
 def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:

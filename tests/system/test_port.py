@@ -8,6 +8,7 @@ import itertools
 import os
 import select
 import termios
+import threading
 import tty
 from collections.abc import Sequence
 
@@ -81,6 +82,37 @@ def test_behind_a_suspend_the_port_is_opened_anew() -> None:
         assert asyncio.run(opened()) == (1, True, 2)
         assert "suspended" in next(one.text for one in told if one.name == "port_lost")
         assert GO not in os.read(master, 4096)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try() -> None:
+    told = list[Event]()
+
+    async def opened() -> bool:
+        usual = threading.stack_size(1 << 46)  # which no machine has room for
+        try:
+            port = await SerialPort(
+                path, 115200, STOP, PERIOD_NS, lambda: None, told.append
+            ).__aenter__()
+        finally:
+            threading.stack_size(usual)
+        assert not port.is_open
+        keeping = asyncio.create_task(port.keep_open())
+        async with asyncio.timeout(5.0):
+            while not port.is_open:
+                await asyncio.sleep(0.001)
+        keeping.cancel()
+        await port.__aexit__(None, None, None)
+        return True
+
+    master, slave = os.openpty()
+    try:
+        tty.setraw(master)
+        path = os.ttyname(slave)
+        assert asyncio.run(opened())
+        assert "no room for another thread" in told[0].text
     finally:
         os.close(master)
         os.close(slave)

@@ -86,8 +86,10 @@ export class Drive {
     this.#timer = null;
     // A daemon that reads late drops what comes on the heels of another command. Told twice, it
     // has heard it, and then it is silence: who goes on with zeros keeps others from driving.
+    // Timers of a page that is hidden or stands still run late, and somebody else drives by then.
     clearTimeout(this.#again);
-    this.#again = setTimeout(() => this.#send(ZERO), TWICE);
+    const last = performance.now() + 3 * TWICE;
+    this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
     this.stick.classList.remove("held");
     awake("stick", false);
     this.#told(why);

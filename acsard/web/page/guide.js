@@ -89,9 +89,9 @@ export class Guide {
   }
 
   #runs({ running, by, yours }) {
-    this.#busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
-    for (const id of ["check", "calibrate"]) [$(id).disabled, $(id).title] = [Boolean(running), this.#busy];
-    text("guide-note", this.#busy);
+    const busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
+    for (const id of ["check", "calibrate"]) [$(id).disabled, $(id).title] = [Boolean(running), busy];
+    if (busy !== this.#busy) text("guide-note", (this.#busy = busy));
     if (!running || !yours) return;
     this.#running = true;
     this.#link.beat(LIFE);

@@ -10,6 +10,7 @@ import { Minute } from "./minute.js";
 import { Recordings } from "./recordings.js";
 import { barred, hint, may, permit } from "./roles.js";
 import { Settings } from "./settings.js";
+import { Stopping } from "./stopping.js";
 import * as views from "./views.js";
 import { figure, milliseconds, said as clickable, signed, yaw } from "./words.js";
 
@@ -19,18 +20,16 @@ const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
 const words = (told) => clickable(told, OTHER);
 const LATCHED = ["stopped", "fault"];
-const URGENT = 30000; // ms for which a STOP without an answer is sent again
-const PAUSE = 300; // between two
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
 const guide = new Guide(link);
+const stopping = new Stopping(() => (link.open ? link.call("stop", undefined, OTHER) : posted()), views.alarm);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
 let view = "drive";
-let presses = 0; // of STOP
 let state = null;
 let heard = -Infinity; // when what `state` says was true, by performance.now()
 let hello = null;
@@ -63,20 +62,10 @@ function followed(key, rate, wanted) {
   else link.unsubscribe(key);
 }
 
-/** Sent until it is answered: a link may be dead and not know it yet. */
-async function stop() {
+function stop() {
   drive.release();
   guide.leave();
-  const press = ++presses;
-  const last = performance.now() + URGENT;
-  for (;;) {
-    const told = link.open ? await link.call("stop", undefined, OTHER) : await posted();
-    if (press !== presses) return; // a newer one tells
-    const again = !told.ok && performance.now() < last;
-    views.alarm(told.ok ? "" : `STOP: ${told.text}${again ? "; it is sent again" : ""}`);
-    if (!again) return;
-    await new Promise((done) => setTimeout(done, PAUSE));
-  }
+  stopping.press();
 }
 
 /** STOP without the link: there may be no place for one more page. */
@@ -171,6 +160,7 @@ function stated({ detail }) {
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
+  if (LATCHED.includes(state.mode)) stopping.heard(heard);
   views.banner(state, hello?.role === "viewer", OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
@@ -286,7 +276,8 @@ addEventListener("keydown", (event) => {
   if (!event.repeat) stop();
 }, true);
 addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
-$("clear").addEventListener("click", () => asked("clear"));
+$("clear").addEventListener("click", () => (stopping.over(), asked("clear")));
+addEventListener("pagehide", () => stopping.over());
 $("activate").addEventListener("click", () => asked("activate"));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));

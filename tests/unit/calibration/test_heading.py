@@ -30,6 +30,17 @@ def test_a_gyro_of_few_digits_tells_its_bias_between_them() -> None:
     assert headings_of(coarse)[2].bias == pytest.approx(0.004, abs=0.001)
 
 
+def test_a_slow_gyro_with_a_spike_in_a_short_rest_has_a_bias() -> None:
+    drive = usual(plan=[(3, 0, 0), (4, 0.3, 0.0), (4, 0.0, 1.0), (1.8, 0, 0), (4, 0.0, -1.0)])
+    every = round(0.25 / float(np.median(np.diff(drive.gyro_t))))
+    slow = replace(drive, gyro=drive.gyro[::every].copy(), gyro_t=drive.gyro_t[::every])
+    in_rest = int(np.searchsorted(slow.gyro_t, 12.0))
+    slow.gyro[in_rest] += 0.02
+    headings = headings_of(slow)[2]
+    assert headings.bias == pytest.approx(0.01, abs=0.01)
+    assert 0.0 < headings.unsure < 0.1
+
+
 @pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.0), (0.003, 0.0003)])
 def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> None:
     z = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -131,6 +132,13 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
     assert found.std[0] < 0.016
     if places:
         assert found.values[0] == pytest.approx(1.6, rel=0.006)
+
+
+def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
+    robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
+    seen = drive(robot, wander(robot.rng, 300.0))
+    worth = calibrated(replace(seen, gyro=seen.gyro * 1.02).csv(places=True)).gain
+    assert (worth.turn.then or math.inf) < 3.0  # deg in 360, of which 2 % are 7
 
 
 def test_positions_that_tell_no_side_contradict_no_gyro() -> None:

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from acsard.cli import drive
 from acsard.cli.drive import ASK_S, HOLD_S, NO_END, ZEROS, News, Page, Ride, Teleop, split
+from acsard.client.driving import Answers
 from acsard.messages.encodings import encode
 from acsard.messages.schema import RobotState, Time
 from acsard.top.teleop import HELP
@@ -206,16 +207,23 @@ def test_what_a_storage_still_has_of_a_dead_robot_is_no_news(
     assert heard_after(robot, 10 * ASK_S, monkeypatch) == pytest.approx(10 * ASK_S, abs=0.11)
 
 
+def test_a_storage_that_has_what_was_heard_last_says_no_news() -> None:
+    older, last = replace(STATE, stamp=Time(9)), replace(STATE, stamp=Time(10))
+    answers = Answers()
+    assert answers.news(older, replace(STATE, stamp=Time(8)))
+    assert not answers.news(last, last)
+
+
 def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class Answers(Robot):
+    class Alive(Robot):
         def ask(self, name: str, take: Any) -> None:
             before = self.stored or STATE
             self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
             super().ask(name, take)
 
-    assert heard_after(Answers(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
+    assert heard_after(Alive(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
 
 
 def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 from acsard.cli import run
 from acsard.config.parsing import parse
 from acsard.config.settings import Config, McuConfig, WebConfig
+from acsard.doctor.running import OPTIONS
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
@@ -30,6 +31,14 @@ def test_the_options_are_the_keys_of_the_configuration() -> None:
     assert (config.robot.id, config.ros.namespace) == ("r7", "a/b")
     assert config.bus.listen == ("tcp/127.0.0.1:1",)
     assert config.bus.connect == ("tcp/[::1]:2",)
+
+
+def test_the_doctor_knows_all_that_options_set() -> None:
+    given = given_by("--port", "x", "--baud-rate", "9600", "--id", "r", "--namespace", "n",
+                     "--record", "d", "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2",
+                     )  # fmt: skip
+    keys = {f"{section}.{key}" for section, values in given.items() for key in values}
+    assert keys == set(OPTIONS)
 
 
 @pytest.mark.parametrize(

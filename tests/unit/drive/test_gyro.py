@@ -306,7 +306,7 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize(("sign", "named"), [(-1.0, "reversed"), (0.0, "dead")])
-@pytest.mark.parametrize("rate", [0.02, 0.05])
+@pytest.mark.parametrize("rate", [0.02, 0.05, 0.1])
 def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
     sign: float, named: GyroDoes, rate: float
 ) -> None:
@@ -314,7 +314,8 @@ def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
     bench.run(REST_FIRST)
     bench.run(60.0, rate)
     assert bench.told == pytest.approx(60.0 * rate * 1.6)
-    assert (bench.says() == named) == (rate == 0.05)
+    # Wheels of unequal tyres say 0.08 rad/s on a straight, where a good gyro says nothing.
+    assert (bench.says() == named) == (rate > (0.02 if sign else 0.05))
     bench.run(1.0)
     assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it owed at rest"
 

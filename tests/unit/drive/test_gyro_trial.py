@@ -68,9 +68,13 @@ def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
     assert trial.verdict == "none yet"
 
 
-@pytest.mark.parametrize(("share", "verdict"), [(0.6, "good"), (-0.6, "reversed"), (0.0, "dead")])
-def test_slow_lines_add_up_to_a_verdict(share: float, verdict: Verdict) -> None:
-    assert turned(Trial(), 0.08, share, 6.0) == verdict
+@pytest.mark.parametrize(
+    ("rate", "share", "verdict"),
+    [(0.08, 0.6, "good"), (0.08, -0.6, "reversed"), (0.12, 0.0, "dead"), (0.08, 0.0, "none yet")],
+)
+def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verdict) -> None:
+    """But of unequal tyres the wheels say so much on a straight, where a good gyro says nothing."""
+    assert turned(Trial(), rate, share, 6.0) == verdict
 
 
 def test_a_straight_between_two_turns_begins_anew() -> None:

@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, McuConfig, OdometryConfig
+from acsard.drive.uncertainty import GYRO_SCALE
 from acsard.error_budget.budget import Budget, Cause, Heard, Share, budget
 from acsard.error_budget.drive_log import Line
 from tests.unit.error_budget import drives
@@ -127,8 +128,23 @@ def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     for cause in ("time", "quantisation", "gaps", "slip"):
         assert share(found, cause).deg_per_turn == 0.0
     turns = found.turned / 360
-    grown = math.degrees(math.sqrt(lines[-1].yaw_variance / turns))
+    grown = math.degrees(math.sqrt(lines[-1].yaw_variance / turns + (GYRO_SCALE * math.tau) ** 2))
     assert share(found, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
+
+
+@pytest.mark.parametrize("before", [-10, 10])
+def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
+    """Its scale's error is squared with all the turns since the pose was set."""
+
+    def told(turns: float) -> float:
+        heading, lines = turns * math.tau, list[Line]()
+        for n, line in enumerate(driven().lines):
+            if lines:
+                heading += math.remainder(line.yaw - driven().lines[n - 1].yaw, math.tau)
+            lines.append(replace(line, yaw_variance=1e-6 * n + (GYRO_SCALE * heading) ** 2))
+        return share(budget(Heard(lines, [], gyro=True), CONFIG), "gyro").deg_per_turn or 0.0
+
+    assert told(before) == pytest.approx(told(0.0), rel=0.3)
 
 
 def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantisation() -> None:
