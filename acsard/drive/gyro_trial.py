@@ -39,8 +39,10 @@ class Trial:
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
-        self._stretch = self._stretch_s = 0.0
-        """rad by the wheels, and s, of this stretch."""
+        self._stretch = self._stretch_s = self._stretch_gyro = 0.0
+        """rad by the wheels, s, and rad by the gyro of this stretch;"""
+        self._fast = self._fast_gyro = 0.0
+        """rad by both of those that were fast enough for a gyro to be dead."""
 
     @property
     def open(self) -> bool:
@@ -53,14 +55,18 @@ class Trial:
         Without a certain bias it is only seen that it tells degrees.
         """
         self._stretch += wheels
+        self._stretch_gyro += gyro
         self._stretch_s += dt
         if self._stretch_s >= STRETCH_S:
             if abs(self._stretch) < SLOWEST * self._stretch_s:
-                self._wheels = self._gyro = self._seconds = 0.0
-            self._stretch = self._stretch_s = 0.0
+                self._begin()
+            if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
+                self._fast += self._stretch
+                self._fast_gyro += self._stretch_gyro
+            self._stretch = self._stretch_s = self._stretch_gyro = 0.0
         if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
             # Of a turn to the other side a late gyro still tells the one before.
-            self._wheels = self._gyro = self._seconds = 0.0
+            self._begin()
             return
         self._wheels += wheels
         self._gyro += gyro
@@ -68,10 +74,20 @@ class Trial:
         if self._wheels == 0.0:
             return
         verdict = self._verdict(self._gyro / self._wheels)
-        if verdict == "dead" and abs(self._wheels) < LEAST_RATE * self._seconds:
+        if verdict == "dead" and not self._says_nothing():
             verdict = "none yet"
         if verdict != "none yet" and (certain or verdict == "in degrees"):
             self.verdict = verdict
+
+    def _begin(self) -> None:
+        self._wheels = self._gyro = self._seconds = self._fast = self._fast_gyro = 0.0
+
+    def _says_nothing(self) -> bool:
+        """In turns that are no straight of unequal tyres, this one among them."""
+        fast, gyro = self._fast, self._fast_gyro
+        if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
+            fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
+        return abs(fast) >= REFUTED and abs(gyro) < PROPORTIONS[0] * abs(fast)
 
     def _verdict(self, ratio: float) -> Verdict:
         least, most = PROPORTIONS

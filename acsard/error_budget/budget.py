@@ -222,7 +222,8 @@ class _Driven:
             kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
         yield self._share("parameters", basis, kind, driving.plain())
         if heard.gyro:
-            told: Basis = "measured" if odometry.covariance == "model" else "unknown"
+            known = odometry.covariance == "model" and driving.tells_gyro
+            told: Basis = "measured" if known else "unknown"
             steps = driving.turned_by_gyro()
             yield self._share("gyro", told, _only(odometry), steps, scale=GYRO_SCALE)
 

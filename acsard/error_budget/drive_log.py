@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from acsard.drive.gap_variance import Gaps
 from acsard.drive.kinematics import Kinematics
+from acsard.drive.uncertainty import GYRO_SCALE
 from acsard.error_budget.line_times import Places, places
 from acsard.values import Twist, WheelSpeeds
 
@@ -19,8 +20,9 @@ Floats = npt.NDArray[np.float64]
 BLOCK_S = 0.5
 """Errors of time hang together for as long: the longest stall of a host is 0.3 s."""
 
-QUIET, LEAST_QUIET = 0.02, 20
-"""rad/s, slower than which a line turns by nothing; and so many such lines tell what that costs."""
+LEAST_LINES, ALIKE = 20, 0.99
+"""Lines on the way that tell what a gyro's noise costs; and the cosine from which on turning and
+the time that passes are one and the same."""
 
 LATEST_S = 0.1
 """A line that is later tells when it was read; its way is looked at as a gap's."""
@@ -63,8 +65,8 @@ class Motion(Struct, frozen=True):
     """m, signed."""
     turn: Floats
     """rad"""
-    yaw_variance: Floats
-    """rad2 that odometry itself added."""
+    yaw_variance: Floats | None
+    """rad2 that odometry itself added with time, None where that cannot be told."""
     late: Floats
     """m and rad that each line's time changed: columns of two."""
     lateness: float
@@ -90,7 +92,10 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         for a, b in pairwise(lines)
     ]
     turns = [math.remainder(b.yaw - a.yaw, math.tau) for a, b in pairwise(lines)]
-    growth = _noise(t, np.array(turns), np.array([line.yaw_variance for line in lines]))
+    growth = _noise(
+        t, np.array([line.speeds for line in lines]), np.array(turns),
+        np.array([line.yaw_variance for line in lines]),
+    )  # fmt: skip
     seen = _Gaps(t, twists, rolled, found, whole)
     late = _late(t, twists, found)
     late[[k for k in seen.stood if k < len(late)]] = 0.0
@@ -101,14 +106,26 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
     )  # fmt: skip
 
 
-def _noise(t: Floats, turns: Floats, variances: Floats) -> Floats:
-    """rad2 by which the heading's variance grows with time alone: what its scale errs by, which is
-    squared with all that was turned before, is seen where it turns."""
-    growth, dt = np.maximum(0.0, np.diff(variances)), np.diff(t)
-    quiet = (np.abs(turns) < QUIET * dt) & (dt > 0.0)
-    if np.count_nonzero(quiet) < LEAST_QUIET:
-        quiet = np.abs(turns) <= np.quantile(np.abs(turns), 0.1)
-    return np.asarray(growth[quiet].sum() / max(1e-9, float(dt[quiet].sum())) * dt)
+def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
+    """rad2 by which the heading's variance grows in each line with time alone, while wheels turn.
+
+    What a gyro's scale errs by is squared with all that was turned since the pose was set, so that
+    each line adds 2 S2 A dA more, of A before it: found by least squares with it, and left out.
+    None where turns and time cannot be told apart.
+    """
+    # Of a pose that was set anew the variance falls.
+    dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
+    levers, before = 2 * GYRO_SCALE**2 * turns, np.cumsum(turns) - turns / 2
+    grown = np.diff(variances) - levers * before
+    columns = np.column_stack((dt, levers))[moves]
+    sizes = np.sqrt(np.sum(columns**2, axis=0))
+    if len(columns) < LEAST_LINES or not sizes[0]:
+        return None
+    if sizes[1] and abs(columns[:, 0] @ columns[:, 1]) > ALIKE * sizes[0] * sizes[1]:
+        return None
+    used = columns / np.where(sizes > 0.0, sizes, 1.0)
+    rate = float(np.linalg.lstsq(used, grown[moves], rcond=None)[0][0]) / float(sizes[0])
+    return np.where(moves, max(0.0, rate) * dt, 0.0)
 
 
 def _late(t: Floats, twists: list[Twist], found: Places) -> Floats:

@@ -50,6 +50,11 @@ class Driving:
         """Without an error of its own."""
         return self._steps()
 
+    @property
+    def tells_gyro(self) -> bool:
+        """What a gyro's noise costs is seen."""
+        return self._motion.yaw_variance is not None
+
     def turned_by_gyro(self) -> list[Step]:
         """What odometry holds its gyro's turns for."""
         return self._steps(gyro=self._motion.yaw_variance)

@@ -771,14 +771,15 @@ def by_hand(page: Phone, script: str) -> list[Any]:
 
 STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
     const out = [], now = Date.now;
-    let ok = false;
-    const send = async () => (out.push("sent"), {ok, text: "no answer"});
+    let ok = false, lost = true;
+    const send = async () => (out.push("sent"), {ok, lost, text: "no answer"});
     const stopping = new Stopping(send, (told) => out.push(told));
     const pressed = stopping.press();
     await new Promise((done) => setTimeout(done, 100)); // it was sent once
     SCRIPT
     await pressed;
     Date.now = now;
+    delete performance.now;
     return out;
 })"""
 
@@ -792,11 +793,30 @@ FAILS = ["sent", "STOP: no answer; it is sent again"]
         ("ok = true", ["sent", ""]),
         ("stopping.heard(performance.now())", [""]),
         ("stopping.heard(-Infinity); ok = true", ["sent", ""]),
-        ("stopping.over()", []),
+        ("stopping.over()", ["STOP was not confirmed"]),
         ("Date.now = () => now() + 31000", ["STOP was not confirmed"]),
-        ("stopping.heard(performance.now()); ok = true; stopping.press()", ["sent", ""]),
+        (
+            "const then = performance.now(); Date.now = () => now() - 3600000;"
+            "performance.now = () => then + 31000",
+            ["STOP was not confirmed"],
+        ),
+        ("ok = true; stopping.press()", ["sent", ""]),
+        (
+            "lost = false; await new Promise((done) => setTimeout(done, 300));"
+            "stopping.heard(performance.now()); ok = true",
+            [*FAILS, "sent", ""],
+        ),
     ],
-    ids=["answered", "arrived", "stopped before", "cleared", "asleep", "pressed again"],
+    ids=[
+        "answered",
+        "arrived",
+        "stopped before",
+        "cleared",
+        "asleep",
+        "a clock set back",
+        "pressed again",
+        "answered: not ended yet",
+    ],
 )
 def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_pressed(
     page: Phone, script: str, then: list[str]

@@ -40,6 +40,11 @@ export class Guide {
     addEventListener("keydown", (event) => this.#pressed(event));
   }
 
+  /** Somebody goes through one, here or elsewhere. */
+  get going() {
+    return this.#running || Boolean(this.#busy);
+  }
+
   /** End what goes on, as Ctrl-C does. */
   leave() {
     if (this.#running) this.#link.urge({ press: "leave" });

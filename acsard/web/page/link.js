@@ -76,10 +76,10 @@ export class Link extends EventTarget {
   call(verb, payload, robot) {
     const id = ++this.#number;
     return new Promise((done) => {
-      const given = setTimeout(() => this.#answer({ answer: id, ok: false, text: "no answer within 3 s" }), 3000);
+      const given = setTimeout(() => this.#unanswered(id, "no answer within 3 s"), 3000);
       this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
       if (this.open) this.urge({ call: verb, payload, id, robot });
-      else this.#answer({ answer: id, ok: false, text: "no connection to the robot" });
+      else this.#unanswered(id, "no connection to the robot");
     });
   }
 
@@ -126,6 +126,10 @@ export class Link extends EventTarget {
     this.#answers.delete(message.answer);
   }
 
+  #unanswered(id, text) {
+    this.#answer({ answer: id, ok: false, lost: true, text });
+  }
+
   #ping() {
     if (!this.open) return;
     if (performance.now() - this.#heard > SILENT) {
@@ -150,7 +154,7 @@ export class Link extends EventTarget {
   #down(reason) {
     this.open = false;
     this.way = null;
-    for (const id of [...this.#answers.keys()]) this.#answer({ answer: id, ok: false, text: "the connection went before an answer came" });
+    for (const id of [...this.#answers.keys()]) this.#unanswered(id, "the connection went before an answer came");
     this.#tell("down", { reason });
   }
 

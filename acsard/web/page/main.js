@@ -76,7 +76,7 @@ async function posted() {
     const told = await answer.json();
     return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
   } catch {
-    return { ok: false, text: "no connection to the robot" };
+    return { ok: false, lost: true, text: "no connection to the robot" };
   }
 }
 
@@ -160,7 +160,8 @@ function stated({ detail }) {
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
-  if (LATCHED.includes(state.mode)) stopping.heard(heard);
+  // A check that goes on does not end with the daemon's stop.
+  if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
   views.banner(state, hello?.role === "viewer", OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;

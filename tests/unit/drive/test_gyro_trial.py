@@ -77,6 +77,22 @@ def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verd
     assert turned(Trial(), rate, share, 6.0) == verdict
 
 
+@pytest.mark.parametrize("seconds", [6.0, 60.0])
+def test_a_turn_behind_a_straight_of_unequal_tyres_proves_a_gyro(seconds: float) -> None:
+    trial = Trial()
+    turned(trial, 0.08, 0.0, seconds)
+    told = [turned(trial, 0.5, 1.0, DT) for _ in range(1000)]
+    assert set(told) == {"none yet", "good"}
+
+
+def test_lines_that_are_slow_in_turns_are_no_fast_ones() -> None:
+    trial = Trial()
+    for _ in range(1000):
+        trial.add(0.04 * DT, 0.0, DT)
+        trial.add(0.08 * DT, 0.0, DT)
+    assert trial.verdict == "none yet"
+
+
 def test_a_straight_between_two_turns_begins_anew() -> None:
     trial = Trial()
     for _ in range(20):

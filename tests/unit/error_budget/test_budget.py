@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 
 import pytest
 from msgspec.structs import replace
@@ -132,19 +133,40 @@ def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     assert share(found, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
 
 
+def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
+    """Of a gyro whose noise is 1e-6 rad2 in each line that moves, and whose scale errs by all that
+    was turned since the pose was set, `before` turns of it before these lines."""
+    heading, noise, made = before * math.tau, 0.0, list[Line]()
+    for last, line in pairwise([lines[0], *lines]):
+        heading += math.remainder(line.yaw - last.yaw, math.tau)
+        noise += 1e-6 if any(line.speeds) else 0.0
+        made.append(replace(line, yaw_variance=noise + (GYRO_SCALE * heading) ** 2))
+    return share(budget(Heard(made, [], gyro=True), CONFIG), "gyro")
+
+
 @pytest.mark.parametrize("before", [-10, 10])
 def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
-    """Its scale's error is squared with all the turns since the pose was set."""
+    found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
+    assert found.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
 
-    def told(turns: float) -> float:
-        heading, lines = turns * math.tau, list[Line]()
-        for n, line in enumerate(driven().lines):
-            if lines:
-                heading += math.remainder(line.yaw - driven().lines[n - 1].yaw, math.tau)
-            lines.append(replace(line, yaw_variance=1e-6 * n + (GYRO_SCALE * heading) ** 2))
-        return share(budget(Heard(lines, [], gyro=True), CONFIG), "gyro").deg_per_turn or 0.0
 
-    assert told(before) == pytest.approx(told(0.0), rel=0.3)
+def test_at_rest_a_gyro_costs_nothing_and_says_nothing_of_a_drive() -> None:
+    lines = driven().lines
+    still = [
+        replace(lines[0], at=lines[0].at - 3.0 + n / 100, speeds=(0.0,) * 4) for n in range(300)
+    ]
+    found, rested = with_a_gyro(lines), with_a_gyro([*still, *lines])
+    assert rested.deg_per_turn == pytest.approx(found.deg_per_turn, rel=0.05)
+
+
+def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
+    line = driven().lines[0]
+    spin = [
+        replace(line, at=n / 100, yaw=n / 100, positions=(0.01 * n, -0.01 * n, -0.01 * n, 0.01 * n),
+                speeds=(1.0, -1.0, -1.0, 1.0))
+        for n in range(3000)
+    ]  # fmt: skip
+    assert with_a_gyro(spin, 10.0).basis == "unknown"
 
 
 def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantisation() -> None:
