@@ -26,8 +26,8 @@ ROUNDS, SPAN_S, SETTLES_S, REST_S = 10, 9.0, 1.0, 30.0
 
 PAIRS = 20
 
-SURE = 0.2
-"""Points of a core that the mean of all pairs may be off, by twice its standard error."""
+SHARE = 0.15
+"""Of what the daemon takes without, on this machine as it is: a median is sure enough of that."""
 
 MORE = 0.4
 """Points of a core that recording may take."""
@@ -126,8 +126,8 @@ def test_recording_takes_little_of_the_processor(tmp_path: Path) -> None:
     print(f"(twice the standard error of {PAIRS} pairs; each +- {stdev(more):.2f}, ", end="")
     # A busy machine makes both dearer: where the one without takes 3 %, it is quiet.
     print(f"median {median(more):+.2f}) beside {mean(off for off, _ in pairs):.2f} without")
-    assert 2 * error < SURE
     assert mean(more) - 2 * error < MORE
+    assert median(more) < SHARE * mean(off for off, _ in pairs)
 
 
 def test_an_idle_day_is_less_than_60_mb(tmp_path: Path) -> None:
