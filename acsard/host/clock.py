@@ -20,7 +20,7 @@ mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC
 
 
 def asleep_ns() -> int:
-    """How long this computer was suspended since it was switched on; all clocks stood meanwhile."""
+    """How long this computer was suspended since it was switched on; `mono_ns` stood meanwhile."""
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
