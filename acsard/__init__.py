@@ -37,7 +37,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     serial/        S  owns the serial port
     bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
     record/        S  the black box: steps <-> MCAP, a ring of files, replay (its core is pure)
-    runtime/       S  the control loop and the daemon; figures of itself
+    runtime/       S  the control loop, the daemon, the latch file; figures of itself
     door/          S  `acsard door`: where TLS ends, a process of its own
     client/        S  drive and follow a robot from Python: synchronous, asynchronous; driving is
                       one drive, and what `state` says becomes of it
@@ -57,7 +57,7 @@ Three invariants, each tested:
 1. Only the rooms marked S do I/O; only host/clock.py reads a clock for the daemon.
 2. No wheel speed grows unless a fresh command, a live link and mode driving agree in the same
    step; otherwise it only falls, and without a link the command is zero at once. The guard checks
-   exactly this, with code of its own.
+   exactly this, and that each ramp ends in time, with code of its own.
 3. No line is held back to be sent later: one that cannot go now is superseded by the next.
 """
 

@@ -5,14 +5,21 @@ will, and lets them pass only if they are finite, within the hard limit, with a 
 have one, and no faster than the last line sent unless a fresh command, a live link and mode DRIVING
 agreed (invariant 2). Without a link only zero passes. Anything else becomes the stop line, and the
 reason goes back into the robot, which latches a fault.
+
+The guard also checks that the robot comes to rest. When the last fresh command is older than the
+longest ramp that the limits allow, only zero passes. After a stop, a fault or the end of the daemon
+the longest ramp at the stop deceleration counts. The guard remembers these times, so a recording
+keeps its `Memory` beside the robot.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 
-from acsard.config.settings import Config, Source
-from acsard.values import Outputs
+from msgspec import Struct
+
+from acsard.config.settings import Config
+from acsard.values import NS_PER_S, Outputs
 
 Wheels = tuple[int, int, int, int]
 """The motors a to d in hundredths of rad/s."""
@@ -20,39 +27,82 @@ Wheels = tuple[int, int, int, int]
 _ZERO: Wheels = (0, 0, 0, 0)
 _HEX = b"0123456789ABCDEF"
 
+HALTED = ("stopped", "fault", "leaving")
+"""Modes in which the robot brakes at the stop deceleration."""
+
+MARGIN_NS = 300_000_000
+"""Allowed beyond the longest ramp. The board stops by itself after a pause this long between two
+lines, so no ramp of the daemon is later than that."""
+
+
+class Memory(Struct, frozen=True):
+    """Everything that a guard remembers from one line to the next."""
+
+    last: bytes = b""
+    """The line that left last, which an MCU with power is obeying. Empty at the start."""
+    commanded_ns: int | None = None
+    """When a fresh command was last followed in mode `driving`, monotonic."""
+    halted_ns: int | None = None
+    """When the mode became one of `HALTED`, monotonic. None in any other mode."""
+    ramp_ns: int = 0
+    """Longest ramp to rest under any limits in force since the robot was last at rest."""
+    stop_ramp_ns: int = 0
+    """The same at the stop decelerations."""
+
 
 class Guard:
-    """Passes a line on or replaces it with `stop`. Remembers nothing: the last line is told it."""
+    """Passes a line on or replaces it with `stop`."""
 
-    def __init__(
-        self,
-        stop: bytes,
-        wheel_speed: float,
-        sources: tuple[Source, ...],
-        require_check: bool = False,
-    ) -> None:
+    def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
         """`stop` is the plain stop line: an MCU in any state obeys it."""
         self._stop = stop
-        self._require_check = require_check
-        self._most = int(wheel_speed * 100 + 1)
-        self._timeouts = {source.name: source.timeout * 1e9 for source in sources}
+        memory = memory or Memory()
+        self._last = memory.last or stop
+        self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
+        self._longest = memory.ramp_ns, memory.stop_ramp_ns
+        self.use(config)
 
-    @classmethod
-    def of(cls, stop: bytes, config: Config) -> Guard:
-        """That of a configuration."""
-        check = config.mcu.link_check == "require"
-        return cls(stop, config.limits.wheel_speed, config.commands.sources, require_check=check)
+    def use(self, config: Config) -> None:
+        """Check by this configuration from now on. The memory stays."""
+        self._require_check = config.mcu.link_check == "require"
+        self._most = int(config.limits.wheel_speed * 100 + 1)
+        self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
+        self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
+        self._note_limits()
 
-    def check(self, outputs: Outputs, last: bytes) -> tuple[bytes | None, str]:
-        """The line that may really go out, and why it is not the one these outputs have, or "".
+    @property
+    def memory(self) -> Memory:
+        """The memory that lets another guard continue."""
+        return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
-        `last` is the line that went out last, which an MCU with power is obeying.
-        """
+    def left(self, line: bytes) -> None:
+        """Note that this line went out."""
+        self._last = line
+        self._note_limits()
+
+    def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
+        """The line that may really go out, and why it is not the one these outputs have, or ""."""
+        if outputs.mode == "driving":
+            if self._commanded(outputs):
+                self._commanded_ns = outputs.now.mono_ns
+            self._halted_ns = None
+        elif outputs.mode not in HALTED:
+            self._halted_ns = None
+        elif self._halted_ns is None:
+            self._halted_ns = outputs.now.mono_ns
         line = outputs.line
         if line is None:
             return None, ""
-        trip = self._objection(line, outputs, _wheels(last) or _ZERO)
+        trip = self._objection(line, outputs, _wheels(self._last) or _ZERO)
         return (self._stop, trip) if trip else (line, "")
+
+    def _note_limits(self) -> None:
+        """Let a robot in motion end its ramp by the limits under which it began to move."""
+        if (_wheels(self._last) or _ZERO) == _ZERO:
+            self._longest = self._ramps
+        elif self._longest != self._ramps:
+            (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
+            self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
         wheels = _wheels(line)
@@ -71,7 +121,17 @@ class Guard:
         )
         if grows and not self._commanded(outputs):
             return "a wheel grows without a fresh command in mode driving"
+        if self._late(outputs.now.mono_ns):
+            return "it still moves a wheel although the longest ramp to rest is over"
         return ""
+
+    def _late(self, now_ns: int) -> bool:
+        """Return whether the robot must be at rest by now."""
+        (ramp_ns, stop_ramp_ns), since_ns = self._longest, self._commanded_ns
+        if since_ns is None or now_ns - since_ns > ramp_ns + MARGIN_NS:
+            return True
+        halted_ns = self._halted_ns
+        return halted_ns is not None and now_ns - halted_ns > stop_ramp_ns + MARGIN_NS
 
     def _commanded(self, outputs: Outputs) -> bool:
         timeout, arrived = self._timeouts.get(outputs.source), outputs.command_ns
@@ -92,6 +152,25 @@ class Guard:
             and all(digit in _HEX for digit in digits)
             and check == b"*%04X\r\n" % _crc(body)
         )
+
+
+def _ramp_ns(config: Config, *, stop: bool) -> int:
+    """Return how long the limits let the robot take from its highest speed to rest, in ns.
+
+    No twist is faster than its own limit or than all wheels at theirs. Both axes reach rest
+    together, at the pace of the slower one. Jerk shapes speeding up only.
+    """
+    limits, drive = config.limits, config.drive
+    sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
+    rim = limits.wheel_speed * drive.wheel_radius * sides / 2
+    half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
+    linear = min(limits.linear_speed, rim)
+    angular = min(limits.angular_speed, rim / half_track)
+    if stop:
+        by = limits.linear_stop_deceleration, limits.angular_stop_deceleration
+    else:
+        by = limits.linear_deceleration, limits.angular_deceleration
+    return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
 @lru_cache(4)  # the line that went last was new a period ago

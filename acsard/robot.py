@@ -13,6 +13,7 @@ from collections import Counter
 from msgspec.structs import replace
 
 from acsard.config.live import changed
+from acsard.config.lowered import lowered, with_lowered
 from acsard.config.motion_rules import longest_reply
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import Config
@@ -24,7 +25,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.drive.learned_track import LearnedTrack
 from acsard.drive.lifecycle import Lifecycle
 from acsard.drive.limits import Limiter
-from acsard.drive.modes import Mode, RefusedError, Trigger
+from acsard.drive.modes import LEAVING, Mode, RefusedError
 from acsard.drive.odometry import Odometry
 from acsard.drive.sanity import Sanity
 from acsard.drive.tally import Tally
@@ -42,6 +43,8 @@ from acsard.values import (
     Event,
     GyroStatus,
     Inputs,
+    Instant,
+    Latches,
     Outputs,
     Plain,
     Pose,
@@ -61,6 +64,8 @@ done so. So start over from rest instead of resuming a speed it no longer has.""
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
 """What brakes by the stop limits."""
 
+NS_PER_MS = 1_000_000
+
 MAX_TEXT = 200
 """Characters of a refusal kept: it may quote what a stranger sent."""
 
@@ -68,7 +73,10 @@ MAX_TEXT = 200
 class Robot:
     """One robot base: its link, pose, mode and commanders."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
+        """Start in the mode of these latches and with the limits that they keep lowered."""
+        self._file_limits = config.limits
+        config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
         """In force; another one after a step that was asked to `set` something."""
         longest_s = longest_reply(config.feedback.fault_time)
@@ -89,7 +97,11 @@ class Robot:
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
-        self._life = Lifecycle(config.control.auto_activate)
+        self._life = Lifecycle(config.control.auto_activate, latches)
+        self._life.lower(lowered(self._file_limits, config.limits))
+        if latches.next or latches.inactive:
+            mode, why = self._life.mode, self._life.why
+            self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
@@ -119,27 +131,34 @@ class Robot:
 
     def snapshot(self, now_ns: int) -> Snapshot:
         """What `state` and `diagnostics` show; costs too much for every step."""
-        session, since = self.session, self._refused_ns
-        counters = {"lines": session.good_lines}
+        session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
+        counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
-        counters |= self._odometry.missed()
+        if self._arbiter.forgiven_ns:
+            counters["clocks_forgiven_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
         gyro = GyroStatus() if self._gyro is None else self._gyro.status
         if self._track is not None:
             gyro = replace(gyro, track_use=self._track.use)
         return Snapshot(
             pose=self._odometry.pose,
-            measured=self._odometry.twist,
-            speeds=self._odometry.speeds,
+            measured=None if silent else self._odometry.twist,
+            speeds=None if silent else self._odometry.speeds,
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
             refused=self._refused,
             refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
+            feedback_age_s=session.feedback_age_s(now_ns),
             gyro=gyro,
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
             encoders=session.snapping.counts,
             sender=self._choice.sender,
         )
+
+    @property
+    def latches(self) -> Latches:
+        """The latches in force, also in the middle of a step that a bug has ended."""
+        return self._life.latches
 
     @property
     def travelled(self) -> float:
@@ -149,6 +168,9 @@ class Robot:
     def step(self, inputs: Inputs) -> Outputs:
         """Take all that happened since the last step; decide what happens now."""
         events = list(inputs.events)
+        if self._first_events:
+            events += self._first_events
+            self._first_events = []
         if inputs.missed:
             self.counters["missed_periods"] += inputs.missed
             events.append(missed(inputs.missed))
@@ -158,7 +180,7 @@ class Robot:
         if inputs.commands or inputs.refusals:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
-        self._life.fire(Trigger.NO_COMMAND if self._choice.twist is None else Trigger.COMMAND)
+        self._life.command(self._choice.twist is not None)
         news = self._news()
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
@@ -184,6 +206,7 @@ class Robot:
             events=self._tally.lines(events, inputs.now.mono_ns),
             answers=answers,
             news=news,
+            latches=self._life.latches,
         )
 
     def _news(self) -> bool:
@@ -235,16 +258,16 @@ class Robot:
         else:
             self._linked_once = True
             self._life.link(up=True)
-        now_ns = inputs.now.mono_ns
+        now = inputs.now
         if self._gyro is not None:
             self._gyro.hear(inputs.gyro)
         if not feedback:
             return ()
         return tuple(
-            [estimate for line in feedback if (estimate := self._believe(line, now_ns, events))]
+            [estimate for line in feedback if (estimate := self._believe(line, now, events))]
         )
 
-    def _believe(self, line: Feedback, now_ns: int, events: list[Event]) -> Estimate | None:
+    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
         """Fold a line that can be true; None for one that cannot, or is the last straw."""
         why = self._sanity.impossible(line)
         told = self._dropped.line(why)
@@ -255,11 +278,11 @@ class Robot:
             events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
-                self._fault(f"impossible feedback: {why}", now_ns, events)
+                self._fault(f"impossible feedback: {why}", now, events)
             return None
         fault = self._sanity.watch(self._speeds, line.speeds, line.since)
         if fault:
-            self._fault(fault, now_ns, events)
+            self._fault(fault, now, events)
         if self._sanity.turned:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
@@ -285,17 +308,17 @@ class Robot:
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
-            self._fault(trip, inputs.now.mono_ns, events)
+            self._fault(trip, inputs.now, events)
         if inputs.leaving and self._life.mode is not Mode.LEAVING:
-            self._life.fire(Trigger.LEAVE)
+            self._life.leave()
         if not inputs.requests:
             return ()
-        return tuple([self._answer(r, inputs.now.mono_ns, events) for r in inputs.requests])
+        return tuple([self._answer(r, inputs.now, events) for r in inputs.requests])
 
-    def _answer(self, request: Request, now_ns: int, events: list[Event]) -> Answer:
+    def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
         before = self._life.mode
         try:
-            message = self._obey(request, now_ns)
+            message = self._obey(request, now)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
@@ -305,28 +328,29 @@ class Robot:
         self._asked = asked
         return Answer(request.id, True, message)
 
-    def _obey(self, request: Request, now_ns: int) -> str:
-        life, linked = self._life, self.session.link == "up"
-        asked_ns = now_ns if request.asked_ns is None else request.asked_ns
+    def _obey(self, request: Request, now: Instant) -> str:
+        life = self._life
+        asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
             case "stop":
-                return life.stop(now_ns)
+                return life.stop(request.by, asked_ns, now)
             case "clear":
-                if not life.clear(asked_ns, now_ns, linked):
-                    return "nothing to clear: neither stopped nor in fault"
+                released = life.clear(request.latch, asked_ns, now)
+                if not released:
+                    return "nothing to clear: the robot is neither stopped nor in fault"
                 self._sanity.forget()
                 self._arbiter.require_neutral(asked_ns)
-                return "cleared; each source must be neutral once before it drives"
+                return released
             case "activate":
-                if life.activate(linked):
+                if life.activate():
                     self._arbiter.require_neutral(asked_ns)
                 return "active"
             case "deactivate":
-                return life.deactivate()
+                return life.deactivate(request.by, now)
             case "set_pose" | "reset_odometry":
                 return self._place(request.pose or Pose())
             case "set":
-                return self._set(request.settings, now_ns)
+                return self._set(request.settings, now.mono_ns)
 
     def _place(self, pose: Pose) -> str:
         """It is there from now on; to the pose before nothing is owed."""
@@ -347,14 +371,15 @@ class Robot:
         except ConfigError as error:
             raise RefusedError(str(error)) from None
         self._limiter.use(self.config.limits)
+        self._life.lower(lowered(self._file_limits, self.config.limits))
         self._odometry.use(self.config.odometry)
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
         return news or "nothing new: all of it is so already"
 
-    def _fault(self, why: str, now_ns: int, events: list[Event]) -> None:
-        if self._life.fault(why, now_ns):
+    def _fault(self, why: str, now: Instant, events: list[Event]) -> None:
+        if self._life.fault(why, now):
             self._arbiter.require_neutral(self._made_ns)
             events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
@@ -412,9 +437,7 @@ class Robot:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 return self.session.words(self._port_trouble)
-            case Mode.STOPPED | Mode.FAULT:
-                return f"{self._life.latched}; call srv/clear"
-            case Mode.INACTIVE:
-                return "switched off; call srv/activate"
+            case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
+                return self._life.why
             case Mode.LEAVING:
-                return "the daemon is going down"
+                return LEAVING

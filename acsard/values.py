@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 """The order of every four-wheel value, index 0 to 3."""
@@ -17,7 +18,6 @@ NS_PER_S = 1_000_000_000
 
 ROOT = "acsard"
 """Begins every key of the native tree: `acsard/<robot.id>/...`."""
-
 
 Role = Literal["viewer", "operator", "maintainer"]
 """What somebody may do on the bus; each may what those before it may."""
@@ -98,7 +98,7 @@ class Command(Struct, frozen=True):
     """A velocity wish of one commander. Three words tell whose it is, here and everywhere:
 
         source  what it commands as, one of `commands.sources`: the `app` of `cmd/app`
-        sender  who sent it, as far as the envelope says: two programs on one source are two
+        sender  its public name, as far as the envelope says: two programs on one source are two
         clock   what stamped it: the sender's own attachment, Zenoh for it, or a message's header
 
     `arrived_ns` is the monotonic time of arrival and alone decides the age; `stamp_ns` is when it
@@ -121,6 +121,8 @@ class Command(Struct, frozen=True):
     """It came from ROS, whose tools send no zero by themselves."""
     stamp_replaced: bool = False
     """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
+    steady: bool = False
+    """The stamp comes from a clock that is never adjusted, as the sender's attachment says."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
@@ -141,6 +143,8 @@ class Request(Struct, frozen=True):
     """Who asked, as `incoming/asker.py` puts it."""
     settings: dict[str, Plain] = {}
     """What `set` is to set, by key as in `config/live.py`."""
+    latch: int | None = None
+    """Number of the latch that `clear` releases; None if the client does not name one."""
 
 
 class Answer(Struct, frozen=True):
@@ -169,7 +173,7 @@ EventName = Literal[
     "lines_rejected", "lines_dropped", "lines_lost", "wheels_turned", "wheels_doubted",
     "gyro", "track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "no_router",
-    "missed_periods", "recording",
+    "missed_periods", "recording", "latch_file",
     "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
     "page_ended", "page_refused",
     "router_open", "router_crowded", "router_stuck", "router_ended",
@@ -217,12 +221,14 @@ class Estimate(Struct, frozen=True, gc=False):
 class Wait(Struct, frozen=True):
     """What a source waits for, and what `drive/words.py` needs to say it."""
 
-    what: Literal["nothing", "command", "proof", "neutral", "zeros", "higher", "equal", "senders"]
+    what: Literal[
+        "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
+    ]
     source: str = ""
     """Who must be neutral or prove its clock; who sends nothing but zeros; of higher or equal
     priority, who has the robot."""
     seconds: float = 0.0
-    """s of silence that are neutral, or of steady delays that are a proof."""
+    """s without a speed behind the zero of a shared identity, or s that a proof takes."""
     senders: int = 0
     """How many wait while another sender of the same source is followed."""
     lasts: float = 0.0
@@ -230,7 +236,9 @@ class Wait(Struct, frozen=True):
     kept: str = ""
     """The source that sends speeds meanwhile and is kept waiting."""
     ros: bool = False
-    """Who must be neutral sends from ROS."""
+    """The sender that must send a zero sends from ROS."""
+    shared: bool = False
+    """Several programs may share the identity of the sender that must send a zero."""
 
 
 class SourceStatus(Struct, frozen=True):
@@ -303,6 +311,47 @@ class GyroStatus(Struct, frozen=True):
     track_use: TrackUse = "shown"
 
 
+class Latch(Struct, frozen=True):
+    """One latch: a stop, a fault or the robot being switched off."""
+
+    number: int
+    """Identifies the latch: milliseconds since 1970, or one more than the latch before.
+
+    It stays unique across restarts, and JavaScript represents it exactly.
+    """
+    at_ns: int
+    """Wall-clock time at which the latch was set, ns since 1970."""
+    by: str
+    """Client that asked for it, as in `Event.by`; empty for a fault."""
+    why: str
+    """Reason in words: "stopped by NAME", the fault's reason or "switched off by NAME"."""
+    kept: bool = False
+    """True if the latch was set before the daemon's last start."""
+
+
+class Latches(Struct, frozen=True):
+    """Everything that must survive every end of the process; it does not depend on the link."""
+
+    stop: Latch | None = None
+    fault: Latch | None = None
+    inactive: Latch | None = None
+    lowered: dict[str, float] = {}
+    """Each `limits.*` setting that `set` made lower than in the configuration file, by its key."""
+
+    @property
+    def next(self) -> Latch | None:
+        """The latch that `clear` releases next: the fault if there is one, else the stop."""
+        return self.fault or self.stop
+
+    def after_restart(self) -> Latches:
+        """Return these latches for the next start of the daemon, each marked as kept."""
+        stop, fault, inactive = (
+            None if latch is None else replace(latch, kept=True)
+            for latch in (self.stop, self.fault, self.inactive)
+        )
+        return Latches(stop, fault, inactive, self.lowered)
+
+
 class Inputs(Struct, frozen=True):
     """Everything one step may know.
 
@@ -363,6 +412,8 @@ class Outputs(Struct, frozen=True):
     news: bool = False
     """Another command is followed, or none any more, or the mode is another one, than when the last
     line was due."""
+    latches: Latches = Latches()
+    """The latches in force after the step; the same object until one of them changes."""
 
 
 class Spread(Struct, frozen=True):
@@ -396,14 +447,15 @@ class Snapshot(Struct, frozen=True):
     """What `state` and `diagnostics` show beyond one step's outputs."""
 
     pose: Pose
-    measured: Twist
-    speeds: WheelSpeeds
+    measured: Twist | None  # None while the feedback is silent
+    speeds: WheelSpeeds | None  # None while the feedback is silent
     sources: tuple[SourceStatus, ...]
     counters: dict[str, int]
     refused: str
     """The last command that was refused and why, "" when none was."""
     refused_age_s: float | None = None
     """s since one was refused for more than that its sender is new here, None when none was."""
+    feedback_age_s: float | None = None  # since the last good line, None before the first one
     missed_last_minute: int = 0
     """Periods without a step."""
     figures: dict[str, Measured] = {}
@@ -418,3 +470,5 @@ class Snapshot(Struct, frozen=True):
     """Whose command counts, of the senders of one source; "" when nobody's does."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
+    latch_file: str | None = None
+    """Why the latches would not survive a restart, in words; None where nothing is kept."""

@@ -187,7 +187,7 @@ COMMANDS: dict[str, How] = {
     "acsard echo state -n 1": Run('"mode":"[a-z]+","reason":'),
     "acsard top": Run("pose and twist"),
     "acsard call stop": Run("^stopped and latched; srv/clear releases it$"),
-    "acsard call clear": Run("^cleared; each source must be neutral once before it drives$"),
+    "acsard call clear": Run("^cleared; each sender must send a zero before it drives$"),
     "acsard ports": Run(codes=(0, 1)),
     "acsard mcu check --port DEVICE": Elsewhere(
         "tests/system/test_mcu.py", "test_a_person_at_a_real_port_is_asked_after_each_motor"
@@ -218,7 +218,8 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
         "installs into venvs of other Pythons, for who has them"
     ),
-    ".venv/bin/python -m tests.mutation": Shown("takes hours, for who changes the core"),
+    ".venv/bin/python -m tests.mutation": Shown("takes hours, for changes of the core"),
+    ".venv/bin/python -m tests.mutation --safety --fast": Shown("takes an hour, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
         "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop"
     ),

@@ -30,6 +30,7 @@ PURE_AMONG_SHELLS = (
     "runtime.at_once",
     "runtime.figures",
     "runtime.histogram",
+    "runtime.kept_latches",
     "runtime.period",
     "bench.matching",
     "bench.record",
@@ -103,7 +104,7 @@ DAEMON_ROOMS = ("host", "serial", "bus", "door", "record", "runtime")
 """What the daemon is made of: one clock for all."""
 
 LONG_FILE, LONG_FUNCTION = 300, 50
-LONGEST_FILE, LONGEST_FUNCTION = 420, 55
+LONGEST_FILE, LONGEST_FUNCTION = 500, 55
 
 
 def path_of(module: str) -> Path:

@@ -134,8 +134,14 @@ class Rig:
         return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
-        hidden = ("INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG")
+        hidden = (
+            "INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG",
+            "STATE_DIRECTORY",
+        )  # fmt: skip
         words = [*self._words, "--config", str(self._file), "--port", port]
+        env = {key: value for key, value in os.environ.items() if key not in hidden}
+        # The measured daemon keeps its latches nowhere else: it must leave nothing behind.
+        env["XDG_STATE_HOME"] = str(self._log.parent)
         with self._log.open("wb") as log:
             self._began_ns = clock.mono_ns()
             self.process = subprocess.Popen(
@@ -143,7 +149,7 @@ class Rig:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=log,
-                env={key: value for key, value in os.environ.items() if key not in hidden},
+                env=env,
                 start_new_session=True,
                 preexec_fn=end_with_us,
             )

@@ -39,6 +39,7 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
         commands=CommandsConfig(sources=(Source("bench", 100),)),
         rates=RatesConfig(),
         log=LogConfig(),
+        control=replace(config.control, state_directory=""),
     )
     if not simulated:
         return own

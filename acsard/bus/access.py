@@ -5,6 +5,9 @@ neighbour on the link: who is behind a router has the router's rights. A rule ho
 expression that it includes, so what may be asked with a wildcard has to be allowed with one. Who
 comes by TLS gets exact keys only, since a few wildcards take Zenoh's time without bound. What Zenoh
 lets pass is checked again in code (exact key, kind PUT, listed source).
+
+Zenoh does not tell the daemon under which certificate a sample came. The rules do it instead: each
+certificate that commands has keys of its own, which end with its name.
 """
 
 from __future__ import annotations
@@ -67,7 +70,7 @@ EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
 GRANTS: dict[Role, tuple[str, ...]] = {
     "viewer": ("speak", "tell", "watch", "ask", "halt"),
-    "operator": ("speak", "tell", "watch", "ask", "halt", "command", "operate"),
+    "operator": ("speak", "tell", "watch", "ask", "halt", "drive", "operate"),
     "maintainer": (
         "speak",
         "tell",
@@ -75,13 +78,16 @@ GRANTS: dict[Role, tuple[str, ...]] = {
         "appear",
         "ask",
         "halt",
-        "command",
+        "drive",
         "operate",
         "maintain",
         "sense",
     ),
 }
 """The rules each role has. A router is a maintainer, and tells of a twin that is alive."""
+
+DRIVERS: tuple[Role, ...] = ("operator", "maintainer")
+"""The roles whose certificates command."""
 
 WIDE: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
@@ -90,7 +96,16 @@ WIDE: dict[Role, tuple[str, ...]] = {
 }
 """What each role has besides with `access.wildcards`."""
 
-LOCAL = (*GRANTS["maintainer"], *WIDE["maintainer"], "look", "overhear", "err", "forge")
+LOCAL = (
+    *GRANTS["maintainer"],
+    *WIDE["maintainer"],
+    "command",
+    "hand_on",
+    "look",
+    "overhear",
+    "err",
+    "forge",
+)
 """Who is at the machine may also look with any wildcard, hear commands, and be wrong: what is put
 on other keys is refused in code, which says why and counts it; but nobody speaks in the robot's
 place."""
@@ -137,10 +152,12 @@ class _Keys:
         """What the daemon subscribes to, whoever sends."""
         sources = [source.name for source in config.commands.sources]
         self.commands = [full_key(robot, key) for key in source_keys(sources)]
-        self.commands += [
+        """What listed sources send on, without a certificate."""
+        self.ros_commands = [
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
-        """What listed sources send on."""
+        """The same by ROS, whose keys have no place for a certificate."""
+        self._sources = sources
         self.gyro = [full_key(robot, t.key) for t in topics if t.key == IMU and t not in told]
         self.gyro += [e.key for e in ros if e.native == IMU]
         """What a gyro is heard on; the simulator has its own."""
@@ -153,6 +170,10 @@ class _Keys:
         self.exact_questions = [key for key in self.questions if "*" not in key]
         self.exact_questions += [full_key(robot, f"schema/{name}") for name in SCHEMAS]
         self.parameters = _of(ros, "query")
+
+    def commands_by(self, certificate: str) -> list[str]:
+        """What listed sources send on under this certificate, "*" for any."""
+        return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def of(self, verb: Verb) -> list[str]:
         """The keys of a service."""
@@ -171,17 +192,25 @@ def least_role(key: str) -> Role:
 
 
 def access_control(config: Config) -> dict[str, object]:
-    """The value of Zenoh's `access_control` for the session of this daemon."""
-    return _access(config, LOCAL)
+    """The value of Zenoh's `access_control` for the session of this daemon.
+
+    A TLS link of that session leads to a router, which has let each client put under the name of
+    its own certificate alone, and hands that on.
+    """
+    return _access(config, LOCAL, gateway=False)
 
 
 def door_access(config: Config) -> dict[str, object]:
-    """The same for the door's, whose only link without a certificate is the daemon's."""
-    return _access(config, ("pass",))
+    """The same for the door's, whose only link without a certificate is the daemon's.
+
+    Each certificate that may command has a subject of its own beside that of its role.
+    """
+    return _access(config, ("pass",), gateway=True)
 
 
-def _access(config: Config, local: tuple[str, ...]) -> dict[str, object]:
-    rules = _rules(_Keys(config))
+def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
+    keys = _Keys(config)
+    rules = _rules(keys)
     access = config.access
     names: dict[Role, tuple[str, ...]] = {
         "viewer": access.viewers,
@@ -198,6 +227,17 @@ def _access(config: Config, local: tuple[str, ...]) -> dict[str, object]:
     wide = WIDE if access.wildcards else dict.fromkeys(GRANTS, ())
     granted: dict[str, tuple[str, ...]] = {"local": local}
     granted |= {role: (*GRANTS[role], *wide[role]) for role in GRANTS}
+    drivers = [name for role in DRIVERS for name in names[role]]
+    if gateway:
+        for name in drivers:
+            own = _rule(f"command as {name}", "ingress", ["put"], keys.commands_by(name))
+            rules[own["id"]] = own
+            subject = f"certificate {name}"
+            subjects[subject] = {"link_protocols": ["tls"], "cert_common_names": [name]}
+            granted[subject] = (own["id"],)
+    else:
+        for role in DRIVERS:
+            granted[role] += ("hand_on",)
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -209,6 +249,7 @@ def _access(config: Config, local: tuple[str, ...]) -> dict[str, object]:
                 "subjects": [name],
             }
             for name in subjects
+            if any(rules[rule]["key_exprs"] for rule in granted[name])
         ],
     }
 
@@ -238,6 +279,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("ask", "ingress", ["query"], asked),
         _rule("halt", "ingress", ["put"], [keys.stop]),
         _rule("command", "ingress", ["put"], keys.commands),
+        _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),
+        _rule("drive", "ingress", ["put"], keys.ros_commands),
         _rule("operate", "ingress", ["query"], operated),
         _rule("maintain", "ingress", ["query"], maintained),
         # who bends the pose, as by set_pose

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from acsard.config.settings import TLS
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
 
@@ -55,6 +56,11 @@ def common_name(directory: str) -> str:
     subject: Any = _shown(directory).get("subject", ())
     names = [value for part in subject for kind, value in part if kind == "commonName"]
     return str(names[-1]) if names else ""
+
+
+def shown_at(endpoint: str, directory: str) -> str:
+    """Return the common name that a client shows at this endpoint, "" where it shows none."""
+    return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
 
 def names_in(directory: str) -> list[str]:

@@ -74,7 +74,10 @@ def around(session: zenoh.Session, robot_id: str, endpoint: str) -> Around | Non
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
-    """Tell these robots to stop, or all: at once, whoever else is there and slow to answer."""
+    """Tell these robots to stop, or all: at once, whoever else is there and slow to answer.
+
+    `sender` is the caller's sender id, `NAME/SECRET`.
+    """
     by = msgspec.msgpack.encode({"sender": sender})
     for one in ids:
         session.put(full_key(one, "stop"), b"", attachment=by, express=True)

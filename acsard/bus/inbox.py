@@ -30,6 +30,9 @@ SAMPLES = 64
 OTHERS = ""
 """Where samples on all other keys go."""
 
+ALL = "*"
+"""In the place of a certificate's name."""
+
 STOPS = 16
 """Stops held, apart from all else: no flood of anything can push one out."""
 
@@ -58,7 +61,8 @@ class Inbox:
         """The ids that routers stamp them with: when they came by there, and nobody's name."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, deque[Arrival]] = {
-            key: deque(maxlen=ARRIVALS) for key in (*source_keys(sources), OTHERS)
+            key: deque(maxlen=ARRIVALS)
+            for key in (*source_keys(sources), *source_keys(sources, ALL), OTHERS)
         }
         self._arrivals[IMU] = deque(maxlen=SAMPLES)
         self._stops: deque[Arrival] = deque(maxlen=STOPS)
@@ -128,13 +132,20 @@ class Inbox:
         if key == "stop" and put:
             self._stop(arrival)
             return
-        held = self._arrivals.get(key, self._arrivals[OTHERS])
+        held = self._line(key)
         if len(held) == held.maxlen:
             self._overrun += 1
         held.append(arrival)
         self._any = True
         if key != IMU:  # which is for the next line that the wheels send
             self._waker.command()
+
+    def _line(self, key: str) -> deque[Arrival]:
+        """The queue of a key. The certificates of one source share one, as they share a limit."""
+        held = self._arrivals.get(key)
+        if held is None:
+            held = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
+        return held
 
     def _stop(self, arrival: Arrival) -> None:
         self._stops.append(arrival)

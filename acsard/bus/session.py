@@ -205,8 +205,13 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
-    """A limit per listed source, so that none uses up another's; one more for all unlisted."""
-    keys = [full_key(robot_id, key) for key in [*source_keys([*sources, "*"]), "imu"]]
+    """A limit per listed source, so that none uses up another's; one more for all unlisted.
+
+    The certificates of a source share a limit, but each connection has limits of its own.
+    """
+    listed = [*sources, "*"]
+    below = [*source_keys(listed), *source_keys(listed, "*"), "imu"]
+    keys = [full_key(robot_id, key) for key in below]
     return _at_most("commands", ["put", "delete"], [*keys, *limited])
 
 

@@ -89,7 +89,7 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     from acsard.values import AcsardError
 
     # Who is named is told to stop, there or not: nobody waits to find that out first.
-    fleet.stop(robot.session, ids, robot.name)
+    fleet.stop(robot.session, ids, robot.caller)
     wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
 
     def stop(one: str) -> ServiceReply | AcsardError:

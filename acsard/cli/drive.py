@@ -196,7 +196,7 @@ class News:
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, seen.objection, seen.linear, seen.angular, seen.age > SILENT_S)
-        moves = state is not None and (state.linear != 0.0 or state.angular != 0.0)
+        moves = state is not None and bool(state.linear or state.angular)
         wait = NEWS_S if what != self._shown else SAME_S if moves else QUIET_S
         if now - self._at < wait:
             return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,8 @@ from acsard.lan import identities
 from acsard.values import ROLES
 
 MOST_DAYS = 3650
+
+NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -219,10 +222,11 @@ def _admit_service(directory: Path) -> None:
 
 
 def _name(text: str) -> str:
-    good = text.isascii() and text.isprintable() and 0 < len(text) <= 64
-    if not good or "/" in text or text in (".", ".."):
+    # As `access` wants it: the name is a part of keys, and a directory here.
+    if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a name for a certificate: 1 to 64 letters, digits and signs but /"
+            f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "
+            "_.:@+-, and no @ at the start"
         )
     return text
 

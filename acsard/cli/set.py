@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Change settings of the robot that runs, all or none: limits, timeouts, covariances, publishing
 rates, the log's level. They are checked as the file is, told in the log and on the key `config`,
-and gone with the next start unless --write puts them into the configuration file too (all but
-a source's timeout: [[commands.sources]] is yours to write). A lower speed limit is reached by the
-deceleration. Without a setting: list those that there are. Exit 1 when it is refused.
+and gone with the next start, except a lowered speed, acceleration or jerk, unless --write puts
+them into the configuration file too (all but a source's timeout: [[commands.sources]] is yours to
+write). A lower speed limit is reached by the deceleration. Without a setting: list
+those that there are. Exit 1 when it is refused.
 """
 
 
@@ -51,6 +52,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Set, or list."""
     from acsard.client import connect
+    from acsard.config.lowered import stays
     from acsard.host.errors import MendableError
     from acsard.host.files import change, require_changeable
     from acsard.messages.encodings import encode
@@ -65,16 +67,19 @@ def main(args: argparse.Namespace) -> int:
             _tell(robot.get("config"), args.json)
             return int(Exit.OK)
         reply = robot.set(settings)
-    until = "; until the next start" if reply.success else ""
+    until = "until the next start"
+    if any(stays(key) for key in settings):
+        until += "; a lowered limit survives it"
     if reply.success and file is not None:
         try:
             change(file, settings)
         except MendableError as error:
             raise ExitError(
-                Exit.FAILURE, f"{reply.message}, until the next start; not written: {error}"
+                Exit.FAILURE, f"{reply.message}, {until}; not written: {error}"
             ) from None
-        until = f"; written to {file}"
-    print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message + until))
+        until = f"written to {file}"
+    text = f"{reply.message}; {until}" if reply.success else reply.message
+    print(json_line(encode(reply, "json").decode()) if args.json else lines(text))
     return int(Exit.OK if reply.success else Exit.FAILURE)
 
 

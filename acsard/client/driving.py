@@ -135,7 +135,10 @@ def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
             watch.require(0.0)
         if watch.state is None or watch.heard < begun + SETTLED_S:
             continue
-        speed = max(abs(watch.state.linear) / STANDS[0], abs(watch.state.angular) / STANDS[1])
+        linear, angular = watch.state.linear, watch.state.angular
+        if linear is None or angular is None:
+            continue  # without feedback nobody knows whether it stands
+        speed = max(abs(linear) / STANDS[0], abs(angular) / STANDS[1])
         if speed < 1.0:
             return
         if speed < SLOWER * slowest:

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from acsard.bus.certificates import shown_at
 from acsard.bus.fleet import around
 from acsard.bus.identity import Identity, identity
 from acsard.bus.quiet import why as why_quiet
@@ -27,12 +28,20 @@ from acsard.host.errors import (
     ReplyError,
     UsageError,
 )
-from acsard.host.own_name import own_name
+from acsard.host.own_name import new_secret, own_name, sender_id
 from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
-from acsard.messages.signature import Signature
-from acsard.messages.topics import VERBS, by_key, full_key, key_hint, service_key, unknown
+from acsard.messages.signature import Signature, public_name
+from acsard.messages.topics import (
+    VERBS,
+    by_key,
+    command_key,
+    full_key,
+    key_hint,
+    service_key,
+    unknown,
+)
 from acsard.values import Plain, Pose
 
 AGAIN_S = 0.03
@@ -80,20 +89,47 @@ class Client:
         """Who calls services, in the daemon's log; set it to what you like."""
         self._opened = False
         self._puts = _Puts()
-        self.sender, self._sequence = _name(session), 0
-        started = clock.now()
-        # The wall clock may be set while we drive; stamps that jump would be refused as stale.
-        self._wall_offset_ns = started.wall_ns - started.mono_ns
+        self.certificate = shown_at(endpoint, tls)
+        """The common name of the certificate that this client shows, "" without one."""
+        # `like` makes another sender of commands on this connection, but not another caller.
+        self._secret = new_secret()
+        self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
+        self._sequence = 0
+        # The wall clock may be set while we drive, and the daemon would take that for a delay.
+        self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
-    def like(self, robot_id: str) -> Client:
-        """The same connection, to another robot behind it."""
+    def _sign_as(self, name: str) -> None:
+        self._sender_id = sender_id(name)
+        self.sender = public_name(self._sender_id, self.certificate)
+        """The name that `state.sender` has while the robot follows this client."""
+
+    @property
+    def caller(self) -> str:
+        """The sender id on each call: `name` with a secret. The daemon's log shows its public
+        name."""
+        return sender_id(self.name, self._secret)
+
+    def like(self, robot_id: str, name: str = "") -> Client:
+        """Return a client of another robot on the same connection, or another sender to this one.
+
+        `name` is the sender's name; by default it is that of this process.
+        """
         other = Client(self.session, robot_id, self.source, self._tls, self._endpoint)
-        other.name, other._puts = self.name, self._puts
+        other.name, other._secret, other._puts = self.name, self._secret, self._puts
+        if name:
+            other._sign_as(name)
         return other
 
     def key(self, name: str) -> str:
         """The full key of a name of the topic table, for example "odom"."""
         return full_key(self._id, name)
+
+    def command_key(self, source: str) -> str:
+        """The key below the robot's id that this client commands on as `source`.
+
+        Over TLS that is a key of its certificate.
+        """
+        return command_key("cmd", source, self.certificate)
 
     def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving.
@@ -122,11 +158,20 @@ class Client:
             raise self.unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`."""
+        """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`.
+
+        `clear` releases the stop or fault that `state` shows now. Pass `latch=state.latch` of the
+        state that a person has looked at, and the daemon refuses if a stop came since.
+        """
+        if service == "clear" and "latch" not in fields:
+            fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings until the next start: `{"limits.linear_speed": 0.8}`; all or none."""
+        """Change settings until the next start: `{"rates.state": 5.0}`; all or none.
+
+        A lowered speed, acceleration or jerk of `limits` survives the next start.
+        """
         return self.request("set", {"settings": settings})
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
@@ -194,19 +239,20 @@ class Client:
 
     def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
         self._puts.wait()
+        steady = stamp_ns is None
         if stamp_ns is None:
-            stamp_ns = clock.mono_ns() + self._wall_offset_ns
+            stamp_ns = clock.steady_ns() + self._wall_offset_ns
         message = schema.TwistStamped(
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
         self._sequence += 1
         self.session.put(
-            self.key(f"cmd/{self.source}"),
+            self.key(self.command_key(self.source)),
             encode(message, "msgpack"),
             encoding=encoding_name("msgpack", "TwistStamped"),
             express=True,
-            attachment=Signature(self.sender, stamp_ns, self._sequence).pack(),
+            attachment=Signature(self._sender_id, stamp_ns, self._sequence, steady).pack(),
             timestamp=self.session.new_timestamp(),
         )
 
@@ -235,7 +281,7 @@ class Client:
             replies = self.session.get(
                 self.key(name),
                 payload=payload,
-                attachment=msgspec.msgpack.encode({"sender": self.name}),
+                attachment=Signature(self.caller).pack(),
                 timeout=REPLY_TIMEOUT_S,
             )
         except zenoh.ZError:
@@ -275,11 +321,6 @@ class Client:
         if us.role == "viewer":
             return NotPermittedError(us.words())
         return NotDrivenError(f"{error}; {us.words()}")
-
-
-def _name(session: zenoh.Session) -> str:
-    """Ours alone, and for people to read: the machine, the process and the session."""
-    return f"{platform.node()[:32]}/{os.getpid()}/{str(session.zid())[:8]}"
 
 
 def _no_key(name: str) -> UsageError:

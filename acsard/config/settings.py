@@ -37,8 +37,12 @@ Text = Annotated[
 CommonName = Annotated[
     str,
     Meta(
-        pattern=r"^[^\x00-\x1f/]{1,64}\Z",
-        extra={"unit": "the common name of a certificate", "example": "operator"},
+        # It is a part of keys and of what `state` shows.
+        pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
+        extra={
+            "unit": "a common name of letters, digits, spaces and _.:@+-",
+            "example": "operator",
+        },
     ),
 ]
 RosNode = Annotated[
@@ -137,6 +141,13 @@ class ControlConfig(Struct, frozen=True):
     rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
     auto_activate: bool = True
     real_time: bool = True
+    state_directory: Annotated[
+        str,
+        Meta(
+            pattern=r"^(~?/[^\x00]{0,254})?\Z",
+            extra={"unit": "a directory that begins with / or ~/, or empty"},
+        ),
+    ] = ""
 
 
 class DriveConfig(Struct, frozen=True):

@@ -99,7 +99,15 @@ def daemon(running: Running) -> Iterator[Finding]:
     if state.counters.get("door_crowded"):
         text = "all connections from the network were taken at times: the log says by whom"
         yield Finding("door", "warning", text, "take his certificate from [access], or his program")
+    yield from latch_file(state.latch_file)
     yield from late(running)
+
+
+def latch_file(trouble: str) -> Iterator[Finding]:
+    """Report that a stop would be lost at a restart, if it would."""
+    if trouble:
+        mend = "free the disk, or name a directory that can be written: control.state_directory"
+        yield Finding("latch file", "warning", trouble, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:

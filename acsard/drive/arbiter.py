@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from acsard.config.settings import CommandsConfig, Source
 from acsard.drive.freshness import LONGEST_PROOF_NS, Freshness
-from acsard.drive.neutral import Sender, State
+from acsard.drive.neutral import Sender
 from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
@@ -47,7 +47,7 @@ class _Source:
 
     def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
         self.name, self.priority = settings.name, settings.priority
-        self.first: State = "unheard" if neutral_first else "free"
+        self.neutral_first = neutral_first
         self.senders: dict[str, Sender] = {}
         self.use(settings, pause)
 
@@ -55,8 +55,8 @@ class _Source:
         """Go by this timeout and pause from now on, its senders too."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
-        self.neutral = Wait("neutral", settings.name, pause)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
+        self.late = Wait("late", settings.name, settings.timeout)
         for sender in self.senders.values():
             sender.use(self.timeout_ns, self.pause_ns)
 
@@ -69,45 +69,56 @@ class _Source:
                 if self._account(least, now_ns)[0]:
                     return None
                 del self.senders[least]
-            known = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.first)
+            known = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
         return known
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Who may be driving counts most, then who may drive, then who was there last."""
+        """Rank a sender: one that may be driving, then one that may drive, then the latest."""
         sender = self.senders[name]
-        free = sender.state == "free"
-        return free and sender.live(now_ns), free, sender.noticed_ns
+        armed = sender.armed(now_ns)
+        return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """The clock of this sender wavers, or was set: then it begins anew."""
+        """Forget the unproven zeros of a sender, or ask for a new one if its clock was set."""
         sender = self.senders.get(name)
         if sender is None:
             return
         if was_set:
-            sender.forget(self.first)
+            sender.require_neutral()
         else:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """The senders that are not silent, first the one that counts: who may drive, came first."""
+        """The senders that are not silent: the armed ones first, in the order they came."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
-        return sorted(live, key=lambda sender: (sender.state != "free", sender.came_ns))
+        return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
         """When a command last counted, of whichever sender."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
-    def forget(self) -> None:
-        """Every sender must be neutral once before it drives again."""
+    def require_neutral(self) -> None:
+        """Ask every sender for a zero before it drives again."""
         for sender in self.senders.values():
-            sender.forget(self.first)
+            sender.require_neutral()
 
-    def doubtful(self, now_ns: int) -> bool:
-        """Commands come in that do not count for when they were sent."""
-        return any(sender.doubtful(now_ns) for sender in self.senders.values())
+    def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
+        """What a sender that is not armed waits for."""
+        pause = self.pause_ns / NS_PER_S
+        return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
+
+    def doubted(self, now_ns: int) -> Wait | None:
+        """What a source waits for whose commands do not count by their stamps, None if they do."""
+        doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
+        if not doubtful:
+            return None
+        latest = max(doubtful, key=lambda sender: sender.noticed_ns)
+        if latest.doubt == "stale":
+            return self.late
+        return self.proof if latest.armed(now_ns) else self.neutral(latest)
 
 
 class Arbiter:
@@ -131,14 +142,14 @@ class Arbiter:
             self._sources[settings.name].use(settings, commands.pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
-        """Forget all commands; each sender must be neutral once before it drives again.
+        """Forget all commands and ask each sender for a zero before it drives again.
 
-        Only what arrived after `since_ns` counts as neutral or as heard: a zero that was under
-        way before the stop was cleared says nothing about now.
+        Only a zero that arrives at `since_ns` or later counts: one that was under way before the
+        stop was cleared says nothing about now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
-            source.forget()
+            source.require_neutral()
         self._holder = None
 
     def accept(self, command: Command) -> Objection:
@@ -153,19 +164,17 @@ class Arbiter:
         verdict = self._freshness.judge(command, source.timeout_ns)
         if verdict == "stale":
             if known is not None:
-                known.notice(command.arrived_ns)
-                known.doubted_ns = command.arrived_ns
+                known.refuse(command, verdict)
             return "stale"
         sender = known or source.sender(command.sender, command.arrived_ns)
         if sender is None:
             return "crowded"
         if verdict in ("set", "first"):
-            # The clock is its own on every source: what it said on others is as doubtful.
+            # A sender has one clock on all its sources: all its zeros are as doubtful.
             for other in self._ranking:
                 other.doubt(command.sender, verdict == "set")
-        counts = verdict in ("fresh", "set")
-        sender.take(command, self._since_ns, counts=counts)
-        return "" if counts else "unproven"
+        sender.take(command, self._since_ns, verdict)
+        return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """A command that could not even be read: no sender who does that is silent."""
@@ -179,15 +188,14 @@ class Arbiter:
         live = [(source, found[0]) for source in heard if (found := source.live(now_ns))]
         if not live:
             self._holder = None
-            doubtful = (source.proof for source in self._ranking if source.doubtful(now_ns))
-            return Choice(wait=next(doubtful, COMMAND))
+            doubted = (source.doubted(now_ns) for source in self._ranking)
+            return Choice(wait=next(filter(None, doubted), COMMAND))
         source, sender = live[0]
         if len(live) > 1:
             source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
         self._holder = source
-        if sender.state != "free":
-            lasts = _lasts(now_ns - sender.came_ns)
-            wait = Wait("neutral", source.name, source.neutral.seconds, lasts=lasts, ros=sender.ros)
+        if not sender.armed(now_ns):
+            wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))
             return Choice(source.name, None, wait, sender=sender.name)
         wait = NOTHING
         if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
@@ -202,6 +210,11 @@ class Arbiter:
                 return f"another sender of {source.name}" if source is holder else source.name
         return ""
 
+    @property
+    def forgiven_ns(self) -> int:
+        """How much later the clocks of senders became in all, as `Freshness` has it, ns."""
+        return self._freshness.forgiven_ns
+
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
         """What each source is doing and waiting for, highest priority first."""
         return tuple(self._status(source, now_ns) for source in self._ranking)
@@ -214,9 +227,9 @@ class Arbiter:
     def _waits_for(self, source: _Source, now_ns: int) -> Wait:
         holder, live = self._holder, source.live(now_ns)
         if not live:
-            return source.proof if source.doubtful(now_ns) else COMMAND
-        if live[0].state != "free":
-            return source.neutral
+            return source.doubted(now_ns) or COMMAND
+        if not live[0].armed(now_ns):
+            return source.neutral(live[0])
         if holder is None or source is holder:
             return Wait("senders", senders=len(live) - 1) if len(live) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)

@@ -1,207 +1,341 @@
-"""Is a stamped command fresh? By two clocks that nobody has compared.
+"""Decides whether a stamped command is fresh, by two clocks that nobody has compared.
 
-Arrival less departure holds the delay and how far the clocks are apart. That nobody knows, but the
-promptest delay so far tells how much longer this one took. Whose promptest is to be believed must
-first have shown steady delays: a backlog's fall while it pours out, a prompt sender's stay.
+The arrival by our clock minus the stamp by the sender's clock is the delay plus an unknown offset.
+The offset cancels out against the minimum of all delays: a command is stale if it took longer than
+the minimum by more than its timeout, or if its stamp lies before that of an accepted command.
 
-    new      not heard before, or not for long
-    known    its promptest delay is believed
-    stepped  too late or too early by that: held up on the way, or its clock was set
+    new      the minimum is not known: the delays must stop falling first, as a backlog's never do
+    known    the minimum is believed
+    stepped  (foreign clocks only) late or early by the minimum: held up, or the clock was set
 
-No clock has to be synchronised, and a step of ours does not matter: arrivals are monotonic.
+There are two kinds of clocks. A *steady* clock is never adjusted: our client, tools and page say so
+with `"steady": true`. Its command that looks late is late, and stays refused. A *foreign* clock may
+be set or slewed, which looks like a delay. A new delay that has proved constant is believed; the
+sender must return to neutral. What is forgiven in this way is bounded, because a congested network
+looks the same: `FORGIVE_NS`, refilled by 1 s a minute. A stamp that goes back, or stands, shows an
+adjustment that no network can cause, so it costs nothing. While the sender pauses, its clock may be
+set by any amount. Arrivals are monotonic: our own wall clock may step.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Command
 
-DRIFT = 2e-4
-"""How far apart the sender's clock and ours may go; twice what a bad crystal does."""
+DRIFT = 5000
+"""The two clocks drift apart by less than one part in 5000, twice the error of a bad crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""After so long a silence the drift may be 50 ms: who comes back is as good as new."""
+"""After a pause of this length the drift may be 50 ms, so the clock is new again. A pause shows in
+the stamps; a network that holds everything back for as long leaves the clock known."""
+
+KEEP_NS = 3600 * NS_PER_S
+"""A clock that was silent for this time is forgotten, to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""What falls by more than this is no jitter: a backlog that pours out, or a clock set forward."""
+"""Delays that fall by more than this are no jitter: a backlog pours in, or the clock was set."""
 
-STEADY, SLEWED = 0.01, 0.1
-"""By which share of the time delays may change and still be steady: of a clock whose delay jumped
-or was never known, and of one that crept away, as it does while NTP slews it (by 8 %)."""
+WAVER_NS = NS_PER_S
+"""Delays that rise by more than this are no jitter: the network held commands back."""
 
-JITTER_NS = NS_PER_S // 200
-"""Creeping is what changes by no more than this beside that share."""
+FALLS_NS = NS_PER_S // 50
+"""The last of several minima that is lower by more than this still falls."""
+
+EVEN, CREPT = 200, 20
+"""A proof allows the minimum of the delays to change by one part in this of the time it takes. The
+halves of that time are compared, so the slopes are twice that: 1 %, or 10 % for a clock that crept
+away, because NTP slews by up to 8.3 %."""
+
+CREEP, JITTER_NS = 10, NS_PER_S // 200
+"""A delay creeps if it changes from one command to the next by no more than one part in `CREEP` of
+the time between them and `JITTER_NS`. Otherwise it jumps."""
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
 """A proof takes the timeout of the source, but no longer than this."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Who jumped takes so long: rather a backlog, let in by heaps, than a clock that was set."""
-
-ROSE_NS, AGAIN_NS = NS_PER_S // 50, JUMP_PROOF_NS // 2
-"""Who jumped and whose delays are all longer by so much, for so long, begins the proof again: no
-jitter, but a clock that was slewed, and goes evenly again."""
+"""A sender whose delay jumped must prove itself for this time. The jump is more likely a backlog
+that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""Who is silent for longer begins the proof again."""
+"""A silence of this length ends a proof. A foreign clock may have been set by any amount while its
+sender paused for this time by its own stamps. Numbers tell a pause from commands that were lost."""
+
+STANDS_NS = 10_000
+"""Two stamps that are no further apart, of commands that did not arrive together, show a clock that
+was set back. Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each
+message until the wall clock has caught up."""
+
+APART_NS = NS_PER_S // 500
+"""Commands that arrive within this time of each other may have been sent together."""
+
+TOGETHER_NS = NS_PER_S // 2000
+"""Commands that arrive within this time of each other come out of one queue, the oldest first. A
+check waits for the last of them. No sender may send more than 1000 commands a second."""
+
+FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
+"""How much later a foreign clock may become without an adjustment that shows: 1 s, and 1 s more for
+each minute."""
 
 MAX_CLOCKS = 1024
-"""Clocks remembered at once; the one heard of longest ago goes first. As many as senders may name
-within a twentieth of a second, and more: none is forgotten between two of its commands."""
+"""Number of clocks that are remembered. The clock that was silent for longest is forgotten first.
+Senders may use this many names within 0.05 s before one at 20 Hz is forgotten."""
 
 State = Literal["new", "known", "stepped"]
-Sign = Literal["usual", "wavering", "steady", "proven"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
-"""`fresh` counts. `unproven` does not yet, nor does `first`, with which a proof begins. `set`
-counts: the clock has been set, and who set it begins anew."""
-
-NEXT: dict[tuple[State, Sign], tuple[State, Verdict]] = {
-    ("new", "wavering"): ("new", "first"),
-    ("new", "steady"): ("new", "unproven"),
-    ("new", "proven"): ("known", "fresh"),
-    ("known", "usual"): ("known", "fresh"),
-    ("known", "wavering"): ("stepped", "stale"),
-    ("stepped", "usual"): ("known", "fresh"),  # as prompt as ever: nothing to prove
-    ("stepped", "wavering"): ("stepped", "stale"),
-    ("stepped", "steady"): ("stepped", "stale"),
-    ("stepped", "proven"): ("known", "set"),
-}
-"""What a command shows of its clock: where that leads, and what becomes of the command."""
+"""`fresh` counts. `unproven` does not count yet, nor does `first`, with which a proof begins.
+`stale` does not count. `set` counts, but the sender must return to neutral."""
 
 
 class _Proof:
-    """Whether delays are steady, from the one it began with on."""
+    """A test that the delays have become constant, from one command on.
 
-    def __init__(self) -> None:
-        self._share, self._least_ns = STEADY, 0
-        self._first = self._delay = self._since_ns = 0
-        self._heard_ns = -GAP_NS - 1  # too long ago: the first one begins it
-        self._met_ns: int | None = None
-        """When a delay was first met again: what falls passes each but once."""
-        self._prompt_ns = 0
-        """When one was last about as prompt."""
+    The minimum of the first half of the proof time is compared with that of the second. Through
+    jitter they differ. Then the last eight halves are looked at, in four pairs. Their minima must
+    differ by less than `EARLY_NS` and follow no trend: they fall while a backlog pours in, and rise
+    while a queue grows. The proof of a clock that stepped begins `again` with its second half.
+    """
 
-    def begin(self, delay: int, at_ns: int, share: float = STEADY, least_ns: int = 0) -> Sign:
-        """From this command on, for no less than that."""
-        self._share, self._least_ns, self._first = share, least_ns, delay
-        self._look_from(delay, at_ns)
-        return "wavering"
+    def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
+        self.least = self._first = self._half = delay
+        self._length_ns, self._share, self._again = needed_ns // 2, share, again
+        self._begun_ns = self._last_ns = at_ns
+        self._halves: list[tuple[int, int]] = []
+        """When each of the last halves began, and its minimum."""
 
-    def _look_from(self, delay: int, at_ns: int) -> None:
-        self._delay, self._since_ns, self._heard_ns, self._met_ns = delay, at_ns, at_ns, None
-        self._prompt_ns = at_ns
+    def add(self, delay: int, at_ns: int) -> Literal["proven", "open", "failed"]:
+        """Judge one more command; `failed` if the proof must begin again with it."""
+        if not -EARLY_NS <= delay - self._first <= WAVER_NS:
+            return "failed"
+        proven = False
+        if at_ns - self._begun_ns >= self._length_ns and at_ns - self._last_ns > TOGETHER_NS:
+            self._halves.append((self._begun_ns, self._half))
+            self._begun_ns += self._length_ns
+            if at_ns - self._begun_ns >= self._length_ns:
+                self._begun_ns = at_ns
+            self._half = delay
+            proven = self._constant(at_ns)
+        self._last_ns = at_ns
+        self._half, self.least = min(self._half, delay), min(self.least, delay)
+        return "proven" if proven else "open"
 
-    def add(self, delay: int, at_ns: int, timeout_ns: int) -> Sign:
-        """One more; what wavers begins it again.
-
-        So does what falls a little, but as no more than the jitter of what came before.
-        """
-        more, lasted_ns = delay - self._delay, at_ns - self._since_ns
-        silence, self._heard_ns = at_ns - self._heard_ns, at_ns
-        allowed = self._share * lasted_ns
-        if more > timeout_ns or silence > GAP_NS or delay < self._first - EARLY_NS:
-            return self.begin(delay, at_ns, self._share, self._least_ns)
-        if more < -allowed:
-            self._look_from(delay, at_ns)
-            return "steady"
-        if more <= ROSE_NS:
-            self._prompt_ns = at_ns
-        elif self._least_ns and at_ns - self._prompt_ns > AGAIN_NS:
-            return self.begin(delay, at_ns, self._share, self._least_ns)
-        if more > allowed:
-            return "steady"  # jitter, unless none is as prompt again
-        if self._met_ns is None:
-            self._met_ns = at_ns
-        needed_ns = max(self._least_ns, min(timeout_ns, LONGEST_PROOF_NS))
-        met_again = at_ns - self._met_ns >= needed_ns // 2
-        return "proven" if met_again and lasted_ns >= needed_ns else "steady"
+    def _constant(self, at_ns: int) -> bool:
+        """Compare the halves that are over. A clock that stepped has two to compare, never more."""
+        minima, count = [least for _, least in self._halves], len(self._halves)
+        lasted = at_ns - self._halves[0][0]
+        if count == 2:
+            if abs(minima[1] - minima[0]) <= lasted // self._share:
+                return True
+            if self._again:
+                del self._halves[0]
+                self.least = self._first = minima[1]
+            return False
+        if count < 8:
+            return False
+        del self._halves[0]
+        pairs = [min(minima[n], minima[n + 1]) for n in (0, 2, 4, 6)]
+        spread, up = max(pairs) - min(pairs), sorted(pairs)
+        trend = pairs == up or pairs == up[::-1] or min(pairs[:3]) - pairs[3] > FALLS_NS
+        return spread <= lasted // self._share or (spread <= EARLY_NS and not trend)
 
 
 class _Clock:
-    """What is known of one clock, by the commands it stamped."""
+    """One clock, judged by the commands that it stamped."""
 
     def __init__(self, at_ns: int) -> None:
-        self._state: State = "new"
-        self._promptest = Promptest(DRIFT)
-        """Of those believed, in ns."""
-        self._late = self._early = 0.0
-        """By how much the last one came later; by how much lately some came ever earlier."""
-        self._heard_ns, self._delay = at_ns, 0
-        self._proof = _Proof()
+        self.state: State = "new"
+        self.at_ns = at_ns
+        """Arrival of the last command."""
+        self.forgiven_ns = 0
+        """How much later the delays became by the last `set`, without an adjustment that shows."""
+        self._stamp_ns = 0
+        self._delay = 0
+        self._number: int | None = None
+        """Sequence number of the last command."""
+        self._least = 0
+        """The minimum of the believed delays, which rises with the drift."""
+        self._early = 0
+        """How much the minimum has fallen lately."""
+        self._floor: int | None = None
+        """Lowest delay of a steady clock, which rises with the drift; None for a foreign clock."""
+        self._before: int | None = None
+        """Delay before the first adjustment that showed since the clock was last prompt."""
+        self._shown = 0
+        """How far the adjustments went that showed since then, ns."""
+        self._paused = False
+        """Its sender has paused since then, so any adjustment may have happened."""
+        self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
+        self._proof: _Proof | None = None
+        self._accepted: tuple[int, int] | None = None
+        """Stamp and sequence number of the last accepted command."""
 
-    @property
-    def new(self) -> bool:
-        """Its delays have not been believed yet, or not for long."""
-        return self._state == "new"
-
-    @property
-    def heard_ns(self) -> int:
-        """When it was heard last."""
-        return self._heard_ns
-
-    def judge(self, delay: int, at_ns: int, timeout_ns: int) -> Verdict:
-        """What to do with a command that took so long by the two clocks."""
-        silence, self._heard_ns = at_ns - self._heard_ns, at_ns
-        if silence > FORGET_NS:
-            self._state, self._proof = "new", _Proof()
-        sign = self._sign(delay, at_ns, silence, timeout_ns)
-        self._state, verdict = NEXT[self._state, sign]
-        self._delay = delay
-        if sign == "proven":
-            self._promptest, self._late, self._early = Promptest(DRIFT), 0.0, 0.0
+    def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
+        """Return the verdict on the next command of this clock."""
+        at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
+        silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
+        if silence > FORGET_NS and departed > FORGET_NS:
+            self.state, self._proof, self._accepted, self._floor = "new", None, None, None
+        if command.steady and self._later_than_lowest(delay, silence) > timeout_ns:
+            verdict: Verdict = "stale"
+        elif self.state == "new":
+            verdict = self._prove(delay, at_ns, silence, timeout_ns)
+        else:
+            self._least += silence // DRIFT
+            if not command.steady:
+                self._look_for_adjustment(silence, departed, command.sequence)
+            verdict = self._compare(delay, at_ns, silence, timeout_ns, command.steady)
+        self.at_ns, self._stamp_ns, self._delay = at_ns, stamp_ns, delay
+        self._number = command.sequence
+        mark = stamp_ns, -1 if command.sequence is None else command.sequence
+        if verdict == "fresh" and self._superseded(mark):
+            return "stale"
+        if verdict in ("fresh", "set"):
+            self._accepted = mark
         return verdict
 
-    def _sign(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Sign:
-        if self._state == "new":
-            return self._proof.add(delay, at_ns, timeout_ns)
-        departed = silence - (delay - self._delay)  # so long after the last, by the sender's clock
-        before, self._late = self._late, self._promptest.measure(silence, departed)
-        early = max(0.0, self._early - SLEWED * silence) + max(0.0, -self._late)
-        if self._late <= timeout_ns and early <= EARLY_NS:
-            self._promptest.believe()
-            self._early = early
-            return "usual"
-        if self._state == "stepped":
-            return self._proof.add(delay, at_ns, timeout_ns)
-        crept = abs(self._late - before) <= SLEWED * silence + JITTER_NS
-        if crept:
-            return self._proof.begin(delay, at_ns, SLEWED)
-        return self._proof.begin(delay, at_ns, STEADY, JUMP_PROOF_NS)
+    def _superseded(self, mark: tuple[int, int]) -> bool:
+        """Return whether a newer command was accepted. Without numbers, equal stamps pass."""
+        last = self._accepted
+        return last is not None and (mark < last or (mark == last and mark[1] >= 0))
+
+    def _later_than_lowest(self, delay: int, silence: int) -> int:
+        """Return how much later than the lowest delay a command of a steady clock came."""
+        floor = delay if self._floor is None else self._floor + silence // DRIFT
+        self._floor = min(floor, delay)
+        return delay - self._floor
+
+    def _look_for_adjustment(self, silence: int, departed: int, number: int | None) -> None:
+        """Note a pause, or stamps that go back or stand, unless the numbers show a loss."""
+        if number is not None and self._number is not None and number != self._number + 1:
+            return
+        if departed > GAP_NS:
+            self._paused = True
+        elif departed <= STANDS_NS and silence > APART_NS:
+            self._before = self._delay if self._before is None else self._before
+            self._shown += silence - departed
+
+    def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
+        proof = self._proof
+        sign = "failed" if proof is None or silence > GAP_NS else proof.add(delay, at_ns)
+        if proof is None or sign == "failed":
+            needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
+            self._proof = _Proof(delay, at_ns, needed_ns, EVEN, again=False)
+            return "first"
+        if sign == "open" or not -EARLY_NS <= delay - proof.least <= timeout_ns:
+            return "unproven"
+        return self._believe(proof, "fresh")
+
+    def _compare(
+        self, delay: int, at_ns: int, silence: int, timeout_ns: int, steady: bool
+    ) -> Verdict:
+        late = delay - self._least
+        early = max(0, self._early - silence // CREEP) + max(0, -late)
+        if late <= timeout_ns and early <= EARLY_NS:
+            self.state, self._proof, self._early = "known", None, early
+            self._least = min(self._least, delay)
+            self._forget_adjustments()
+            return "fresh"
+        if steady:  # the minimum was that of a backlog
+            self.state, self._proof = "new", None
+            return self._prove(delay, at_ns, silence, timeout_ns)
+        proof, needed_ns = self._proof, min(timeout_ns, LONGEST_PROOF_NS)
+        crept = False
+        if proof is None:
+            self.state = "stepped"
+            self._accrue(at_ns, FORGIVE_NS)
+            crept = abs(delay - self._delay) <= silence // CREEP + JITTER_NS
+        elif silence <= GAP_NS:
+            sign = proof.add(delay, at_ns)
+            if sign == "open" or (sign == "proven" and delay - proof.least > timeout_ns):
+                return "stale"
+            if sign == "proven":
+                return self._forgive(proof, at_ns)
+        if not crept:
+            needed_ns = max(needed_ns, JUMP_PROOF_NS)
+        share = CREPT if crept else EVEN
+        self._proof = _Proof(delay, at_ns, needed_ns, share, again=True)
+        return "stale"
+
+    def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
+        """Believe the proven delay if an adjustment showed or a pause hid it, or by the budget."""
+        self._accrue(at_ns, FORGET_NS)
+        late = max(0, proof.least - self._least)
+        hidden = late
+        if self._before is not None:
+            hidden = min(late, max(0, self._before - self._least, late - self._shown))
+        if hidden > self._budget and not self._paused:
+            return "stale"
+        self._budget = max(0, min(self._budget, FORGIVE_NS) - hidden)
+        self.forgiven_ns = hidden
+        return self._believe(proof, "set")
+
+    def _accrue(self, at_ns: int, most_ns: int) -> None:
+        """Let the budget grow with the time. It has no limit while the clock is refused."""
+        grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
+        self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
+
+    def _forget_adjustments(self) -> None:
+        self._before, self._shown, self._paused = None, 0, False
+
+    def _believe(self, proof: _Proof, verdict: Verdict) -> Verdict:
+        self.state, self._least, self._proof = "known", proof.least, None
+        self._early = 0
+        self._forget_adjustments()
+        return verdict
 
 
 class Freshness:
-    """The clocks of all that stamp commands."""
+    """The clocks of all senders that stamp their commands."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
+        self._numbers: dict[str, tuple[int, int]] = {}
+        """Number and arrival of the last command of each sender that numbers without stamps."""
+        self.forgiven_ns = 0
+        """How much later foreign clocks became in all, without an adjustment that shows, ns."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
-        """What to do with a command; without a stamp it is as old as its arrival."""
+        """Return whether the command counts. Without a stamp it is as old as its arrival."""
         if command.stamp_ns is None:
-            return "fresh"
+            return self._in_order(command)
         name, at_ns = command.clock or command.source, command.arrived_ns
         clock = self._clocks.pop(name, None) or self._newcomers.pop(name, None) or _Clock(at_ns)
-        verdict = clock.judge(at_ns - command.stamp_ns, at_ns, timeout_ns)
-        held = self._newcomers if clock.new else self._clocks
+        verdict = clock.judge(command, command.stamp_ns, timeout_ns)
+        if verdict == "set":
+            self.forgiven_ns += clock.forgiven_ns
+        held = self._newcomers if clock.state == "new" else self._clocks
         held[name] = clock
         self._forget(at_ns)
         return verdict
 
+    def _in_order(self, command: Command) -> Verdict:
+        """Judge a command without a stamp by its number. A sender that paused may start again."""
+        number, at_ns = command.sequence, command.arrived_ns
+        if number is None:
+            return "fresh"
+        last, last_at_ns = self._numbers.pop(command.sender, (-1, at_ns))
+        stale = number <= last and at_ns - last_at_ns <= GAP_NS
+        self._numbers[command.sender] = (last, last_at_ns) if stale else (number, at_ns)
+        if len(self._numbers) > MAX_CLOCKS:
+            del self._numbers[next(iter(self._numbers))]
+        return "stale" if stale else "fresh"
+
     def _forget(self, now_ns: int) -> None:
-        """Those who would begin anew if they came back, so that it changes nothing: a recording
-        begins with all that is remembered, which the loop writes in one step."""
-        for held, silent_ns in ((self._newcomers, GAP_NS), (self._clocks, FORGET_NS)):
-            while held and now_ns - _oldest(held).heard_ns > silent_ns:
+        """Forget the clocks that were silent for long, and any above the limit.
+
+        A recording begins with all of them, which the loop writes in one step.
+        """
+        for held, silent_ns in ((self._newcomers, GAP_NS), (self._clocks, KEEP_NS)):
+            while held and now_ns - _oldest(held).at_ns > silent_ns:
                 del held[next(iter(held))]
         if len(self._newcomers) + len(self._clocks) > MAX_CLOCKS:
             both = [held for held in (self._newcomers, self._clocks) if held]
-            held = min(both, key=lambda one: _oldest(one).heard_ns)
+            held = min(both, key=lambda clocks: _oldest(clocks).at_ns)
             del held[next(iter(held))]
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """The one heard of longest ago: whoever is heard goes last."""
+    """Return the clock that was silent for longest: each command moves its clock to the end."""
     return next(iter(held.values()))

@@ -1,82 +1,223 @@
-"""The mode the robot is in, moved only by the table, and what latched it.
+"""The latches, the facts beside them, and the mode that follows from both.
 
-What lives here: the state beside the table (`modes.py`): switched on or off, why latched, when
-last stopped. What must not: what a mode means for the wheels (`robot.py`).
+A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
+time, and only `activate` releases `inactive`. A clear must not release a stop that its sender has
+not seen, however late the network delivers it:
+
+- A clear that names a number releases the latch with exactly this number.
+- A clear without a number is refused until `LOOK_FIRST_S` after the last stop. It may release a
+  fault that its sender has not seen, because a fault that persists latches again.
+- A clear that arrived before the latch was set never releases it.
+
+`modes.py` derives the mode. `robot.py` decides how the wheels follow it.
 """
 
 from __future__ import annotations
 
-from acsard.drive.modes import Mode, RefusedError, Trigger, next_mode
+import math
+
+from msgspec.structs import replace
+
+from acsard.drive.dates import utc
+from acsard.drive.modes import LEAVING, Mode, RefusedError, mode_of, require_allowed
+from acsard.values import NS_PER_S, Instant, Latch, Latches
+
+LOOK_FIRST_S = 2.0
+"""Seconds after a stop in which `clear` must name it: a sent packet seldom takes longer."""
+
+LONG_AGO_NS = -(2**62)
+"""Monotonic time before every other one."""
 
 
 class Lifecycle:
-    """One robot's mode. A request that cannot be raises `RefusedError`, in words."""
+    """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
 
-    def __init__(self, active: bool) -> None:
-        self.mode = Mode.INACTIVE
-        self.latched = ""
-        """Why it is stopped or in fault."""
-        self._active = active
-        self._stopped_ns = -1
-        self._resume(linked=False)
+    def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
+        """Start in the mode of these latches, or switched off if `active` is False."""
+        self.latches = latches
+        self.mode = Mode.WAITING
+        self._leaving = self._linked = self._commanded = False
+        self._dormant = not active
+        """True until the first `activate`, with `control.auto_activate = false`."""
+        found = (latches.stop, latches.fault, latches.inactive)
+        self._number = max([latch.number for latch in found if latch is not None], default=0)
+        self._stopped_ns = self._faulted_ns = LONG_AGO_NS
+        """Monotonic times at which the last stop and the last fault were latched."""
+        self._cleared_ns = LONG_AGO_NS
+        """Monotonic time at which a fault over a stop was last cleared."""
+        self._stop_asked_ns = LONG_AGO_NS
+        """Monotonic time at which the last stop arrived."""
+        self._derive()
 
-    def fire(self, trigger: Trigger) -> None:
-        """A fact (link, command, fault, leave) has come about."""
-        self.mode = next_mode(self.mode, trigger)
+    # facts
 
     def link(self, up: bool) -> None:
-        """The link is up, or is not."""
-        self.fire(Trigger.LINK_UP if up else Trigger.LINK_LOST)
+        """Note whether the link to the board is up."""
+        if up is not self._linked:
+            self._linked = up
+            self._derive()
 
-    def fault(self, why: str, now_ns: int) -> bool:
-        """Latch a fault; False when one is latched already, whose reason is kept."""
-        if self.mode in (Mode.FAULT, Mode.LEAVING):
+    def command(self, fresh: bool) -> None:
+        """Note whether there is a command to follow."""
+        if fresh is not self._commanded:
+            self._commanded = fresh
+            self._derive()
+
+    def leave(self) -> None:
+        """Note that the daemon is going down."""
+        self._leaving = True
+        self._derive()
+
+    def fault(self, why: str, now: Instant) -> bool:
+        """Latch a fault; return False and keep the earlier one if a fault is latched already."""
+        if self.latches.fault is not None:
             return False
-        self._stopped_ns = now_ns
-        self.fire(Trigger.FAULT)
-        self.latched = why
+        self._faulted_ns = now.mono_ns
+        self._latch(fault=self._made(now, "", why))
         return True
 
-    def stop(self, now_ns: int) -> str:
-        """Stop and latch."""
-        self._stopped_ns = now_ns
-        self.fire(Trigger.STOP)
-        if self.mode is Mode.LEAVING:
-            return "the daemon is going down: ramping to zero"
-        if self.mode is Mode.FAULT:
-            return "in fault, which holds the robot already; srv/clear releases it"
-        self.latched = "stopped by request"
+    # requests
+
+    def stop(self, by: str, asked_ns: int, now: Instant) -> str:
+        """Latch a stop under a new number, unless a later stop is latched already."""
+        repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
+        if not repeated:
+            self._stopped_ns, self._stop_asked_ns = now.mono_ns, asked_ns
+            self._latch(stop=self._made(now, by, f"stopped by {by or 'request'}"))
+        if self._leaving:
+            return f"stopped and latched; {LEAVING}"
+        if self.latches.fault is not None:
+            return "stopped and latched; srv/clear releases the fault first, then the stop"
         return "stopped and latched; srv/clear releases it"
 
-    def clear(self, asked_ns: int, now_ns: int, linked: bool) -> bool:
-        """Release the latch, unless it was asked before the last stop or fault came about.
+    def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
+        """Release the fault, or else the stop; return the answer, or "" if none was latched.
 
-        False when nothing was latched, and nothing has changed.
+        Args:
+            number: The latch that the sender has seen, None if the request names none.
+            asked_ns: Monotonic time at which the request arrived.
+            now: Both clocks at this step.
         """
-        if asked_ns <= self._stopped_ns or now_ns == self._stopped_ns:
-            raise RefusedError("a stop or fault came at the same time or after; call it again")
-        before = self.mode
-        self.fire(Trigger.CLEAR)
-        if self.mode is before:
-            return False
-        self.latched = ""
-        self._resume(linked)
-        return True
+        require_allowed(self.mode, "clear")
+        latches, latch = self.latches, self.latches.next
+        if latch is None:
+            return ""
+        if number is None:
+            self._require_seen(asked_ns, now)
+            set_ns = max(self._stopped_ns, self._faulted_ns)
+        else:
+            if number != latch.number:
+                raise RefusedError(self._unseen(number, latch))
+            set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
+        if asked_ns <= set_ns or now.mono_ns == set_ns:
+            raise RefusedError("a stop or a fault came at the same time or later: call it again")
+        if latches.fault is None:
+            self._latch(stop=None)
+            return "cleared; each sender must send a zero before it drives"
+        self._cleared_ns = now.mono_ns
+        self._latch(fault=None)
+        if latches.stop is None:
+            return "cleared; each sender must send a zero before it drives"
+        return f"fault cleared; still {latches.stop.why}: call srv/clear again"
 
-    def activate(self, linked: bool) -> bool:
-        """Switch on; True when it was off."""
-        self.fire(Trigger.ACTIVATE)
-        was_off, self._active = not self._active, True
-        if linked:
-            self.link(True)
+    def activate(self) -> bool:
+        """Switch the robot on; return True if it was off."""
+        require_allowed(self.mode, "activate")
+        was_off = self._off
+        self._dormant = False
+        self._latch(inactive=None)
         return was_off
 
-    def deactivate(self) -> str:
-        """Switch off."""
-        self.fire(Trigger.DEACTIVATE)
-        self._active = False
+    def deactivate(self, by: str, now: Instant) -> str:
+        """Switch the robot off; the first request that did it stays latched."""
+        require_allowed(self.mode, "deactivate")
+        if self.latches.inactive is None:
+            self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
         return "inactive: ramping to zero; srv/activate switches it on"
 
-    def _resume(self, linked: bool) -> None:
-        if self._active:
-            self.activate(linked)
+    def lower(self, limits: dict[str, float]) -> None:
+        """Keep these limits, which `set` made lower than in the configuration file."""
+        if limits != self.latches.lowered:
+            self.latches = replace(self.latches, lowered=limits)
+
+    @property
+    def why(self) -> str:
+        """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
+        latches = self.latches
+        if latches.fault is not None:
+            fault = f"{latches.fault.why}, latched {_when(latches.fault)}"
+            if latches.stop is None:
+                return f"{fault}; call srv/clear"
+            return f"{fault}; also {_said(latches.stop)}; call srv/clear twice"
+        if latches.stop is not None:
+            return f"{_said(latches.stop)}; call srv/clear"
+        if latches.inactive is not None:
+            return f"{_said(latches.inactive)}; call srv/activate"
+        return "switched off; call srv/activate"
+
+    # latches and mode
+
+    @property
+    def _off(self) -> bool:
+        return self._dormant or self.latches.inactive is not None
+
+    def _made(self, now: Instant, by: str, why: str) -> Latch:
+        self._number = max(self._number + 1, now.wall_ns // 1_000_000)
+        return Latch(self._number, now.wall_ns, by, why)
+
+    def _latch(self, **changes: Latch | None) -> None:
+        before = self.latches
+        if any(getattr(before, name) is not latch for name, latch in changes.items()):
+            self.latches = replace(before, **changes)
+        self._derive()
+
+    def _derive(self) -> None:
+        self.mode = mode_of(
+            leaving=self._leaving,
+            fault=self.latches.fault is not None,
+            stopped=self.latches.stop is not None,
+            inactive=self._off,
+            linked=self._linked,
+            commanded=self._commanded,
+        )
+
+    def _require_seen(self, asked_ns: int, now: Instant) -> None:
+        """Raise `RefusedError` if a stop came so shortly before that the sender may not know it."""
+        stop = self.latches.stop
+        if stop is None:
+            return
+        if asked_ns - self._cleared_ns < LOOK_FIRST_S * NS_PER_S:
+            # The network may have delivered one clear twice.
+            raise RefusedError(
+                f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
+                f"{stop.why}: look at it, then call srv/clear again"
+            )
+        # The monotonic clock says nothing of a stop before the restart.
+        since = (now.wall_ns - stop.at_ns) if stop.kept else asked_ns - self._stopped_ns
+        if 0 <= since < LOOK_FIRST_S * NS_PER_S:
+            age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
+            raise RefusedError(
+                f"a stop by {stop.by or 'request'} came {age_s:.1f} s ago: look at the robot, then "
+                f"call srv/clear again {LOOK_FIRST_S:g} s after it, or with the latch of the state "
+                "that you have looked at"
+            )
+
+    def _unseen(self, number: int, latch: Latch) -> str:
+        """Return why a clear that names this number does not release `latch`."""
+        still = f"in fault ({latch.why})" if latch is self.latches.fault else latch.why
+        return (
+            f"latch {number} is not in force; the robot is still {still}: look at it, then call "
+            "srv/clear again"
+        )
+
+
+def _when(latch: Latch) -> str:
+    return f"at {utc(latch.at_ns)}{', before the restart' if latch.kept else ''}"
+
+
+def _said(latch: Latch) -> str:
+    """Return the words for a stop or for switching off, with the time."""
+    if not latch.why.endswith(f" by {latch.by or 'request'}"):
+        # The daemon itself set it at a start, and its reason is a whole sentence.
+        return f"{latch.why} (latched {_when(latch)})"
+    return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"

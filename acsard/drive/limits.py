@@ -82,8 +82,11 @@ class Limiter:
         return twist
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Fall towards rest for `dt` s, along the line to it; `stop` brakes by the stop limits."""
-        twist = self.twist
+        """Fall towards rest for `dt` s, along the line to it; `stop` brakes by the stop limits.
+
+        A negative `dt` changes nothing: it must not speed up the robot.
+        """
+        dt, twist = max(0.0, dt), self.twist
         seconds = max(
             abs(twist.linear) / _braking(self._linear, stop),
             abs(twist.angular) / _braking(self._angular, stop),

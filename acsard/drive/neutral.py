@@ -1,163 +1,127 @@
-"""Neutral first: whether one sender may drive, by what it has sent since that was required.
+"""The neutral-first rule for one sender: whether it may drive, by what it has sent.
 
-    unheard  nothing of it has been heard yet
-    heard    it commands, and has not let go
-    free     it has let go: it may drive, until neutral is required again
+A sender is armed by a zero, never by a pause, and it stays armed until arming is asked for again:
 
-It lets go by a zero that no speed came shortly before, or by a pause of its own doing. What lives
-here: one sender's last command and its state. What must not: which sender is followed
-(`arbiter.py`).
+- A zero of a sender with an identity of its own arms it at once, also right behind its speeds.
+- Several programs may share an identity (a bridge, a plain key). Then a zero arms it when no speed
+  has followed for `commands.pause`. Further zeros and silence change nothing. Otherwise the zero
+  of one program would release another one that never stopped.
+
+This module holds one sender's last command and its arming. `arbiter.py` decides which sender is
+followed and asks for arming again. `freshness.py` decides whether a command counts.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from statistics import median
-from typing import Literal
-
+from acsard.drive.freshness import Verdict
 from acsard.values import REST, Command
-
-State = Literal["unheard", "heard", "free"]
-Sign = Literal["moving", "zero", "pause"]
-"""`moving` is a speed, or a zero among speeds: others may look like this sender."""
-
-NEXT: dict[tuple[State, Sign], State] = {
-    ("unheard", "moving"): "heard",
-    ("unheard", "zero"): "free",
-    ("unheard", "pause"): "heard",  # who was not heard cannot pause
-    ("heard", "moving"): "heard",
-    ("heard", "zero"): "free",
-    ("heard", "pause"): "free",
-}
-"""What a command shows, and what that leads to. Who is free stays so."""
-
-INTERVALS = 5
-"""A sender's usual interval is the median of so many: a stall among them does not make it."""
 
 
 class Sender:
-    """One sender of a source: two programs, or two people, on one key are two."""
+    """One sender of a source. Two programs are two senders if their identities differ."""
 
-    def __init__(self, timeout_ns: int, pause_ns: int, state: State) -> None:
+    def __init__(self, timeout_ns: int, pause_ns: int, neutral_first: bool) -> None:
         self.use(timeout_ns, pause_ns)
-        self.state = self._sure = state
-        """Also by what does not count yet; and only by what does."""
+        self._neutral_first = neutral_first
+        self._armed = self._proven_armed = not neutral_first
+        self._zero_ns: int | None = None
+        """Arrival of the zero of a shared identity that no speed has followed yet."""
+        self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Its last command that counted, since neutral was last required."""
+        """Arrival of the last command that counted since arming was last asked for."""
         self.came_ns = 0
-        """First command since it was last silent: who came first."""
+        """Arrival of the first command after the sender was last silent: the first sender wins."""
         self.zeros_ns: int | None = None
-        """First of the zeros that it has sent without a speed since; None when it sent one."""
+        """Arrival of the first zero since the last speed, or None if the last was a speed."""
         self.ros = False
-        """It sends from ROS."""
+        """The last command came from ROS."""
+        self.shared = False
+        """Several programs may share this identity."""
         self.noticed_ns = 0
-        """Last sign of it, whether that counted or not."""
-        self.doubted_ns: int | None = None
-        """Last command of it that did not count for when it was sent."""
-        self._moved_ns: int | None = None
-        """Its last speed, or what may have been one."""
-        self._intervals: deque[int] = deque(maxlen=INTERVALS)
-        """How far its last speeds were apart."""
-        self._stamp_ns: int | None = None
-        """When it says that it sent the last command that could be believed."""
-        self._sequence: int | None = None
+        """Arrival of the last message, whether it counted or not."""
+        self._doubted_ns: int | None = None
+        self.doubt: Verdict = "unproven"
+        """Why the last command that did not count was refused by its stamp."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
-        """Go by these from now on."""
+        """Apply this command timeout and this `commands.pause` from now on."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:
-        """Its last command is no older than the timeout of its source."""
+        """Return whether the last command is no older than the timeout of its source."""
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def doubtful(self, now_ns: int) -> bool:
-        """Nothing of it counts because of when that was sent."""
-        return self.doubted_ns is not None and now_ns - self.doubted_ns <= self._timeout_ns
+        """Return whether its stamps are the reason that its commands do not count now."""
+        return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
 
-    def forget(self, state: State) -> None:
-        """What it has sent until now counts no more."""
-        self.arrived_ns = self._stamp_ns = None
-        self.state = self._sure = state
+    def armed(self, now_ns: int) -> bool:
+        """Return whether the sender may drive."""
+        self._settle(now_ns)
+        return self._armed
+
+    def require_neutral(self) -> None:
+        """Forget the last command and ask for a zero again."""
+        self.arrived_ns = self._zero_ns = self._proven_zero_ns = None
+        self._armed = self._proven_armed = not self._neutral_first
 
     def unlearn(self) -> None:
-        """What did not count until now never will."""
-        self.state = self._sure
+        """Forget the zeros whose stamps were never proven: they may come from a backlog."""
+        self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Something of it that does not count came in: it may have been a speed."""
-        if self._moved_ns is not None:
-            self._intervals.append(at_ns - self._moved_ns)
-        self._moved_ns = self.noticed_ns = at_ns
+        """Take note of a message that does not count: it may have been a speed."""
+        self._settle(at_ns)
+        self._zero_ns = self._proven_zero_ns = None
+        self.noticed_ns = at_ns
 
-    def take(self, command: Command, since_ns: int, *, counts: bool = True) -> None:
-        """A command of it, which says nothing of neutral if it arrived before `since_ns`.
+    def refuse(self, command: Command, why: Verdict) -> None:
+        """Take note of a command that is stale."""
+        self.notice(command.arrived_ns)
+        self._doubt(command, why)
 
-        One that does not count yet makes it neutral all the same, but not live.
+    def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
+        """Take a command that counts, or that will count once its clock is proven.
+
+        A zero that arrived before `since_ns`, when arming was last asked for, does not arm.
+        A zero of an unproven clock arms once that clock is proven, unless `unlearn` comes first.
         """
-        now_ns = command.arrived_ns
-        if now_ns >= since_ns and self.state != "free":
-            self.state = NEXT[self.state, self._sign(command)]
-        self._stamp_ns, self._sequence = command.stamp_ns, command.sequence
-        if is_zero(command):
-            self.noticed_ns = now_ns
-        else:
-            self.notice(now_ns)
-        if not counts:
-            self.doubted_ns = now_ns
+        now_ns, zero = command.arrived_ns, is_zero(command)
+        self._settle(now_ns)
+        self.noticed_ns, self.shared = now_ns, command.shared
+        if not zero:
+            self._zero_ns = self._proven_zero_ns = None
+        elif now_ns >= since_ns and not command.shared:
+            self._armed = True
+        elif now_ns >= since_ns and self._zero_ns is None:
+            self._zero_ns = now_ns
+        if verdict in ("first", "unproven"):
+            self._doubt(command, verdict)
             return
+        self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns
         live = self.live(now_ns)
         if not live:
             self.came_ns = now_ns
-        if not is_zero(command):
+        if not zero:
             self.zeros_ns = None
         elif self.zeros_ns is None or not live:
             self.zeros_ns = now_ns
-        self.ros = command.ros
-        self._sure, self.name = self.state, command.sender
-        self.twist, self.arrived_ns, self.doubted_ns = command.twist, now_ns, None
+        self.ros, self.name = command.ros, command.sender
+        self.twist, self.arrived_ns, self._doubted_ns = command.twist, now_ns, None
 
-    def _sign(self, command: Command) -> Sign:
-        if is_zero(command) and self._let_go(command):
-            return "zero"
-        return "pause" if self._paused(command) else "moving"
+    def _doubt(self, command: Command, why: Verdict) -> None:
+        self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
-    def _let_go(self, command: Command) -> bool:
-        """No speed came for so long before that nobody can be in the midst of sending them."""
-        if self._moved_ns is None:
-            return True
-        usual = self._usual or 0.0
-        enough = max(self._timeout_ns, min(1.5 * usual, self._pause_ns))
-        if command.shared:  # whose zero it is, nobody knows
-            enough = max(self._timeout_ns, self._pause_ns + min(usual, self._pause_ns))
-        return command.arrived_ns - self._moved_ns > enough
-
-    def _paused(self, command: Command) -> bool:
-        """It was silent for clearly longer than it usually is, by its own doing."""
-        usual = self._usual
-        if usual is None:
-            return False  # all one knows this may be how often it sends
-        longest = self._longest_ns(usual)
-        if command.arrived_ns - self.noticed_ns <= longest:
-            return False
-        # Or was the network silent?
-        sent, before = command.stamp_ns, self._stamp_ns
-        if sent is not None and before is not None and sent - before <= longest:
-            return False
-        number, last = command.sequence, self._sequence
-        return number is None or last is None or number == last + 1
-
-    def _longest_ns(self, usual: float) -> float:
-        """Silence that is no pause yet: it began when its next speed was due."""
-        return max(self._timeout_ns, self._pause_ns + usual, 3 * usual)
-
-    @property
-    def _usual(self) -> float | None:
-        """How far its speeds are apart, ns; None until that shows."""
-        return median(self._intervals) if self._intervals else None
+    def _settle(self, now_ns: int) -> None:
+        """Arm a shared identity if no speed has followed its zero for the pause."""
+        if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
+            self._armed = True
+            if self._proven_zero_ns == self._zero_ns:
+                self._proven_armed = True
 
 
 def is_zero(command: Command) -> bool:
-    """It asks for rest, and not because opposites cancel out."""
+    """Return whether the command asks for rest, not for wheel speeds that cancel out."""
     return command.twist == REST and not command.cancelled

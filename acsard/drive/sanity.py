@@ -65,8 +65,10 @@ class _Wheel:
         self.evidence = dict.fromkeys(_FAULTS, 0.0)
         self.suspected = False
         """There is some of that."""
-        self.slowest = 0.0
-        """rad/s; down to here it has slowed since it is faster than it should be."""
+        # Infinity lets the first line count as slowing down. With 0, a wheel that was already
+        # too fast would never count as slowing down: slow motors latched "runaway" that way.
+        self.slowest = math.inf
+        """Slowest speed since the wheel became faster than it should be, rad/s."""
 
     def signs(self, told: float, speed: float, share: float, still: bool) -> tuple[bool, ...]:
         """Whether it looks dead, reversed, running away, stuck: in the order of `_FAULTS`.

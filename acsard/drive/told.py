@@ -7,8 +7,9 @@ from acsard.drive.modes import Mode
 from acsard.drive.words import chosen, waiting
 from acsard.values import Event, Refusal
 
-MAX_SENDER = 40
-"""Characters of a sender's id: he may choose it himself."""
+MAX_SENDER = 124
+"""Characters of a sender's name. A public name has up to 57, and 67 with a certificate; a sender
+without an attachment is named after its key, which it may choose."""
 
 
 def missed(periods: int) -> Event:

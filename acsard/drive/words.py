@@ -9,15 +9,17 @@ REFUSED = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
     "crowded": f"{MAX_SENDERS} other senders of this source are live",
-    "unproven": "of a sender that is new here: no error, it counts once its delays are steady",
-    "stale": "held up on the way for longer than the source's timeout, or the sender's clock was "
-    "set: counts once its delays are steady",
+    "unproven": "a sender that is new here counts once its delays have proved steady; this is "
+    "not an error",
+    "stale": "older than the source's timeout allows, or than a command that was accepted: the "
+    "network held it up, or the sender's clock was set",
 }
-"""What a command is refused for."""
+"""The words for each reason to refuse a command."""
 
 
 ROS_NEVER = (
-    ' (`ros2 topic pub` of a speed never does that: "Drive" in deploy/ros2/README.md has what does)'
+    " (`ros2 topic pub` of a speed sends none: "
+    '"After a clear" in deploy/ros2/README.md has tools that do)'
 )
 
 
@@ -37,14 +39,20 @@ def waiting(wait: Wait) -> str:
             return "a command"
         case "proof":
             return (
-                f"{wait.source} may be late: its delays must be steady for {wait.seconds:g} s if "
-                "its clock is new here, for 1.5 s if that was set"
+                f"{wait.source} is new here: it drives once its delays have been steady for "
+                f"{wait.seconds:g} s"
+            )
+        case "late":
+            return (
+                f"commands of {wait.source} come too late, by more than {wait.seconds:g} s: the "
+                "network holds them up, or the sender's clock was set"
             )
         case "neutral":
-            lasts = f", and sends speeds for over {_long(wait.lasts)}" if wait.lasts else ""
+            lasts = f"; it has sent speeds for over {_long(wait.lasts)}" if wait.lasts else ""
+            alone = f", and no speed for {wait.seconds:g} s after it," if wait.shared else ""
             return (
-                f"neutral first: {wait.source} must send a zero, or pause for "
-                f"{wait.seconds:g} s, before it can drive{lasts}{ROS_NEVER if wait.ros else ''}"
+                f"send a zero first: {wait.source} must send a zero{alone} before it can drive"
+                f"{lasts}{ROS_NEVER if wait.ros else ''}"
             )
         case "zeros":
             kept = f"; {wait.kept} sends speeds and is kept waiting" if wait.kept else ""

@@ -102,9 +102,8 @@ class Bridge:
 
     def _viewer(self, client: int) -> Client:
         """The robot as one of the viewers commands it."""
-        robot = self._robot.like(self._id)
-        robot.sender = f"{self._robot.sender}/{client}"
-        return robot
+        name = self._robot.sender.rpartition("/")[0]
+        return self._robot.like(self._id, f"{name}/{client}")
 
     def _alive(self, sample: zenoh.Sample) -> None:
         self._here = sample.kind == zenoh.SampleKind.PUT

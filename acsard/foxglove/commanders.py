@@ -22,7 +22,7 @@ class Way(Struct, frozen=True):
     """A key of the bus as the daemon takes it."""
 
     native: str
-    """The key below the robot's id that it stands for."""
+    """The key below the robot's id that it stands for; "*" is a certificate's name."""
     encoding: str = ""
     """Of samples that name none."""
     via: Via = "native"
@@ -34,7 +34,7 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
     `key_of` makes the full key of one below the robot's id.
     """
     native = source_keys([source])
-    found = {key_of(key): Way(key) for key in native}
+    found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
     for one in endpoints(ros, "*"):
         if one.native in native:
             found[one.key] = Way(one.native, one.encoding, one.transport)

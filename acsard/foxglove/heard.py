@@ -75,13 +75,15 @@ class _Heard:
 
     def _take(self, sample: zenoh.Sample) -> None:
         now = clock.now()
-        way = self._ways.get(str(sample.key_expr))
+        key = str(sample.key_expr)
+        head, _, last = key.rpartition("/")
+        way = self._ways.get(key) or self._ways.get(f"{head}/*")
         if way is None:
             return  # a stranger put it on a wildcard
         put = sample.kind == zenoh.SampleKind.PUT
         attached = sample.attachment
         arrival = Arrival(
-            way.native,
+            way.native.replace("*", last),
             put,
             sample.payload.to_bytes()[: MAX_COMMAND_BYTES + 1],  # by one too many it is refused
             way.encoding or str(sample.encoding),

@@ -25,6 +25,11 @@ def asleep_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
 
+def steady_ns() -> int:
+    """Return a time in ns that nobody adjusts and that goes on while this computer is suspended."""
+    return mono_ns() + asleep_ns()
+
+
 TOGETHER_NS = 50_000
 """Two readings take 1 us, unless another process gets the core between them."""
 

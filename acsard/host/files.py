@@ -73,8 +73,15 @@ def _left(file: Path, error: Exception) -> ExitError:
     return ExitError(Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand")
 
 
-def replace(file: Path, text: str) -> None:
-    """The file is the old one or the new one, never half of it; who may read it stays."""
+def replace(file: Path, text: str, *, synced: bool = True) -> None:
+    """Replace the file by one with this text; its owner and its mode stay.
+
+    Args:
+        file: The file. Other processes find the old one or the new one, never a part of it.
+        text: The new content.
+        synced: True waits for the disk before the rename, so that a power cut leaves the old file
+            or the new one. After False a power cut may leave a part of the new one until `sync`.
+    """
     before = file.stat() if file.exists() else None
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
@@ -87,8 +94,19 @@ def replace(file: Path, text: str) -> None:
                     os.fchown(new.fileno(), before.st_uid, before.st_gid)
             except PermissionError:
                 pass  # another's file in a directory of ours: it becomes ours
-            os.fsync(new.fileno())
+            if synced:
+                os.fsync(new.fileno())
         os.replace(name, file)
     except BaseException:
         os.unlink(name)
         raise
+
+
+def sync(file: Path) -> None:
+    """Wait until the disk has the file and its name."""
+    for path in (file, file.parent):
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

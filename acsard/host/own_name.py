@@ -1,11 +1,17 @@
-"""What this process calls itself to a daemon whose services it calls."""
+"""The names that this process gives itself to a daemon."""
 
 from __future__ import annotations
 
 import os
 import pwd
+import secrets
 import sys
 from pathlib import Path
+
+from acsard.messages.signature import MAX_NAME
+
+SECRET_BYTES = 16
+"""128 bits, which no program can guess."""
 
 
 def own_name() -> str:
@@ -18,3 +24,13 @@ def own_name() -> str:
     path = Path(sys.argv[0])
     program = path.parent.name if path.stem == "__main__" else path.stem
     return f"{user}@{machine} {program.removeprefix('-c')}".rstrip()
+
+
+def sender_id(name: str, secret: str = "") -> str:
+    """Return a sender id of this name, `NAME/SECRET`, with a new secret unless one is given."""
+    return f"{name[:MAX_NAME]}/{secret or new_secret()}"
+
+
+def new_secret() -> str:
+    """Return 22 random characters that hold no "/"."""
+    return secrets.token_urlsafe(SECRET_BYTES)

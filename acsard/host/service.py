@@ -27,7 +27,7 @@ LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
 """Where `lan.conf` believes the certificates to be."""
 STATES = {
-    UNIT: (Path("/var/lib/acsard"), "what it has recorded"),
+    UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that it keeps"),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
 """Where units keep what they write, and what that is."""

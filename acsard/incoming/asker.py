@@ -1,35 +1,28 @@
-"""Who asked or stopped, in words for the log: the name he gives himself, and the way it came.
+"""Names for the log the program that called a service or sent a stop.
 
-A claim, not a proof: Zenoh does not tell which connection a query came by, nor whose certificate
-that shows. The name is the `sender` of the signature (`messages/signature.py`) on the call or put;
-`client/` sets it. ROS has none: by rmw_zenoh it is the client's GID, and a bridge tells nothing.
+The name is the public name of the sender id in the attachment (`messages/signature.py`), followed
+by the transport in brackets. The name itself is a claim: Zenoh does not say which connection a
+query came by. The digits behind it are the same for as long as the program keeps its secret. A
+call over rmw_zenoh has the client's GID, which ROS discovery publishes; a bridge says nothing.
 """
 
 from __future__ import annotations
 
 from acsard.incoming.commands import Via
-from acsard.messages.signature import unpack
+from acsard.messages.signature import public_name, unpack
 from acsard.ros.attachments import GID_BYTES
-
-MAX_NAME = 40
-"""Characters kept of a name that a stranger chooses."""
-
-MARKS = " @._-:/+"
-"""What a name may have beside letters and digits: nothing that the words around it use."""
 
 
 def asker(via: Via, attachment: bytes, stamped_by: str = "") -> str:
-    """The name, and in brackets the way; `stamped_by` is the session that stamped it, if any."""
+    """Return the caller's public name and its transport.
+
+    `stamped_by` is the id of the Zenoh session that stamped the sample, "" for none.
+    """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"
     if via == "bridge":
         return "unnamed (bridge)"
-    session = f", session {stamped_by}" if stamped_by else ""
-    return f"{_name(attachment)} (native{session})"
-
-
-def _name(attachment: bytes) -> str:
+    session = f", session {public_name(stamped_by)}" if stamped_by else ""
     signature = unpack(attachment)
-    text = signature.sender[:MAX_NAME] if signature else ""
-    kept = (char if char.isalnum() or char in MARKS else "?" for char in text)
-    return "".join(kept).strip() or "unnamed"
+    name = public_name(signature.sender) if signature else "unnamed"
+    return f"{name} (native{session})"

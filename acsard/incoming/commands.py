@@ -13,9 +13,11 @@ from msgspec import UNSET, Struct, UnsetType
 
 from acsard.config.settings import JointsConfig
 from acsard.drive.kinematics import Kinematics
+from acsard.incoming.bindings import Bindings
 from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import (
+    Clear,
     Header,
     JointState,
     SetPose,
@@ -24,6 +26,8 @@ from acsard.messages.schema import (
     TwistStamped,
     Vector3,
 )
+from acsard.messages.signature import public_name
+from acsard.messages.topics import COMMANDS
 from acsard.ros.attachments import GID_BYTES, unpack
 from acsard.ros.transports import Transport
 from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
@@ -80,12 +84,14 @@ _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
 _poses = Decoder(SetPose)
 _settings = Decoder(Settings)
+_clears = Decoder(Clear)
 
 EXAMPLES: dict[Verb, str] = {
     "set_pose": '{"x": 0, "y": 0, "yaw": 0}',
     "set": '{"settings": {"limits.linear_speed": 0.8}}',
+    "clear": '{"latch": 1800000000000}',
 }
-"""The payload of each service that has one."""
+"""The payload of each service that has one; `clear` may also come without."""
 
 
 class Receiver:
@@ -94,11 +100,12 @@ class Receiver:
     def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
         self._joints = joints.as_tuple()
         self._kinematics = kinematics
+        self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
         """The command in a sample on `cmd/…` or `wheel_cmd/…`; raises `DecodeError`."""
-        kind, _, source = arrival.key.partition("/")
-        if "*" in arrival.key or "/" in source:
+        kind, source, certificate = parts(arrival.key)
+        if "*" in arrival.key or "/" in certificate:
             raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
         if not arrival.put:
             raise DecodeError("not_a_put", "a DELETE is not a command")
@@ -110,10 +117,18 @@ class Receiver:
             twist, header, cancelled = self._twist(arrival)
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
-        if header is not None and header.stamp.to_ns() > 0:
-            # Another clock than the envelope's: its own name.
+        if header is not None and header.stamp.to_ns() > 0 and not said.steady:
+            # The header has a clock of its own, with a name of its own.
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
+        if said.signed:
+            bound = self._bindings.other(said.signed, certificate, arrival.arrived_ns)
+            if bound is not None:
+                where = f"certificate {bound}" if bound else "the robot's own machine"
+                raise DecodeError(
+                    "other_certificate",
+                    f"its sender id was first seen under {where}: attach an id of its own",
+                )
         ours = arrival.received_ns
         return Command(
             source,
@@ -127,6 +142,7 @@ class Receiver:
             shared=said.shared,
             ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
+            steady=said.steady,
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
@@ -173,13 +189,16 @@ class Receiver:
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
         """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
-        if verb not in EXAMPLES:
+        if verb not in EXAMPLES or (verb == "clear" and not payload):
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
         if verb == "set":
             wished = _settings.decode(encoding, payload).settings
             return Request(verb, ticket, asked_ns=asked_ns, settings=wished)
+        if verb == "clear":
+            latch = _clears.decode(encoding, payload).latch
+            return Request(verb, ticket, asked_ns=asked_ns, latch=latch)
         got = _poses.decode(encoding, payload)
         if (
             not all(map(math.isfinite, (got.x, got.y, got.yaw)))
@@ -190,38 +209,77 @@ class Receiver:
 
 
 class Voice(Struct, frozen=True):
-    """Who sent a sample, when and as which of its own, as far as that can be told."""
+    """The sender of a sample, its stamp and its number, as far as the envelope has them."""
 
     sender: str
+    """The public name: never the id that the sender attached."""
     stamp_ns: int | None = None
     sequence: int | None = None
     shared: bool = False
-    """Several programs may look like it."""
+    """Several programs may share this identity."""
+    steady: bool = False
+    """Nobody adjusts the clock of its stamps."""
+    signed: str = ""
+    """The public name without the certificate, "" unless a native command has one of its own."""
+
+
+def parts(key: str) -> tuple[str, str, str]:
+    """Split the key of a command into kind, source and certificate, "" for none."""
+    kind, _, rest = key.partition("/")
+    source, _, certificate = rest.partition("/")
+    return kind, source, certificate
 
 
 def voice(arrival: Arrival) -> Voice:
-    """By our attachment, else rmw's, else Zenoh's timestamp, else just the key.
+    """Return the sender of a sample, by the first of these that is there.
 
-    All that have nothing but a key are one, so are all ROS nodes behind a bridge, which says
-    nothing of them, and all that a router stamps. Raises `DecodeError`.
+    On a native key: the attachment (`messages/signature.py`), the session that stamped the sample,
+    the key. On a key of rmw_zenoh: the GID. On a key of a bridge: the session that stamped the
+    sample, the key. All programs that have nothing but a key look like one sender, and so do all
+    ROS nodes behind a bridge and all programs that a router stamps. Raises `DecodeError`.
+
+    From here on the sender has only its public name. ROS discovery publishes GIDs, so a program
+    that may follow it and put on a key of rmw_zenoh can still claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
-        return Voice(rmw.gid.hex(), rmw.stamp_ns, rmw.sequence)
-    told = signature.unpack(arrival.attachment)
+        return Voice(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence)
+    if arrival.via == "bridge":
+        name = f"bridge/{public_name(arrival.sender)}" if arrival.sender else _by_key(arrival)
+        return Voice(name, arrival.stamp_ns, shared=True)
+    told, sender_id, stamp_ns = signature.unpack(arrival.attachment), arrival.sender, None
     if told is not None:
-        stamp_ns = arrival.stamp_ns if told.stamp is None else told.stamp
-        return Voice(told.sender, stamp_ns, told.sequence)
-    if arrival.sender:
-        return Voice(arrival.sender, arrival.stamp_ns, shared=arrival.via == "bridge")
-    key = arrival.key.partition("/")[2]
-    return Voice(f"{arrival.via}/{key}", arrival.stamp_ns, shared=True)
+        sender_id, stamp_ns = told.sender, told.stamp
+    steady = told is not None and told.steady and told.stamp is not None
+    if stamp_ns is None:
+        stamp_ns = arrival.stamp_ns
+    if not sender_id:
+        return Voice(_by_key(arrival), stamp_ns, shared=True)
+    kind, _, certificate = parts(arrival.key)
+    return Voice(
+        public_name(sender_id, certificate),
+        stamp_ns,
+        None if told is None else told.sequence,
+        steady=steady,
+        signed=public_name(sender_id) if kind in COMMANDS else "",
+    )
+
+
+def _by_gid(gid: bytes) -> str:
+    """Return the public name of a ROS publisher, which no native sender id can have."""
+    return f"gid {public_name(gid.hex())}"
+
+
+def _by_key(arrival: Arrival) -> str:
+    return f"{arrival.via}/{arrival.key.partition('/')[2]}"
 
 
 def sender(arrival: Arrival) -> str:
-    """Who sent it, also where the attachment of an rmw cannot be read."""
+    """Return the sender's name, also if the attachment of an rmw cannot be read."""
     if arrival.via == "rmw":
-        return arrival.attachment[-GID_BYTES:].hex()
+        gid = arrival.attachment[-GID_BYTES:]
+        # A shorter one could look like the public name of a sender without a name.
+        return _by_gid(gid) if len(gid) == GID_BYTES else ""
     return voice(arrival).sender
 
 

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, sender
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
+from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S, Event, GyroSample
 
 MAX_RATE = 50.0
@@ -24,8 +25,8 @@ MAX_RATE = 50.0
 FOLLOWED_NS = NS_PER_S // 2
 """How long who was heard last is waited for."""
 
-OWN = "the simulator's own gyro"
-"""How that signs what it says."""
+OWN = "gyro of the simulator/own"
+"""The sender id with which the simulator signs the samples of its gyro."""
 
 MOST_WHO = 64
 """Characters of a sender's name that are told."""
@@ -54,7 +55,7 @@ class ImuTold:
     def __init__(self, own: bool = False) -> None:
         """`own`: the robot is the simulated one, which has a gyro and follows no other."""
         self._own = own
-        self._followed = OWN if own else ""
+        self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
 
     def hear(

@@ -36,8 +36,13 @@ class FrameError(AcsardError):
     """A line is not a frame; `reason` is the name it is counted under."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
-        super().__init__(f"{reason}: {line[:60]!r}")
+        super().__init__(reason, line)
         self.reason = reason
+
+    def __str__(self) -> str:
+        # Formatted only when it is shown: a noisy wire raises hundreds of these in one step.
+        reason, line = self.args
+        return f"{reason}: {line[:60]!r}"
 
 
 class Codec:

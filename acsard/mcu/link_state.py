@@ -3,7 +3,9 @@
 down     the port is closed
 booting  the port is open, or the MCU has restarted: fewer than GOOD_LINES good lines since
 up       lines come in time, and right if they are checked
-stale    it was up, then no good line for `quiet`, or BAD_LINES bad checked ones in a row
+stale    it was up, then no good line for `quiet`, or BAD_LINES bad checked ones in a row, or
+         no line of ours left for the board's watchdog time although the port is open, or
+         the lines that came turned out to be our own
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from typing import Literal
 from acsard.values import NS_PER_S
 
 State = Literal["down", "booting", "up", "stale"]
-Sign = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged"]
+Sign = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
 
 TABLE: dict[tuple[State, Sign], State] = {
     ("down", "opened"): "booting",
@@ -25,6 +27,8 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("up", "restarted"): "booting",
     ("up", "silent"): "stale",
     ("up", "damaged"): "stale",
+    ("up", "blocked"): "stale",
+    ("up", "echo"): "stale",
     ("stale", "closed"): "down",
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",

@@ -9,6 +9,9 @@ from acsard.mcu.negotiation import MENDS, Negotiation
 from acsard.mcu.whose_silence import Lateness
 from acsard.values import Event
 
+BLOCKED = "the serial port sends nothing: its driver accepts no bytes; replug the adapter"
+"""The reason while the output is blocked."""
+
 
 def damaged(link: Link, check: Negotiation) -> bool:
     """The check is asked for because replies came damaged."""

@@ -61,8 +61,8 @@ does not answer with it now; it does not know it, and it is required."""
 
 MENDS: dict[Trouble, str] = {
     "": "",
-    "echo": "what is sent comes back: transmit and receive are joined, or the adapter (RS-485) "
-    "repeats what it sends; mend that, then replug it",
+    "echo": "what is sent comes back: TX and RX are joined, or the terminal echoes, or the RS-485 "
+    "adapter; mend that, then replug it",
     "forgotten": "the microcontroller answered with a check before and now does not: its replies "
     "are damaged on the way (look at cable and baud rate), or it has other firmware "
     "(then replug it)",
@@ -140,7 +140,7 @@ class Negotiation:
     def _begin(self, fresh: bool) -> None:
         self._pending.clear()
         self._made = None
-        self._asked = Throttle()
+        self._asked, self._just_asked = Throttle(), False
         self._unanswered, self._open = 0, False
         # The port makes the first line after an opening a plain stop, whatever it is given.
         self._plain_turn = 0 if fresh else 1
@@ -162,6 +162,7 @@ class Negotiation:
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if not self._asked.lets(now_ns, wait_ns):
             return None
+        self._just_asked = True
         self._plain_turn += 1
         if waking and self._plain_turn % 2:
             return self._stop
@@ -175,7 +176,10 @@ class Negotiation:
         if self._made is not None and went:
             self._pending.append(self._made)
             self._open = self.asking
-        self._made = None
+        if self._just_asked and not went:
+            self._asked.undo()
+            self._plain_turn -= 1
+        self._made, self._just_asked = None, False
 
     def _sealed(self, line: bytes, letters: bytes, now_ns: int) -> bytes:
         self._sequence = (self._sequence + 1) % SEQUENCES
@@ -188,7 +192,16 @@ class Negotiation:
         """Is this our own question? Then nothing that comes back can be believed: it never is."""
         if self._question and line == self._question:
             self.trouble = "echo"
+        return self.echoes
+
+    @property
+    def echoes(self) -> bool:
+        """Whatever comes is an echo, until the port is opened again."""
         return self.trouble == "echo"
+
+    def found_echo(self) -> None:
+        """Plain lines were found to be an echo."""
+        self.trouble = "echo"
 
     def heard_plain(self) -> None:
         """A whole plain line came while asking: the MCU is awake, so silence is an answer too."""
@@ -223,7 +236,7 @@ class Negotiation:
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:
             return
-        if self.trouble == "echo":
+        if self.echoes:
             self._unanswered = 0  # it goes on asking, and nothing drives
             return
         if now_ns - asked_ns < self._answer_ns:

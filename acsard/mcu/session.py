@@ -14,6 +14,8 @@ from acsard.config.settings import FeedbackConfig, McuConfig
 from acsard.mcu import link_words
 from acsard.mcu.check import Reading, unseal
 from acsard.mcu.codec import Codec, FrameError
+from acsard.mcu.contract import WATCHDOG_S
+from acsard.mcu.echo import EchoDetector
 from acsard.mcu.feedback import Feedback, Timeline
 from acsard.mcu.hearing import Hearing
 from acsard.mcu.lines import LineReader
@@ -34,7 +36,10 @@ NAMES: dict[LinkState, EventName] = {
 """The event that a state of the link is when it comes about."""
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""A feedback gap this long means the MCU may have been reset: commanders start over."""
+"""A gap this long in either direction means the MCU may have been reset: commanders start over."""
+
+BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
+"""The output is blocked when no line has left for this long: the MCU has stopped by itself."""
 
 IDENTITY = b"!acsard-mcu "
 """Begins the line with which an MCU of ours names itself when it has booted."""
@@ -60,22 +65,33 @@ class McuSession:
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
+        self._echo = EchoDetector(mcu.baud_rate)
         self.snapping = Snapping()
         self._hearing = Hearing()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
+        self._rejected: dict[str, tuple[int, bytes]] = {}
+        """Lines rejected in this update by reason: their number and the last one."""
         self.good_lines = 0
+        self._heard_ns: int | None = None
         self.restarted = False
         """The last `update` saw a new session with the MCU: reopened, it has started again, or it
         is back from a long gap."""
         self.events: list[Event] = []
         """What the last `update` found worth a log line."""
         self._starting_over = False
-        self._announced: tuple[LinkState, str, bool] = ("down", self.negotiation.in_force, False)
+        self._announced: tuple[LinkState, str, bool, bool]
+        self._announced = ("down", self.negotiation.in_force, False, False)
         self._opened = 0
-        self._blind = Throttle()
-        self._made_ns: int | None = None
-        """When the line just made was; what became of it is not known yet."""
+        self._blind, self._just_blind = Throttle(), False
+        self._made: tuple[bytes, int] | None = None
+        """The line just made and its time, until its fate is known."""
+        self._left_ns = 0
+        """When the last line that left was made, or when the port was opened."""
+        self._held_up = False
+        """The last line made did not leave."""
+        self.blocked = False
+        """The port is open, but its driver has not taken a line for `BLOCKED_NS`."""
 
     @property
     def link(self) -> LinkState:
@@ -96,19 +112,16 @@ class McuSession:
         the last line did not go out.
         """
         self.restarted, self._starting_over, self.events = False, False, []
-        self.negotiation.settle(went=not unsent)
-        if self._made_ns is not None and not unsent:
-            self._timeline.left(self._made_ns)
-        self._made_ns = None
+        self._settle(not unsent, port_open)
         feedback = []
         if not port_open or opened != self._opened:
-            self._begin(port_open, opened)
+            self._begin(port_open, opened, now.mono_ns)
         if port_open:
             for piece in received:
                 feedback += self._read(piece)
             more = self._lines.too_long - self.rejects.get("too_long", 0)
             if more > 0:
-                self._reject("too_long", more)
+                self._reject("too_long", more=more)
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
                 self._link.excuse()
@@ -116,6 +129,8 @@ class McuSession:
                 heard = self._hearing.now
                 heard.late_s = max(heard.late_s, self.lateness.step_s)
             self._judge(now.mono_ns)
+        if self._rejected:
+            self._announce_rejects()
         self._announce()
         return feedback
 
@@ -126,14 +141,15 @@ class McuSession:
         first one at once, for it may be doing what it was told last.
         """
         line = self._next_line(now_ns, speeds)
-        self._made_ns = None if line is None else now_ns
+        self._made = None if line is None else (line, now_ns)
         return line
 
     def _next_line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         if self.negotiation.asking:
             return self.negotiation.question(now_ns)
         if self.silent(now_ns):
-            if not self._blind.lets(now_ns, BLIND_PERIOD_NS):
+            self._just_blind = self._blind.lets(now_ns, BLIND_PERIOD_NS)
+            if not self._just_blind:
                 return None
             speeds = STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
@@ -143,10 +159,16 @@ class McuSession:
         """No good line within `quiet`, or none at all in this session."""
         return self._link.silent(now_ns)
 
+    def feedback_age_s(self, now_ns: int) -> float | None:
+        """Return the seconds since the last good line of any session, None before the first."""
+        return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
+
     def words(self, port_trouble: str = "") -> str:
         """How the link is, for people; `port_trouble` is why the port is closed."""
         if self.link == "down" and port_trouble:
             return port_trouble
+        if self.blocked:
+            return link_words.BLOCKED
         heard, late = self._hearing, self.lateness
         return link_words.words(self._link, self.negotiation, heard, late, self._longest_reply)
 
@@ -158,12 +180,33 @@ class McuSession:
 
     # sessions
 
-    def _begin(self, port_open: bool, opened: int) -> None:
+    def _settle(self, went: bool, port_open: bool) -> None:
+        """Note the fate of the line just made. An open port that took none uses up no throttle."""
+        self.negotiation.settle(went)
+        made, self._made = self._made, None
+        blind, self._just_blind = self._just_blind, False
+        if made is None:
+            return
+        self._held_up = not went
+        if went:
+            line, made_ns = made
+            self._echo.left(line, made_ns)
+            self._timeline.left(made_ns)
+            self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
+            self._left_ns = made_ns
+        elif blind and port_open:
+            self._blind.undo()
+
+    def _begin(self, port_open: bool, opened: int, now_ns: int) -> None:
         self._link.sign("opened" if port_open else "closed")
         self.restarted = opened != self._opened
         self._opened = opened
+        self._left_ns, self._held_up, self.blocked = now_ns, False, False
+        if port_open:
+            self._blind = Throttle()
         self._lines.clear()
         self._timeline.forget()
+        self._echo.forget()
         self.snapping.forget()
         self._hearing.forget()
         self.negotiation.begin(fresh=True)
@@ -179,6 +222,12 @@ class McuSession:
         self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
+        # A step that comes late finds an old line too, but that is this computer's fault.
+        late = self.lateness.step_s > 0.0
+        long = now_ns - self._left_ns > BLOCKED_NS
+        self.blocked = self._held_up and (self.blocked or (long and not late))
+        if self.blocked:
+            self._link.sign("blocked")
         # Never up in the update that saw a restart: who drives has to see the link go first.
         self._link.judge(now_ns, may_rise=not self._starting_over)
         check, up = self.negotiation, self.link == "up"
@@ -186,17 +235,25 @@ class McuSession:
         if quiet and (check.state == "plain" or check.checked):
             check.begin()
         check.judge(now_ns)
-        if up:
+        if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns):
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
-    def _reject(self, reason: str, more: int = 1, text: str = "") -> None:
-        """Count lines that were not taken."""
+    def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
+        """Count lines that were not taken; `line` is the last of them."""
         self.rejects[reason] += more
-        self.events.append(
-            Event("lines_rejected", text, "warning", kind=reason, count=more, news=False)
-        )
+        before, _ = self._rejected.get(reason, (0, b""))
+        self._rejected[reason] = (before + more, line)
+
+    def _announce_rejects(self) -> None:
+        """Add one event per reason. One per line would cost a period for a read full of junk."""
+        for reason, (count, line) in self._rejected.items():
+            text = f"{line[:60]!r}" if line else ""
+            self.events.append(
+                Event("lines_rejected", text, "warning", kind=reason, count=count, news=False)
+            )
+        self._rejected.clear()
 
     def _bad(self) -> None:
         """A line came that is none; so many in a row that a check in force has to be asked anew."""
@@ -207,13 +264,14 @@ class McuSession:
     def _announce(self) -> None:
         """An event for the link and one for the check, when they have changed."""
         link, check = self.link, self.negotiation
-        before, self._announced = self._announced, (link, check.in_force, bool(check.trouble))
+        before = self._announced
+        self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
         if self._announced == before:
             return
-        if link != before[0]:
-            damaged = link_words.damaged(self._link, check)
-            text = self.words() if damaged else self.lateness.words(link)
-            good = link in ("up", "booting")
+        if link != before[0] or self.blocked > before[3]:
+            plain = not (self.blocked or link_words.damaged(self._link, check))
+            text = self.lateness.words(link) if plain else self.words()
+            good = link in ("up", "booting") and not self.blocked
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
             self.events.append(link_words.check_event(check, self._wants_samples))
@@ -246,7 +304,7 @@ class McuSession:
             return None
         check = self.negotiation
         asking = check.asking
-        if asking and check.echoed(line):
+        if check.echoes or (asking and check.echoed(line)):
             self._reject("echo")
             self._link.missed()
             return None
@@ -258,8 +316,13 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
+                if not asking and self._echo.report(line, speeds, read_at.mono_ns):
+                    check.found_echo()
+                    self._link.sign("echo")
+                    self._reject("echo")
+                    return None
         except FrameError as error:
-            self._reject(error.reason, text=f"{line[:60]!r}")
+            self._reject(error.reason, line)
             self._bad()
             return None
         if asked_ns is None and asking:
@@ -277,6 +340,7 @@ class McuSession:
     ) -> Feedback:
         """`size` are the bytes behind the line and its own."""
         self.good_lines += 1
+        self._heard_ns = read_at.mono_ns
         since_ns = self._link.good(read_at.mono_ns)
         if since_ns is not None and since_ns >= LONG_GAP_NS:
             self.restarted = True
@@ -284,7 +348,7 @@ class McuSession:
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
         more = self._timeline.leaps - self.rejects.get("count_leap", 0)
         if more > 0:
-            self._reject("count_leap", more)
+            self._reject("count_leap", more=more)
         if self._timeline.restarted:
             self._restart("has started again: its clock went back")
         return self.snapping.look(feedback)

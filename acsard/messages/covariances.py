@@ -12,6 +12,9 @@ from acsard.values import PoseCovariance, TwistVariances
 SMALLEST, LARGEST = 1e-6, 1e6
 """Of the axes that are not measured."""
 
+UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
+"""Covariance of a twist that is not measured at all."""
+
 
 class Covariances:
     """Fills the matrices of nav_msgs/Odometry."""

@@ -65,6 +65,7 @@ def diagnostics(
         *_gyro(config, snapshot.gyro),
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
+        *_latch_file(snapshot.latch_file),
         *([Row("certificate", *certificate, {})] if certificate[1] else []),
     ]
     return DiagnosticArray(
@@ -87,6 +88,8 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
     named = zip(WHEELS, snapshot.encoders, strict=False)
     values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
+    if snapshot.feedback_age_s is not None:
+        values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     level, message = OK if outputs.link == "up" else ERROR, outputs.link
     if mcu.simulated:
@@ -174,6 +177,13 @@ def _recording(recording: Recording) -> list[Row]:
     missing = {"steps_missing": str(recording.missing)}
     level, message = WARN if recording.trouble else OK, recording.trouble or "on"
     return [Row("recording", level, message, missing)]
+
+
+def _latch_file(trouble: str | None) -> list[Row]:
+    """Return the row of the latch file, or nothing where latches are not kept."""
+    if trouble is None:
+        return []
+    return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:

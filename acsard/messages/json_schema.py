@@ -14,6 +14,7 @@ import msgspec
 from acsard.config.settings import Config
 from acsard.messages.schema import (
     MESSAGES,
+    Clear,
     DoorState,
     Imu,
     JointState,
@@ -25,7 +26,7 @@ from acsard.messages.schema import (
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = (Twist, SetPose, Settings, DoorState)
+ONLY_IN = (Twist, SetPose, Clear, Settings, DoorState)
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {

@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from acsard.config.settings import Config
 from acsard.drive.learned_track import tracks
 from acsard.drive.words import waiting
-from acsard.messages.covariances import Covariances
+from acsard.messages.covariances import UNKNOWN, Covariances
 from acsard.messages.diagnostics import diagnostics
 from acsard.messages.expiry import expiry
 from acsard.messages.happened import Happened
@@ -41,6 +41,7 @@ from acsard.messages.schema import (
 )
 from acsard.values import (
     NS_PER_S,
+    REST,
     Estimate,
     Instant,
     Outputs,
@@ -135,11 +136,11 @@ class Report:
             case "tf_static":
                 return self.tf_static()
             case "odom":
-                return self._odom(estimate) if estimate else None
+                return self._odom(estimate, look().measured is not None) if estimate else None
             case "tf":
                 return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
             case "wheel_states":
-                return self._wheel_states(estimate) if estimate else None
+                return self._wheel_states(estimate, look().speeds is not None) if estimate else None
             case "cmd_vel_out":
                 return self._cmd_vel_out(outputs) if outputs else None
             case "state":
@@ -167,15 +168,19 @@ class Report:
             )
         return TFMessage(transforms)
 
-    def _odom(self, estimate: Estimate) -> Odometry:
+    def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
+        """Build the message with the stamp of its sample.
+
+        If the feedback is not `live`, the twist is zero with the covariance of an unmeasured one.
+        """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
-        of_twist = self._covariances.of_twist(estimate.twist_variances)
+        of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN
         return Odometry(
             Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,
             PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), of_pose),
-            TwistWithCovariance(_twist(estimate.twist), of_twist),
+            TwistWithCovariance(_twist(estimate.twist if live else REST), of_twist),
         )
 
     def _tf(self, estimate: Estimate) -> TFMessage:
@@ -184,12 +189,12 @@ class Report:
         where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
         return TFMessage([TransformStamped(header, frames.base_frame, where)])
 
-    def _wheel_states(self, estimate: Estimate) -> JointState:
+    def _wheel_states(self, estimate: Estimate, live: bool = True) -> JointState:
         return JointState(
             header=Header(Time.from_ns(estimate.at.wall_ns)),
             name=self._names,
             position=list(estimate.positions),
-            velocity=list(estimate.speeds.as_tuple()),
+            velocity=list(estimate.speeds.as_tuple()) if live else [],
         )
 
     def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
@@ -204,9 +209,9 @@ class Report:
             x=snapshot.pose.x,
             y=snapshot.pose.y,
             yaw=snapshot.pose.yaw,
-            linear=snapshot.measured.linear,
-            angular=snapshot.measured.angular,
-            wheels=list(snapshot.speeds.as_tuple()),
+            linear=snapshot.measured.linear if snapshot.measured else None,
+            angular=snapshot.measured.angular if snapshot.measured else None,
+            wheels=list(snapshot.speeds.as_tuple()) if snapshot.speeds else [],
             link=outputs.link,
             source=outputs.source,
             sources=[
@@ -226,6 +231,9 @@ class Report:
             doubt=snapshot.doubt.text,
             sender=snapshot.sender,
             recording=snapshot.recording.trouble,
+            latch=0 if outputs.latches.next is None else outputs.latches.next.number,
+            latch_file=snapshot.latch_file or "",
+            feedback_age=snapshot.feedback_age_s,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:

@@ -24,6 +24,9 @@ Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
+LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
+"""Number of a latch, small enough for a JavaScript number."""
+
 FEW = Meta(max_length=64)
 """More joints than any robot of ours; what a stranger sends must not take long to refuse."""
 
@@ -201,7 +204,10 @@ class Figure(Message, frozen=True):
 
 
 class RobotState(Message, frozen=True):
-    """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s)."""
+    """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
+
+    While no feedback comes, no speed is known: `linear` and `angular` are null, `wheels` is empty.
+    """
 
     stamp: Time
     mode: Annotated[str, one_of(mode.value for mode in Mode)]
@@ -209,8 +215,8 @@ class RobotState(Message, frozen=True):
     x: float
     y: float
     yaw: float
-    linear: float
-    angular: float
+    linear: float | None
+    angular: float | None
     wheels: list[float]
     """Measured speeds in the order front right, front left, rear left, rear right."""
     link: Annotated[str, one_of(get_args(State))]
@@ -230,12 +236,18 @@ class RobotState(Message, frozen=True):
     doubt: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
     sender: str = ""
-    """Which of the senders of `source` is followed, by the name it gives itself."""
+    """The public name of the sender of `source` that is followed."""
     track: str = ""
     """The effective track over the wheel separation, as the gyro teaches it and as configured, and
     which is in use, in words; empty until one is learned."""
     recording: str = ""
     """Why nothing is recorded just now, though it is asked for, in words; empty else."""
+    latch: LatchNumber = 0
+    """Number of the stop or fault that `clear` releases next; 0 while none is latched."""
+    latch_file: str = ""
+    """Why a stop would not survive a restart, in words; empty if it would, or in the simulator."""
+    feedback_age: float | None = None
+    """Seconds since the last good line of the microcontroller; null before the first one."""
 
 
 class DoorState(Message, frozen=True):
@@ -315,6 +327,12 @@ class SetPose(Message, frozen=True):
     yaw: float
 
 
+class Clear(Message, frozen=True):
+    """The latch that `clear` releases, by the number in `RobotState.latch`; null names none."""
+
+    latch: LatchNumber | None = None
+
+
 class Settings(Message, frozen=True):
     """What is to be set: values by their keys in `acsard.toml`, tables and key joined by dots."""
 
@@ -374,7 +392,7 @@ class WhoAmI(Message, frozen=True):
     role: Annotated[str, one_of(ROLES)]
     """At least this, by the access rules."""
     sender: str
-    """The name he gives himself, and the way he came, as the log has it."""
+    """The caller's public name and its transport, as in the log."""
 
 
 MESSAGES: dict[str, type[Message]] = {
@@ -393,6 +411,7 @@ MESSAGES: dict[str, type[Message]] = {
         Events,
         ServiceReply,
         SetPose,
+        Clear,
         Settings,
         Info,
         Interfaces,

@@ -22,8 +22,8 @@ def place(x: float, y: float, yaw: float) -> list[str]:
     ]
 
 
-def speeds(linear: float, angular: float) -> list[str]:
-    """A twist, each figure with its unit: m/s, rad/s."""
+def speeds(linear: float | None, angular: float | None) -> list[str]:
+    """Format a twist, each figure with its unit: m/s, rad/s, or "-" if it is not known."""
     return [f"forward {_signed(linear, 2, 5)} m/s", f"turn {_signed(angular, 2, 5)} rad/s"]
 
 
@@ -51,7 +51,9 @@ def _twist(twist: Twist) -> list[str]:
     return speeds(twist.linear.x, twist.angular.z)
 
 
-def _signed(value: float, decimals: int, width: int) -> str:
+def _signed(value: float | None, decimals: int, width: int) -> str:
+    if value is None:
+        return "-".rjust(width)
     text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
     return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
 

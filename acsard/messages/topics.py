@@ -6,7 +6,9 @@ that is not here does not exist.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from functools import cache
 from typing import Literal, get_args
 
 from msgspec import Struct
@@ -15,12 +17,15 @@ from acsard.config.nearest import hint
 from acsard.config.settings import Config
 from acsard.values import ROOT, Verb
 
+_PLACE = re.compile("<[A-Za-z]+>")
+
 Direction = Literal["out", "in", "query", "service"]
 """A query only asks and may be asked by wildcard; a service acts, and only by its exact key."""
 
 
 class Topic(Struct, frozen=True):
-    """One row. `key` may hold `<source>`, `<Type>`, `<key>` or `<role>` where a name goes."""
+    """One row. `key` may hold `<source>`, `<certificate>`, `<Type>`, `<key>` or `<role>` where a
+    name goes."""
 
     key: str
     direction: Direction
@@ -36,15 +41,14 @@ class Topic(Struct, frozen=True):
     @property
     def pattern(self) -> str:
         """The key with each placeholder as a Zenoh wildcard."""
-        key = self.key.replace("<key>", "**")
-        return key.replace("<source>", "*").replace("<Type>", "*").replace("<role>", "*")
+        return _PLACE.sub("*", self.key.replace("<key>", "**"))
 
 
 SERVICES: tuple[Verb, ...] = get_args(Verb)
 
 _SERVICE_NOTES: dict[Verb, str] = {
     "stop": "stop and stay stopped until clear",
-    "clear": "release a stop or a fault",
+    "clear": "release the fault if there is one, else the stop; the payload {latch} names it",
     "activate": "switch on; commands count",
     "deactivate": "switch off; ramps to zero, commands do not count",
     "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
@@ -97,6 +101,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic(json_key("<key>"), "out", "JSON", "as the key", "each key above, for subscribers"),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
+    Topic("cmd/<source>/<certificate>", "in", "Twist or TwistStamped", "any", "the same by TLS"),
+    Topic("wheel_cmd/<source>/<certificate>", "in", "JointState", "any", "the same by TLS"),
     Topic(IMU, "in", "Imu", "any", "turn rate by a gyro, with [odometry] gyro", gyro=True),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
     Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
@@ -136,11 +142,24 @@ def full_key(robot_id: str, key: str) -> str:
     return f"{ROOT}/{robot_id}/{key}"
 
 
-def source_keys(sources: Iterable[str]) -> list[str]:
-    """The keys that these sources command on."""
-    templates = [topic.key for topic in TOPICS if "<source>" in topic.key]
+COMMANDS = ("cmd", "wheel_cmd")
+"""The first chunk of each key that commands come in on."""
+
+
+def command_key(kind: str, source: str, certificate: str = "") -> str:
+    """Return the key that a source commands on.
+
+    `certificate` is the common name of the sender's certificate: over TLS each certificate has a
+    key of its own, on which the access rules let no other one put. Without one the key is that of
+    programs on the robot's own machine.
+    """
+    return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
+
+
+def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
+    """The keys that these sources command on under one certificate, "*" for all certificates."""
     names = list(sources)
-    return [key.replace("<source>", name) for key in templates for name in names]
+    return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
@@ -161,9 +180,10 @@ def by_key(key: str) -> Topic | None:
 
 def row_of(key: str) -> Topic | None:
     """The row that a key below the robot's id belongs to, as `cmd/app` to `cmd/<source>`."""
-    for topic in TOPICS:
-        head, mark, _ = topic.key.partition("<")
-        name = key.removeprefix(head)
-        if key == topic.key or (mark and name != key and name and "/" not in name):
-            return topic
-    return None
+    found = (topic for topic in TOPICS if _like(topic.key).fullmatch(key))
+    return next(found, None)
+
+
+@cache
+def _like(row: str) -> re.Pattern[str]:
+    return re.compile(_PLACE.sub("[^/]+", re.escape(row)))

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from acsard.config.settings import Config
+from acsard.guard import Guard
 from acsard.record.disk import Bug, OnDisk
 from acsard.record.state import freeze
 from acsard.record.steps import Start, Taken, Unfinished
@@ -57,10 +58,14 @@ class Recorder:
 
     # the control loop's side
 
+    def begins(self, robot: Robot, guard: Guard) -> None:
+        """Let the first file begin with this robot instead of one made of the configuration."""
+        self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
+
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+        """Take a step that is over. `left` is the line of it that left, or None."""
         queue = self._queue
         self._number += 1
         if self._said:
@@ -79,7 +84,7 @@ class Recorder:
             queue.append(Taken(inputs, outputs, left))
         if self._wants_state:
             self._wants_state = False
-            queue.append(Start(self._number, freeze(robot, last), robot.config))
+            queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def died(self, inputs: Inputs) -> None:
         """A fault of our own ended the step that these came into; the daemon ends by it."""

@@ -13,7 +13,7 @@ from functools import lru_cache
 from msgspec import Struct
 
 from acsard.config.settings import Config
-from acsard.guard import Guard
+from acsard.guard import Guard, Memory
 from acsard.record.steps import (
     MICRO,
     Micropose,
@@ -92,13 +92,15 @@ def lived(robot: Robot, step: Step) -> Outputs:
 class Replay:
     """One robot that lives again, step by step."""
 
-    def __init__(self, config: Config, robot: Robot | None = None, last: bytes = b"") -> None:
-        """`robot` and the `last` line as they were before the first step, None at the start."""
+    def __init__(
+        self, config: Config, robot: Robot | None = None, memory: Memory | None = None
+    ) -> None:
+        """Start from `robot` and the guard's `memory` before the first step, or from nothing."""
         self.robot = robot or Robot(config)
         self.outputs: Outputs | None = None
         """What the last step decided now."""
-        self._watched_by(self.robot.config)
-        self._last = last or self.robot.session.codec.stop
+        self._config = self.robot.config
+        self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
         self._checksum = 0
         self._here: Micropose = (0, 0, 0)
         self.tally = Tally()
@@ -109,12 +111,13 @@ class Replay:
             self._checksum = 0
         outputs = self.outputs = lived(self.robot, step)
         if self.robot.config is not self._config:  # a setting was changed
-            self._watched_by(self.robot.config)
-        line, trip = self._guard.check(outputs, self._last)
+            self._config = self.robot.config
+            self._guard.use(self._config)
+        line, trip = self._guard.check(outputs)
         self._checksum = checksum(outputs.estimates, self._checksum)
         if step.said.left is not None:
             # What the board got then is what it obeys, whatever would go now.
-            self._last = step.said.left
+            self._guard.left(step.said.left)
         now = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
         difference = self._compare(step, now, line)
         self._count(step, outputs, now)
@@ -128,11 +131,6 @@ class Replay:
         tally.first = tally.first or difference
         if difference.now.status[0] == FAULT != difference.then.status[0]:
             tally.fault = tally.fault or difference
-
-    def _watched_by(self, config: Config) -> None:
-        """A guard as the loop has it."""
-        self._config = config
-        self._guard = Guard.of(self.robot.session.codec.stop, config)
 
     def _compare(self, step: Step, now: Seen, line: bytes | None) -> Difference | None:
         said = step.said

@@ -10,6 +10,7 @@ from acsard.config.live import flat
 from acsard.config.parsing import ConfigError, effective, parse
 from acsard.config.settings import Config
 from acsard.config.validation import show
+from acsard.guard import Memory
 from acsard.host.errors import RecordingError
 from acsard.messages.text import printable
 from acsard.record.batch import BatchError, decode
@@ -87,7 +88,7 @@ class Course:
         """Of the step that was gone last."""
         self._recording = recording
         self._state, begins = _state(recording), Robot(self.config)
-        self.robot, self.last = self._state or (begins, b"")
+        self.robot, self.memory = self._state or (begins, Memory())
         if self._state is not None:
             # by newer code, its parts may have what it knows nothing of
             begun = Robot(config_of(recording))
@@ -121,7 +122,7 @@ def live(recording: Recording, other: Config | None = None, progress: Progress =
     """Replay it with its own configuration, or with another; raises `RecordingError`."""
     course = Course(recording, other)
     with course.living():
-        replay = Replay(course.config, course.robot, course.last)
+        replay = Replay(course.config, course.robot, course.memory)
         for number, step in enumerate(course.steps()):
             if number % EVERY == 0:
                 progress(step.inputs.now.wall_ns)

@@ -14,13 +14,17 @@ import sys
 from collections import Counter, deque
 from typing import NamedTuple
 
-from acsard.drive.modes import Mode, Trigger
+from acsard.drive.modes import Mode
+from acsard.guard import Memory
 from acsard.messages.text import printable
 from acsard.record.unpickling import unpickled
 from acsard.robot import Robot
 from acsard.values import AcsardError
 
-ROOMS = ("acsard.values", "acsard.robot", "acsard.config.settings", "acsard.drive.", "acsard.mcu.")
+ROOMS = (
+    "acsard.values", "acsard.robot", "acsard.guard", "acsard.config.settings",
+    "acsard.drive.", "acsard.mcu.",
+)  # fmt: skip
 """Whose classes a robot is made of; none of them does anything when it is made."""
 
 BESIDE: dict[tuple[str, str], type] = {
@@ -35,7 +39,6 @@ MOST_TEXT = 200
 
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
-    Trigger: lambda trigger: (Trigger, (trigger.value,)),
 }
 """Python 3.11 before 3.11.4, Debian 12's own, writes members of an enum by `getattr`."""
 
@@ -56,16 +59,16 @@ class State(NamedTuple):
     """All that the steps to come depend on, beside what comes in."""
 
     robot: Robot
-    last: bytes
-    """The line that went last: the guard compares with it."""
+    memory: Memory
+    """What the guard remembers."""
 
 
-def freeze(robot: Robot, last: bytes) -> bytes:
-    """The robot as it is now."""
+def freeze(robot: Robot, memory: Memory) -> bytes:
+    """Write the robot and the memory of its guard as they are now."""
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PROTOCOL)
     pickler.dispatch_table = TABLE
-    pickler.dump((robot, last))
+    pickler.dump((robot, memory))
     return written.getvalue()
 
 
@@ -77,8 +80,8 @@ def thaw(data: bytes) -> State:
         text = f"this version cannot read the state at its start: {short(error)}"
         raise StateError(text) from None
     match made:
-        case (Robot() as robot, bytes() as last):
-            return State(robot, last)
+        case (Robot() as robot, Memory() as memory):
+            return State(robot, memory)
     raise StateError("the state at its start is not that of a robot")
 
 

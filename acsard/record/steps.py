@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.config.settings import Config
+from acsard.guard import Guard
 from acsard.robot import Robot
 from acsard.values import AcsardError, Estimate, Event, Inputs, Outputs, Recording
 
@@ -63,10 +64,13 @@ def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]
 class BlackBox(Protocol):
     """What records every step, and never waits."""
 
+    def begins(self, robot: Robot, guard: Guard) -> None:
+        """Record the robot and its guard before the first step."""
+
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a step that is over; `left` is what went of it, `last` the line that went last."""
+        """Take a step that is over. `left` is the line of it that left, or None."""
 
     def died(self, inputs: Inputs) -> None:
         """A fault of our own ended the step that these came into; the daemon ends by it."""

@@ -51,7 +51,8 @@ acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_f
 acsard/msg/RobotState: \
     std_msgs/msg/Header header, string mode, string reason, \
     float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
-    string link, string source, string sender, acsard/msg/SourceState[] sources, \
+    float64 feedback_age, string link, string source, string sender, \
+    acsard/msg/SourceState[] sources, \
     string refused, string gyro, string track, string doubt, string recording, \
     string certificate, acsard/msg/Counter[] counters
 """

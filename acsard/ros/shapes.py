@@ -83,7 +83,10 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """`RobotState` without what the daemon measures of itself: that is in `diagnostics`."""
+    """`RobotState` without the daemon's own figures, which are in `diagnostics`.
+
+    NaN stands for null.
+    """
 
     header: Header
     mode: str
@@ -94,6 +97,7 @@ class State(Struct, frozen=True):
     linear: float
     angular: float
     wheels: list[float]
+    feedback_age: float
     link: str
     source: str
     sender: str
@@ -116,16 +120,14 @@ def state(message: RobotState) -> State:
         x=message.x,
         y=message.y,
         yaw=message.yaw,
-        linear=message.linear,
-        angular=message.angular,
+        linear=_known(message.linear),
+        angular=_known(message.angular),
         wheels=message.wheels,
+        feedback_age=_known(message.feedback_age),
         link=message.link,
         source=message.source,
         sender=message.sender,
-        sources=[
-            Source(s.name, s.priority, math.nan if s.age is None else s.age, s.waits_for)
-            for s in message.sources
-        ],
+        sources=[Source(s.name, s.priority, _known(s.age), s.waits_for) for s in message.sources],
         refused=message.refused,
         gyro=message.gyro,
         track=message.track,
@@ -134,3 +136,7 @@ def state(message: RobotState) -> State:
         certificate=message.certificate,
         counters=[Counter(name, count) for name, count in message.counters.items()],
     )
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value

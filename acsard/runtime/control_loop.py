@@ -5,6 +5,7 @@ Synchronous on purpose: the daemon calls `step` from one task, the tests call it
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 from msgspec.structs import replace
@@ -15,7 +16,7 @@ from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
 from acsard.incoming.asker import asker
 from acsard.incoming.bus import NOTHING, Bus, BusInput
-from acsard.incoming.commands import Receiver, sender
+from acsard.incoming.commands import Receiver, parts, sender
 from acsard.incoming.door import KEY as DOOR
 from acsard.incoming.door import DoorTold
 from acsard.incoming.imu import ImuTold
@@ -29,15 +30,18 @@ from acsard.messages.topics import IMU
 from acsard.record.steps import BlackBox
 from acsard.robot import Robot
 from acsard.runtime.at_once import Pace
+from acsard.runtime.kept_latches import ANSWER_NS, Handover, LatchKeeper
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.runtime.stopwatch import Stopwatch
 from acsard.values import (
     NS_PER_S,
+    Answer,
     Command,
     Event,
     GyroSample,
     Inputs,
     Instant,
+    Latches,
     Outputs,
     Recording,
     Refusal,
@@ -71,14 +75,16 @@ class ControlLoop:
         beside: Callable[[str], Message | None] | None = None,
         adopted: Callable[[Config], None] | None = None,
         recorder: BlackBox | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+        keeper: LatchKeeper | None = None,
     ) -> None:
         """`others` are the events of the daemon's other parts; each step takes what is there.
 
         `beside` has the present values of the keys that those parts publish; `adopted` hears of a
         configuration that is in force from now on; `recorder` is the black box, that hears of every
-        step.
+        step. The robot starts with `latches`, and `keeper` keeps them over a restart.
         """
-        self.robot = Robot(config)
+        self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
         """Set to begin the way down: the robot ramps to zero and stays there."""
@@ -87,9 +93,16 @@ class ControlLoop:
         self._others = [] if others is None else others
         self._beside = beside
         self._config, self._adopted = config, adopted
-        self._recorder = recorder
+        self._recorder, self._handover = recorder, Handover(latches, keeper)
+        self._answers: deque[tuple[int, Answer]] = deque()
+        """Answers that wait until the file has the latches, each with its monotonic time."""
+        self._got = NOTHING
+        """What this step took from the bus."""
         stop = self.robot.session.codec.stop
-        self._guard = Guard.of(stop, config)
+        self._guard = Guard(stop, config)
+        if recorder is not None and latches != Latches():
+            # A replay would otherwise start with a robot that nobody has stopped.
+            recorder.begins(self.robot, self._guard)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
@@ -97,8 +110,6 @@ class ControlLoop:
         self._turn_rates: list[GyroSample] = []
         """What a gyro said since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        self._last = stop
-        """The line that went last."""
         self._superseded, self._trip = False, ""
         """What became of the last line made; told to the robot with the next step."""
         # The longest line of either direction: answers must not queue in the MCU either.
@@ -130,11 +141,23 @@ class ControlLoop:
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """One step at `now`, at the end of a period or between two."""
+        self._got = NOTHING
+        try:
+            return self._step(now, period)
+        except Exception:
+            # A stop that this step took is lost otherwise: the bug may have come before it.
+            self._handover.take_stops(self.robot.latches, _stops(self._got), now)
+            raise
+
+    def _step(self, now: Instant, period: Period) -> Outputs:
         ended, missed = period.expired > 0, max(0, period.expired - 1)
         if ended:
             self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
         commands, refusals, requests = self._from_bus(now)
+        self._others += self._handover.news()
         port, pace = self._port, self._pace
+        # Take the bytes first: `take` closes the port when the computer was suspended.
+        received = port.take(now if missed else None)
         inputs = Inputs(
             now=now,
             tick=ended and pace.period_ended(missed),
@@ -142,7 +165,7 @@ class ControlLoop:
             port_open=port.is_open,
             opened=port.opened,
             port_trouble=port.trouble,
-            received=port.take(now if missed else None),
+            received=received,
             commands=commands,
             requests=requests,
             refusals=refusals,
@@ -171,6 +194,7 @@ class ControlLoop:
         """What comes of it, and whether its line went; the black box has it, however it ends."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
+            self._handover.take(outputs.latches)
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
             went = self._send(outputs, inputs.now, inputs.tick)
@@ -179,14 +203,24 @@ class ControlLoop:
                 self._recorder.died(inputs)
             raise
         if self._recorder is not None:
-            left = self._last if went else None
-            self._recorder.step(inputs, outputs, left, self.robot, self._last)
-        return outputs, went
+            self._recorder.step(inputs, outputs, went, self.robot, self._guard)
+        return outputs, went is not None
+
+    def finish(self, now: Instant) -> None:
+        """Keep the stops that arrived after the last step; give the last answers."""
+        self.keep_last_stops(now)
+        self._handover.wait()
+        self._answer(now, last=True)
+        self._bus.flush()
+
+    def keep_last_stops(self, now: Instant) -> None:
+        """Keep the stops that arrived since; no step will serve them."""
+        self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config) -> None:
         """Go by the configuration that the robot goes by since this step."""
         self._config = config
-        self._guard = Guard.of(self.robot.session.codec.stop, config)
+        self._guard.use(config)
         self.report.use(config)
         self._queries.use(config)
 
@@ -194,7 +228,7 @@ class ControlLoop:
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
         # Before the first step there is nothing to answer with.
-        got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
         commands: list[Command] = []
@@ -225,7 +259,7 @@ class ControlLoop:
                     Refusal(
                         error.reason,
                         f"{arrival.key}: {error}",
-                        arrival.key.partition("/")[2],
+                        parts(arrival.key)[1],
                         sender(arrival),
                         arrival.arrived_ns,
                     )
@@ -263,24 +297,24 @@ class ControlLoop:
         self._bus.retire(query.ticket)
         return None
 
-    def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bool:
-        """Offer the line; whether it went. What became of it the robot hears with the next step."""
-        line, self._trip = self._guard.check(outputs, self._last)
+    def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
+        """Offer the line, and return it if it left. The next step tells the robot its fate."""
+        line, self._trip = self._guard.check(outputs)
         self._superseded = False
         if line is None:
-            return False
+            return None
         before_ns = self._port.sent_ns
         offered = self._port.offer(line, now)
         if offered == "sent":
-            self._last = line
+            self._guard.left(line)
             self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
             self.robot.counters["lines_sent"] += 1
-            return True
+            return line
         self._superseded = True
         if offered == "superseded" and tick:
             # One that could not go at once has its period still before it.
             self.robot.counters["lines_superseded"] += 1
-        return False
+        return None
 
     def _publish(self, outputs: Outputs) -> None:
         bus, told_ns = self._bus, None
@@ -290,13 +324,24 @@ class ControlLoop:
                 told_ns = self._mono_ns()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
-        for answer in outputs.answers:
-            reply = self._queries.answered(answer, outputs.now.wall_ns)
-            if reply is not None:
-                bus.reply(reply)
-                bus.retire(reply.ticket)
+        self._answers.extend((outputs.now.mono_ns, answer) for answer in outputs.answers)
+        if self._answers:
+            self._answer(outputs.now)
         for event in outputs.events:
             self._log(event)
+
+    def _answer(self, now: Instant, *, last: bool = False) -> None:
+        """Give each answer that has the file or has waited for its time; `last` gives them all."""
+        held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
+        trouble = "" if held else self._handover.trouble
+        while self._answers and (held or last or self._answers[0][0] < before_ns):
+            _, answer = self._answers.popleft()
+            if trouble and answer.success:
+                answer = replace(answer, message=f"{answer.message}; {trouble}")
+            reply = self._queries.answered(answer, now.wall_ns)
+            if reply is not None:
+                self._bus.reply(reply)
+                self._bus.retire(reply.ticket)
 
     def _current(self, key: str) -> Message | None:
         message = self.report.current(key, self._look)
@@ -310,5 +355,14 @@ class ControlLoop:
             figures=self._stopwatch.measured(now_ns),
             missed_last_minute=self._stopwatch.missed(now_ns),
             routers=self._routers.status,
+            latch_file=self._handover.trouble,
             recording=Recording() if self._recorder is None else self._recorder.status,
         )
+
+
+def _stops(got: BusInput) -> list[str]:
+    """Return the names of those that stop the robot with this input."""
+    puts = [one for one in got.arrivals if one.key == "stop" and one.put]
+    calls = [query for query in got.queries if query.topic == "srv/stop"]
+    names = [asker(put.via, put.attachment, put.sender) for put in puts]
+    return names + [asker(call.via, call.attachment) for call in calls]

@@ -11,7 +11,7 @@ import gc
 import os
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from typing import Any
 
 from acsard import __version__
@@ -32,11 +32,12 @@ from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.departure import Departure
 from acsard.runtime.doorkeeper import DOOR, PAGE, Kind, keep_door
+from acsard.runtime.latch_file import LatchFile
 from acsard.runtime.simulated import Simulated
 from acsard.runtime.ticker import Ticker
 from acsard.runtime.wakeup import Next, Wakeup
 from acsard.serial.port import SerialPort
-from acsard.values import NS_PER_S, Event
+from acsard.values import NS_PER_S, Event, Latches
 
 SWITCH_INTERVAL_S = 0.0005
 """How long another Python thread may hold up the loop; by default 5 ms, half a period."""
@@ -92,25 +93,24 @@ async def _run(
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # first in, last out
-        events: list[Event] = []
-        start = clock.now()
+        events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
+        keeper = _keeper(config, stack)
         path = config.mcu.port if simulated is None else simulated.path
+        after = stack.enter_context(ExitStack())
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
         ends_ns = _certificates(config, door is not None)
         # The bus first: an id or address in use must end us before the first byte to the MCU.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
-        beside = None
         if simulated is not None:
             simulated.tell(bus)
-            beside = simulated.current
+        between = stack.enter_context(ExitStack())
         await stack.enter_async_context(port)
-        info = _info(config, path)
         control = ControlLoop(
             config,
-            info,
+            _info(config, path),
             port,
             bus,
             start,
@@ -118,18 +118,22 @@ async def _run(
             clock.mono_ns,
             ends_ns,
             events,
-            beside,
+            None if simulated is None else simulated.current,
             lambda adopted: log.use(adopted.log),
             recorder,
+            # After the bus and the port: a second daemon must end before it touches the latches.
+            Latches() if keeper is None else await keeper.start(clock.now()),
+            keeper,
         )
+        between.callback(lambda: control.finish(clock.now()))
+        after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
         manager.ready()
         departure.started()
-        helpers = [port.keep_open(), _repeat_latched(bus, control)]
-        kept = ((door if config.bus.outside else None, DOOR), (page, PAGE))
-        helpers += [_keep(words, events.append, kind) for words, kind in kept if words is not None]
-        async with _beside(helpers):
+        served = ((door if config.bus.outside else None, DOOR), (page, PAGE))
+        helpers = [_keep(words, events.append, kind) for words, kind in served if words is not None]
+        async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
             await _control(config, control, departure, wake, manager)
 
 
@@ -142,6 +146,18 @@ def _recorder(
     recorder = Recorder(config, log, wall_ns)
     stack.push(lambda kind, error, trace: recorder.close(error))
     return recorder
+
+
+def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
+    """The latch file of a real robot; with the built-in simulator nothing is kept.
+
+    It closes with the stack, after the port: a slow disk must not delay the last STOP.
+    """
+    if config.mcu.simulated:
+        return None
+    keeper = LatchFile(config, os.environ)
+    stack.callback(keeper.close)
+    return keeper
 
 
 def _bus(config: Config, wake: Wakeup) -> ZenohBus:

@@ -61,7 +61,7 @@ class BlockingPort:
             return
         for pause in draining(device.fileno(), clock.mono_ns() + int(DRAIN_S * NS_PER_S)):
             time.sleep(pause)
-        close(device).join(CLOSE_S)
+        close(device, wait_s=CLOSE_S)
         device.close()
 
     def now_ns(self) -> int:

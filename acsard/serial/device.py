@@ -14,6 +14,7 @@ import stat
 import termios
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 
 import serial
 
@@ -21,6 +22,9 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.processes import holder_of
+
+_left_open: list[int] = []
+"""Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
 """Between two looks at what has not left yet: a tenth of a line's time."""
@@ -46,6 +50,9 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
     """The port opened, locked for us alone, raw, flushed; raises OSError."""
+    with suppress(IndexError):  # two threads may empty the list at the same time
+        while True:
+            _end(_left_open.pop())
     # With a time between bytes the driver is told to wait for one (VMIN = 1), so that a read which
     # finds nothing is refused (EAGAIN), and one of nothing is a hang-up and nothing else.
     device = _Device(
@@ -108,10 +115,11 @@ def unlock(fd: int) -> None:
         pass  # the device is gone
 
 
-def close(device: serial.Serial, *, lost: bool = False) -> threading.Thread:
+def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
     """Throw away what is stuck, unlock, close in a thread: a driver may drain for 30 s first.
 
-    `device` is left with /dev/null, which its owner may drain and close in no time.
+    `device` is left with /dev/null, which its owner may drain and close in no time. Wait up to
+    `wait_s` for the thread. If no thread can be started, the next `open_raw` closes the device.
     """
     fd = device.fileno()
     if lost or unsent(fd):
@@ -123,14 +131,18 @@ def close(device: serial.Serial, *, lost: bool = False) -> threading.Thread:
     real, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
     os.dup2(null, fd, inheritable=False)
     os.close(null)
+    thread = threading.Thread(target=_end, args=(real,), name="close port", daemon=True)
+    try:
+        thread.start()
+    except RuntimeError:
+        _left_open.append(real)
+        return
+    thread.join(wait_s)
 
-    def end() -> None:
-        unlock(real)
-        os.close(real)
 
-    thread = threading.Thread(target=end, name="close port", daemon=True)
-    thread.start()
-    return thread
+def _end(fd: int) -> None:
+    unlock(fd)
+    os.close(fd)
 
 
 def refusal(path: str, error: OSError) -> MendableError:

@@ -103,8 +103,8 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _speed(state: RobotState) -> str:
-    """m/s; without a link the last one that was measured is no news."""
-    if state.link != "up":
+    """m/s; "-" without feedback."""
+    if state.linear is None:
         return "-"
     return f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?"
 

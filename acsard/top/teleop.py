@@ -87,12 +87,14 @@ def parting(seen: Teleop, width: int) -> list[str]:
     if seen.state is None or seen.age > SILENT_S:
         return _words([f"left: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
+    if seen.state.linear is None:
+        what = "reports no speed"
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
     return _words([f"left: the robot {what}", why], width, measured(seen.state))
 
 
 def moves(state: RobotState) -> bool:
-    """Not all of it stands."""
+    """Return whether any measured speed differs from zero; a robot without feedback has none."""
     return any((state.linear, state.angular, *state.wheels))
 
 

@@ -26,10 +26,12 @@ def clean(text: str) -> str:
     )
 
 
-def signed(value: float, decimals: int, width: int) -> str:
-    """A number with its sign, right-aligned; what is too long for `width` by its exponent; "-" for
-    none (NaN)."""
-    if math.isnan(value):
+def signed(value: float | None, decimals: int, width: int) -> str:
+    """Format a number with its sign, right-aligned: "-" for None and NaN.
+
+    A number that is too long for `width` is written with an exponent.
+    """
+    if value is None or math.isnan(value):
         return "-".rjust(width)
     text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
     return (text if len(text) <= width else f"{value:+.0e}").rjust(width)

@@ -119,7 +119,9 @@ class Calls:
                 return await in_thread(request, ANSWER_S)
             finally:
                 self._elsewhere -= 1
-        await in_thread(lambda: fleet.stop(client.session, [robot], _caller(who)), ANSWER_S)
+        await in_thread(
+            lambda: fleet.stop(client.session, [robot], _named(client, robot, who).caller), ANSWER_S
+        )
         return ServiceReply(False, f"{robot} was told to stop; look at it: {BUSY}")
 
     async def _ask(self, call: Callable[[], T]) -> T:

@@ -40,6 +40,7 @@ class Order(Struct, frozen=True):
     """One command, as it came."""
 
     sender: str
+    """The sender id, `NAME/SECRET`."""
     linear: float
     """m/s"""
     angular: float
@@ -49,6 +50,8 @@ class Order(Struct, frozen=True):
     sequence: int
     given_ns: int
     """When it came here, monotonic."""
+    steady: bool = False
+    """Nobody adjusts the sender's clock."""
 
     @property
     def moves(self) -> bool:
@@ -117,11 +120,11 @@ class Hand:
         time.sleep(max(0, self._put_ns + SPACING_NS - clock.mono_ns()) / NS_PER_S)
         twist = Twist(Vector3(x=order.linear), Vector3(z=order.angular))
         client.session.put(
-            client.key(f"cmd/{SOURCE}"),
+            client.key(client.command_key(SOURCE)),
             encode(twist, "msgpack"),
             encoding=encoding_name("msgpack", "Twist"),
             express=True,
-            attachment=Signature(order.sender, order.stamp_ns, order.sequence).pack(),
+            attachment=Signature(order.sender, order.stamp_ns, order.sequence, order.steady).pack(),
             timestamp=client.session.new_timestamp(),
         )
         self._put_ns = clock.mono_ns()

@@ -108,9 +108,7 @@ class Fleet:
         if one.here is False:
             was = f"its daemon has ended; it was {state.mode}"
             return Row(robot, "gone", was, None, "", age, one.version)
-        # Without a link the last speed that was measured is no news.
-        speed = state.linear if state.link == "up" else None
-        return Row(robot, state.mode, state.reason, speed, state.link, age, one.version)
+        return Row(robot, state.mode, state.reason, state.linear, state.link, age, one.version)
 
     # on threads of Zenoh's
 

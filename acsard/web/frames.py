@@ -68,6 +68,8 @@ class Command(_Frame, frozen=True):
 
     cmd: Wish
     stamp: float
+    steady: bool = False
+    """Nobody adjusts the clock of `stamp`, as the browser's `performance.now()`."""
 
     @property
     def stamp_ns(self) -> int:

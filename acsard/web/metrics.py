@@ -50,14 +50,13 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     yield "mode", "gauge", "1 for the mode it is in", modes
     links = [({"state": link}, float(link == state.link)) for link in get_args(State)]
     yield "link", "gauge", "1 for the state of the link to the microcontroller", links
-    measures = state.link == "up"  # else its speeds are those of before
-    if measures:
+    if state.linear is not None and state.angular is not None:
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
         yield "angular_speed_radps", "gauge", "measured, to the left", [({}, state.angular)]
     pose = [({"axis": a}, v) for a, v in (("x", state.x), ("y", state.y), ("yaw", state.yaw))]
     yield "pose", "gauge", "in odom, m and rad", pose
     wheels = [({"wheel": w}, v) for w, v in zip(WHEELS, state.wheels, strict=False)]
-    if measures:
+    if wheels:
         yield "wheel_speed_radps", "gauge", "measured", wheels
     yield "robot_total", "counter", "the daemon's counters", _by("what", state.counters)
     figures: list[Sample] = []

@@ -68,7 +68,7 @@ class Minute:
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
         """The robot says so; `wished` is None where nobody heard what is."""
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
-        if state.link != "up" or len(measured) != MEASURED:
+        if len(measured) != MEASURED:
             measured = [None] * MEASURED
         twist = [wished.linear.x, wished.angular.z] if wished else [None, None]
         figure = state.figures.get("period_lateness")

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.bus.address import Address
+from acsard.bus.certificates import shown_at
 from acsard.client import Client
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
@@ -63,6 +64,8 @@ class Robots:
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
         """`about` is what the configuration here says, until the daemon answers."""
         self.id, self.endpoint = address.robot_id, address.endpoint
+        self.certificate = shown_at(address.endpoint, address.tls)
+        """The common name under which the viewers' commands go, "" without a certificate."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()

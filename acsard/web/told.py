@@ -31,7 +31,7 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """What he is called in `state` when he drives."""
+    """The public name that `state.sender` has while this viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float

@@ -8,7 +8,6 @@ client has not read what went before.
 from __future__ import annotations
 
 import asyncio
-import secrets
 from collections.abc import Coroutine
 from typing import Any
 
@@ -17,6 +16,8 @@ from aiohttp import web
 
 from acsard.bus.access import MAY
 from acsard.host import clock
+from acsard.host.own_name import sender_id
+from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S
 from acsard.web import told
 from acsard.web.calls import Calls, RefusedError
@@ -73,7 +74,9 @@ class Viewer:
         counts: Counts,
     ) -> None:
         self.who = who
-        self.sender = f"{who.name[:40]}/{secrets.token_hex(4)}"
+        self._sender_id = sender_id(who.name)
+        self.sender = public_name(self._sender_id, robots.certificate)
+        """The name that `state.sender` has while this viewer drives; all that its page learns."""
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
         self._fleet, self._guide, self._counts = fleet, guide, counts
@@ -183,7 +186,13 @@ class Viewer:
         self._sequence += 1
         twist, now_ns = frame.cmd, clock.mono_ns()
         self._last = Order(
-            self.sender, twist.linear_x, twist.angular_z, stamp_ns, self._sequence, now_ns
+            self._sender_id,
+            twist.linear_x,
+            twist.angular_z,
+            stamp_ns,
+            self._sequence,
+            now_ns,
+            frame.steady,
         )
         self._hand.give(self._last)
 
@@ -196,7 +205,9 @@ class Viewer:
             return
         stamp_ns = last.stamp_ns + now_ns - last.given_ns
         self._sequence += 1
-        self._hand.give(Order(self.sender, 0.0, 0.0, stamp_ns, self._sequence, now_ns))
+        self._hand.give(
+            Order(self._sender_id, 0.0, 0.0, stamp_ns, self._sequence, now_ns, last.steady)
+        )
 
     def _begin(self, frame: Begin) -> None:
         """It turns wheels, and writes configurations."""

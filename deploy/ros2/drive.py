@@ -1,7 +1,7 @@
 """Drive the robot from a ROS machine: zeros first, then one speed for a while, then zeros.
 
-`ros2 topic pub` sends a speed from its first message on, which acsard does not follow: a publisher
-that has not let go yet may be one that nobody watches. This is the line that it does follow.
+acsard follows a publisher only after it has sent a zero. `ros2 topic pub` of a speed sends none, so
+use this script instead.
 
     python3 drive.py [LINEAR m/s] [ANGULAR rad/s] [SECONDS] [--ros-args -r __ns:=/robot1]
 """
@@ -21,7 +21,8 @@ PATIENCE_S = 10.0
 """How long to wait for somebody who listens; a bridge makes its route only now."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
-"""By a bridge, a zero counts a second after the last speed of whomever."""
+"""Behind a bridge all publishers look like one sender: a zero counts when no speed has followed it
+for a second. Over rmw_zenoh a quarter of a second is enough."""
 
 
 def end(number: int, frame: object) -> NoReturn:

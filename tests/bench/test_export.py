@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
+from acsard.guard import Guard
 from acsard.record.batch import encode
 from acsard.record.file import About, Writing
 from acsard.record.steps import Taken
@@ -48,7 +49,7 @@ class Streamed:
         self._number = 0
 
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
         self._taken.append(Taken(inputs, outputs, left))
         if len(self._taken) == BATCH:
@@ -56,6 +57,8 @@ class Streamed:
             self.writing.add("steps", at_ns, encode(self._number, self._taken))
             self._number += BATCH
             self._taken.clear()
+
+    def begins(self, robot: Robot, guard: Guard) -> None: ...
 
     def died(self, inputs: Inputs) -> None: ...
 

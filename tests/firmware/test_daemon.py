@@ -119,7 +119,7 @@ def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
     """The commander sends zeros until they count, a second of one whom only his key tells; then a
     speed."""
     commander.wish = ZERO
-    until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "neutral")
+    until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
     commander.wish = twist(linear)
 
 
@@ -347,7 +347,7 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
             state = bus.state()
             assert (state["link"], state["mode"]) == ("up", "ready")
             (waiting,) = [one for one in state["sources"] if one["name"] == "app"]
-            assert waiting["waits_for"].startswith("neutral first")
+            assert waiting["waits_for"].startswith("send a zero first")
             coasted = truly(stands(board))
             gives_way(bus, commander)
             drives(board)

@@ -12,7 +12,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from acsard.drive.modes import Mode, Trigger
+from acsard.drive.modes import Mode
 
 COMPARE: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -35,8 +35,7 @@ ARITHMETIC: dict[type, type] = {
     ast.Pow: ast.Mult,
 }
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
-MEMBERS = {name: list(Mode.__members__) for name in ("Mode", "_M")}
-MEMBERS |= {name: list(Trigger.__members__) for name in ("Trigger", "_T")}
+MEMBERS = {"Mode": list(Mode.__members__)}
 
 
 class Mutant(NamedTuple):

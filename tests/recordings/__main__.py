@@ -25,7 +25,7 @@ def quiet(world: World) -> None:
     world.drive(0.5, 0.3, 2.0, source="nav")
     world.drive(0.3, -0.8, 2.0, source="teleop")
     world.call("stop")
-    world.run(1.0)
+    world.run(2.0)  # a clear that names no latch is refused for 2 s
     world.call("clear")
     world.drive(-0.4, 0.0, 1.0)
     world.loop.leaving = True

@@ -1,24 +1,27 @@
-"""Who sends commands over a network that may hold them back, by a clock that may be set."""
+"""Programs that send commands over a network that may hold them back, by clocks that may be set."""
 
 from __future__ import annotations
 
 import random
+from collections import deque
+from collections.abc import Callable
 from typing import Literal
 
 import msgspec
 
-from acsard.incoming.commands import Arrival
+from acsard.incoming.commands import Arrival, Via
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.ros.attachments import Attachment
-from acsard.values import NS_PER_S
+from acsard.values import NS_PER_S, Outputs
 from tests.scenarios.world import World
 
-Way = Literal["signed", "rmw", "header", "zenoh", "plain", "bridge"]
-STAMPED: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
-NUMBERED: tuple[Way, ...] = ("signed", "rmw")
+Way = Literal["client", "signed", "rmw", "header", "zenoh", "plain", "bridge"]
+FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
+"""Roads whose stamps come from a wall clock. Our own client stamps by a steady clock."""
+STAMPED: tuple[Way, ...] = ("client", *FOREIGN)
 SHARED: tuple[Way, ...] = ("header", "plain", "bridge")
-"""All who send on a key this way look like one."""
+"""Roads by which all programs on a key share one identity."""
 
 AHEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock by its own."""
@@ -33,6 +36,13 @@ class Speaker:
         """How fast its clock goes, once it is slewed."""
         self._slewed_ns = world.now_ns
         self._sent = 0
+        self.key = "cmd/app"
+        self.via: Via = way if way in ("rmw", "bridge") else "native"
+
+    @property
+    def session(self) -> str:
+        """The id of its Zenoh session."""
+        return f"session of {self.name}"
 
     def slew(self, rate: float) -> None:
         """From now on its clock goes so fast."""
@@ -51,26 +61,28 @@ class Speaker:
         slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
         return linear, int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed), self._sent
 
-    def deliver(self, message: tuple[float, int, int]) -> None:
+    def deliver(self, message: tuple[float, int, int], angular: float = 0.0) -> None:
         """It arrives now."""
         linear, stamp_ns, number = message
         world, way = self.world, self.way
-        twist = Twist(Vector3(linear), Vector3())
+        twist = Twist(Vector3(linear), Vector3(z=angular))
         stamped = TwistStamped(Header(Time.from_ns(stamp_ns)), twist)
-        payload = encode(stamped if way in ("signed", "header") else twist, "cdr")
+        headed = way in ("client", "signed", "header")
+        payload = encode(stamped if headed else twist, "cdr")
         attachment, sender, told_ns = b"", "", None
         if way == "rmw":
             attachment = Attachment(number, stamp_ns, self.name.encode().ljust(16)).pack()
-        elif way == "signed":
-            told = {"sender": self.name, "stamp": stamp_ns, "sequence": number}
-            attachment = msgspec.msgpack.encode(told)
-        if way in ("signed", "zenoh") and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
-            sender, told_ns = f"session of {self.name}", stamp_ns
-        via = way if way in ("rmw", "bridge") else "native"
-        kind = "TwistStamped" if way in ("signed", "header") else "Twist"
+        elif way in ("client", "signed"):
+            signature = {"sender": self.name, "stamp": stamp_ns, "sequence": number}
+            if way == "client":
+                signature["steady"] = True
+            attachment = msgspec.msgpack.encode(signature)
+        if way in ("client", "signed", "zenoh") and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
+            sender, told_ns = self.session, stamp_ns
+        kind = "TwistStamped" if headed else "Twist"
         encoding = f"application/cdr;geometry_msgs/msg/{kind}"
         arrival = Arrival(
-            "cmd/app", True, payload, encoding, world.now_ns, told_ns, sender, via, attachment
+            self.key, True, payload, encoding, world.now_ns, told_ns, sender, self.via, attachment
         )
         if not sender and hasattr(arrival, "received_ns"):
             arrival = msgspec.structs.replace(arrival, received_ns=world.instant.wall_ns)
@@ -91,6 +103,56 @@ class Speaker:
         self.hold(0.0, 1.0, hz)
         self.hold(linear, 1.0, hz)
         assert self.world.state.mode == "driving", (self.way, self.world.state.reason)
+
+
+def over(
+    world: World,
+    speaker: Speaker,
+    delay: Callable[[float], float],
+    speed: Callable[[float], float],
+    seconds: float,
+    hz: float = 20.0,
+) -> tuple[float, int]:
+    """Send `speed(t)` m/s for `seconds` over a network that delivers in order after `delay(t)` s.
+
+    Returns the age on arrival of the oldest speed that the robot obeyed, s, and how many speeds it
+    obeyed. `t` is the time since the call, s.
+    """
+    start_ns, queue = world.now_ns, deque[tuple[int, tuple[float, int, int]]]()
+    sent: dict[int, tuple[tuple[float, int, int], float]] = {}
+    oldest, obeyed = 0.0, set[int]()
+
+    def watch(outputs: Outputs) -> None:
+        nonlocal oldest
+        arrived_ns = outputs.command_ns
+        if arrived_ns in sent and outputs.mode == "driving" and outputs.applied.linear:
+            assert arrived_ns is not None
+            message, age = sent[arrived_ns]
+            if message[0]:
+                oldest = max(oldest, age)
+                obeyed.add(arrived_ns)
+
+    before, world.watch = world.watch, watch
+    number, last_ns = 0, 0
+    while number < seconds * hz or queue:
+        send_ns = start_ns + int(number / hz * NS_PER_S)
+        if number < seconds * hz and (not queue or send_ns <= queue[0][0]):
+            world.run(max(0.0, (send_ns - world.now_ns) / NS_PER_S))
+            t = number / hz
+            last_ns = max(last_ns + 1, world.now_ns + int(delay(t) * NS_PER_S))
+            queue.append((last_ns, speaker.message(speed(t))))
+            sent[last_ns] = (queue[-1][1], (last_ns - world.now_ns) / NS_PER_S)
+            number += 1
+            continue
+        arrive_ns, message = queue.popleft()
+        world.run(max(0.0, (arrive_ns - world.now_ns) / NS_PER_S))
+        sent[world.now_ns] = (message, sent.pop(arrive_ns)[1])
+        speaker.deliver(message)
+        if world._listens:
+            world.run(0.0)
+    world.run(0.3)
+    world.watch = before
+    return oldest, len(obeyed)
 
 
 def moved(world: World, since_ns: int) -> bool:

@@ -11,6 +11,7 @@ from acsard.config.named_faults import FAULTS
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
+from acsard.guard import Guard
 from acsard.record.batch import decode, encode
 from acsard.record.file import About, Writing
 from acsard.record.replay import Replay
@@ -48,12 +49,14 @@ class Tape:
         self.status = Recording("memory")
 
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, last: bytes
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
         self.taken.append(Taken(inputs, outputs, left))
         if self.cut or (self._every and len(self.taken) % self._every == 0):
             self.cut = False
-            self.states[len(self.taken)] = freeze(robot, last)
+            self.states[len(self.taken)] = freeze(robot, guard.memory)
+
+    def begins(self, robot: Robot, guard: Guard) -> None: ...
 
     def died(self, inputs: Inputs) -> None: ...
 
@@ -139,8 +142,8 @@ def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[st
 def happenings(world: World, dice: random.Random) -> None:
     """Each once."""
     world.call("stop")
-    world.hold(0.5, seconds=0.3)
-    world.call("clear")
+    world.hold(0.5, seconds=2.1)  # a clear that names no latch is refused for 2 s
+    assert world.call("clear").success
     world.call("set_pose", b'{"x": 1.5, "y": -2.0, "yaw": 0.3}')
     world.put("cmd/app", b'{"linear": {"x": "fast"}}')
     world.stall(dice.uniform(0.05, 0.4))

@@ -26,18 +26,8 @@ def world() -> World:
 def test_a_source_that_never_sent_a_zero_does_not_move_the_robot(world: World) -> None:
     world.hold(0.5, seconds=2.0)
     assert world.state.x == 0.0
-    assert "neutral first" in world.state.reason
+    assert "send a zero first" in world.state.reason
     assert "app" in world.state.reason
-
-
-def test_a_source_that_paused_for_more_than_a_second_may_drive(world: World) -> None:
-    world.hold(0.5, seconds=0.5)
-    world.run(0.9)  # and the 0.05 s until the next was due
-    world.hold(0.5, seconds=0.5)
-    assert world.state.mode == "ready"
-    world.run(1.1)
-    world.hold(0.5, seconds=0.5)
-    assert world.state.mode == "driving"
 
 
 def test_the_higher_priority_takes_the_robot_and_gives_it_back(world: World) -> None:
@@ -49,12 +39,12 @@ def test_the_higher_priority_takes_the_robot_and_gives_it_back(world: World) -> 
         world.send(-0.2, source="teleop")
         world.run(0.05)
     assert world.state.source == "teleop"
-    assert world.state.linear < 0
+    assert world.odom.twist.twist.linear.x < 0
     waiting = {s.name: s.waits_for for s in world.state.sources}
     assert "teleop has the higher priority" in waiting["nav"]
     world.hold(0.2, seconds=1.0, source="nav")
     assert world.state.source == "nav"
-    assert world.state.linear > 0
+    assert world.odom.twist.twist.linear.x > 0
 
 
 def test_a_person_who_holds_the_stick_through_a_clear_masks_the_planner(world: World) -> None:
@@ -209,8 +199,8 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     world.run(0.2)
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
-    assert world.state.reason.startswith("app may be late: its delays must be steady")
-    assert "app may be late" in {s.name: s.waits_for for s in world.state.sources}["app"]
+    assert world.state.reason.startswith("app is new here: it drives once its delays")
+    assert "app is new here" in {s.name: s.waits_for for s in world.state.sources}["app"]
     assert world.state.counters["commands_first_contact"] == 4
     # Which is how every sender begins: nothing is refused, and nothing warned of.
     assert not [name for name in world.state.counters if name.startswith("command_")]
@@ -262,15 +252,15 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     """`ros2 topic pub -r 10 /cmd_vel`: a speed from the first message on."""
     Speaker(world, way).hold(0.5, 5.0, hz=10.0)
     assert world.state.x == 0.0
-    assert "neutral first: app must send a zero" in world.state.reason
-    assert "`ros2 topic pub` of a speed never does" in world.state.reason
+    assert "send a zero first: app must send a zero" in world.state.reason
+    assert "`ros2 topic pub` of a speed sends none" in world.state.reason
     (told,) = [event for event in world.events if event.name == "kept_waiting"]
     assert told.text == f"app: {world.state.reason}"
 
 
 def test_who_is_not_of_ros_is_not_told_of_its_tools(world: World) -> None:
     Speaker(world, "signed").hold(0.5, 5.0)
-    assert "neutral first" in world.state.reason
+    assert "send a zero first" in world.state.reason
     assert "ros2" not in world.state.reason
 
 
@@ -318,11 +308,12 @@ def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) ->
     world.call("stop")
     world.send(0.0)
     world.now_ns += 300_000_000
-    world.bus.queries.append(Query(99, "srv/clear", "srv/clear", "", b"", "", world.now_ns))
+    named = msgspec.json.encode({"latch": world.state.latch})
+    world.bus.queries.append(Query(99, "srv/clear", "srv/clear", "", named, "", world.now_ns))
     world.send(0.5)
     world.run(0.2)
     assert world.state.mode == "ready"
-    assert "neutral first" in world.state.reason
+    assert "send a zero first" in world.state.reason
 
 
 def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
@@ -370,8 +361,10 @@ class Person:
         self.world.bus.arrivals.append(arrival)
 
     def drive(self, linear: float) -> None:
-        """A zero, then on from there at 20 Hz until it drives."""
-        self.send(0.0)
+        """Zeros for a good second, then on from there at 20 Hz until it drives."""
+        for _ in range(24):
+            self.send(0.0)
+            self.world.run(0.05)
         for _ in range(10):
             self.world.run(0.05)
             self.send(linear)
@@ -408,7 +401,7 @@ def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
         world.run(0.05)
         assert world.state.linear == 0.0
     assert world.state.x == x
-    assert waits_for(world).startswith("neutral first: nav must send a zero")
+    assert waits_for(world).startswith("send a zero first: nav must send a zero")
     for _ in range(30):
         holding.send(0.0)
         world.run(0.05)
@@ -423,12 +416,14 @@ def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_told
     first.send(0.0)
     world.run(0.02)
     second.send(0.0)
+    if via == "bridge":
+        world.run(1.1)
     for _ in range(40):
         first.send(0.4)
         world.run(0.025)
         second.send(-0.4)
         world.run(0.025)
-        assert world.state.linear >= 0.0
+        assert world.odom.twist.twist.linear.x >= 0.0
     assert world.state.linear == pytest.approx(0.4, abs=0.03)
     assert waits_for(world) == "1 more of its senders: the first until it is silent"
     for _ in range(40):
@@ -446,6 +441,7 @@ def test_two_nodes_behind_one_bridge_that_stamps_nothing_are_one_sender(world: W
         )
 
     send(0.0)
+    world.run(1.1)
     for _ in range(20):
         send(0.4)
         world.run(0.05)
@@ -475,7 +471,7 @@ def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
         person.send(0.4)
         world.run(0.05)
         assert world.state.linear == 0.0
-    assert waits_for(world).startswith("neutral first")
+    assert waits_for(world).startswith("send a zero first")
     assert world.state.counters["command_stale"] > 0
 
 
@@ -491,15 +487,13 @@ def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
             person.send(0.4, late)
         world.run(0.01)
         assert world.state.linear == 0.0
-    assert waits_for(world).startswith("neutral first")
+    assert waits_for(world).startswith("send a zero first")
 
 
 @pytest.mark.variations(3)
 @by_each_way
 @pytest.mark.parametrize("nonsense", ["NaN", "cut", "nothing", "a NaN in a stamped one"])
-def test_one_who_sends_nonsense_for_a_while_was_not_silent(
-    world: World, via: Via, nonsense: str
-) -> None:
+def test_what_cannot_be_read_arms_nobody(world: World, via: Via, nonsense: str) -> None:
     person = Person(world, via, "a")
     stamp = Time(*divmod(world.instant.wall_ns, NS_PER_S))
     bad, kind = {
@@ -520,8 +514,10 @@ def test_one_who_sends_nonsense_for_a_while_was_not_silent(
         person.send(0.5)
     world.run(0.05)
     assert world.state.linear == 0.0
-    assert waits_for(world).startswith("neutral first")
-    world.run(1.2)  # now it was
+    assert waits_for(world).startswith("send a zero first")
+    for _ in range(24):
+        person.send(0.0)
+        world.run(0.05)
     for _ in range(10):
         person.send(0.5)
         world.run(0.05)
@@ -539,7 +535,7 @@ def test_wheel_speeds_that_cancel_out_do_not_arm_their_sender(world: World) -> N
     for _ in range(10):
         send(8.0, 8.0, 8.0, 8.0)
     assert world.state.mode == "ready"
-    assert waits_for(world, "app").startswith("neutral first")
+    assert waits_for(world, "app").startswith("send a zero first")
     for _ in range(25):  # others may look like it: for a good second
         send(0.0, 0.0, 0.0, 0.0)
     for _ in range(10):

@@ -10,11 +10,20 @@ import math
 import random
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import nullcontext
 
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
+from acsard.config.settings import (
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    SimConfig,
+    WheelMap,
+)
 from acsard.mcu.check import unseal
 from acsard.mcu.codec import Codec, FrameError
 from acsard.mcu.lines import LineReader
@@ -199,7 +208,7 @@ def test_a_reset_mcu_does_not_move_before_it_is_asked_and_commanders_are_neutral
     world.hold(0.5, seconds=3.0)
     assert not moving(world.lines()[heard + 1 :])
     assert world.state.mode == "ready"
-    assert "neutral first" in world.state.reason
+    assert "send a zero first" in world.state.reason
     assert stopped(world)
     assert world.state.x - before < 0.08
     world.drive(0.5, seconds=1.0)
@@ -572,3 +581,65 @@ def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:
     assert world.state.link == "booting"
     assert "what is sent comes back" in world.state.reason
     assert moving([line for _, line in world.port.sent]) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "most"),
+    [
+        pytest.param({}, 0.01, id="as usual"),
+        pytest.param({"linear_acceleration": 100.0}, 0.2, id="at once"),
+    ],
+)
+def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
+    changes: dict[str, float], most: float
+) -> None:
+    world = World(replace(Config(), limits=replace(LimitsConfig(), **changes)), plugged=False)
+    world.port.plug(Echo(world.config, world.now_ns))
+    world.run(0.5)
+    assert world.state.link == "up"  # at rest nobody can tell
+    world.drive(0.5, seconds=2.0)
+    assert (world.state.mode, world.state.link) == ("waiting", "stale")
+    assert "TX and RX are joined, or the terminal echoes" in world.state.reason
+    assert abs(world.state.x) <= most
+    (event,) = [event for event in world.events if event.name == "link_check"]
+    assert (event.level, event.text) == ("error", world.state.reason)
+    sent = len(world.port.sent)
+    world.drive(0.5, seconds=10.0)
+    assert world.state.link == "stale"
+    assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
+    world.port.unplug()
+    world.run(0.1)
+    world.port.plug(FakeMcu(world.config, world.now_ns))
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("period", [0.0, 0.05])
+@pytest.mark.parametrize("counts", [3200, 1_000_000])
+@pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
+def test_no_board_that_measures_is_taken_for_an_echo(
+    lag: float, counts: int, period: float
+) -> None:
+    plain = Config(
+        sim=SimConfig(motor_time_constant=lag, encoder_counts=counts),
+        mcu=McuConfig(reply_period=period),
+        feedback=FeedbackConfig(wheel_acceleration=1e6),
+    )
+    dice = random.Random(3)
+    for acceleration in (1.0, 100.0):
+        rates = {
+            f"{axis}_{kind}": acceleration * (3 if "stop" in kind else 1)
+            for axis in ("linear", "angular")
+            for kind in ("acceleration", "deceleration", "stop_deceleration")
+        }
+        limits = replace(LimitsConfig(), angular_speed=1.0, **rates)
+        world = World(replace(plain, limits=limits))
+        world.bus.wanted = set()
+        with world.mcu.unprompted(period) if period else nullcontext():
+            world.mcu.unpadded_replies, world.mcu.ending = False, "\r\n"
+            world.run(0.5)
+            world.drive(0.3, seconds=0.5)
+            for _ in range(10):
+                world.hold(round(dice.uniform(-0.9, 0.9), 1), seconds=dice.uniform(0.2, 1.0))
+        assert world.state.link == "up"
+        assert "line_echo" not in world.state.counters

@@ -10,6 +10,7 @@ import pytest
 
 from acsard.incoming.commands import EXAMPLES, Arrival, Via
 from acsard.incoming.queries import Query
+from acsard.messages.signature import public_name
 from acsard.messages.topics import VERBS
 from acsard.values import NS_PER_S, Event, EventName
 from tests.scenarios.world import World
@@ -32,7 +33,12 @@ def told(world: World, name: EventName) -> list[Event]:
 
 def signed(name: str) -> bytes:
     """The attachment of one who says who he is."""
-    return msgspec.json.encode({"sender": name})
+    return msgspec.json.encode({"sender": f"{name}/s3cret"})
+
+
+def shown(name: str) -> str:
+    """The name that the log has for it."""
+    return f"{public_name(f'{name}/s3cret')} (native)"
 
 
 def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> None:
@@ -43,6 +49,8 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
             Arrival("stop", True, b"", "", at_ns, None, "", via=via, attachment=name)
         )
     payload = EXAMPLES.get(VERBS[key], "").encode()
+    if service == "clear":
+        payload = msgspec.json.encode({"latch": world.state.latch})
     query = Query(1, key, key, "", payload, "", at_ns, via, name)
     world.bus.queries.append(query)
     world.run(0.03)
@@ -57,7 +65,7 @@ def test_every_service_is_told_once_with_who_called_it(world: World, service: st
         call(world, "stop", signed("ann@desk"))
     call(world, service, signed("joe@laptop patrol"))
     (event,) = (event for event in world.events if event.name == service)
-    assert event.by == "joe@laptop patrol (native)"
+    assert event.by == shown("joe@laptop patrol")
     assert event.count == 1
 
 
@@ -67,23 +75,24 @@ def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
         call(world, "clear", signed(name + "@desk"))
     asked = [(event.name, event.by) for event in world.events if event.by]
     assert asked == [
-        ("stop", "joe (native)"),
-        ("clear", "joe@desk (native)"),
-        ("stop", "ann (native)"),
-        ("clear", "ann@desk (native)"),
+        ("stop", shown("joe")),
+        ("clear", shown("joe@desk")),
+        ("stop", shown("ann")),
+        ("clear", shown("ann@desk")),
     ]
 
 
 def test_a_second_one_who_stops_is_told_too_a_second_later(world: World) -> None:
     call(world, "stop", signed("joe"))
     call(world, "stop", signed("ann"))
-    assert [event.by for event in told(world, "stop")] == ["joe (native)"]
+    assert [event.by for event in told(world, "stop")] == [shown("joe")]
     world.run(1.0)
-    assert [event.by for event in told(world, "stop")] == ["joe (native)", "ann (native)"]
+    assert [event.by for event in told(world, "stop")] == [shown("joe"), shown("ann")]
 
 
 def test_ros_says_less_of_who_calls_and_the_log_says_so(world: World) -> None:
     call(world, "stop", bytes(16) + b"\x10" + bytes(range(16)), "rmw")
+    world.run(2.0)
     call(world, "clear", b"", "bridge")
     assert told(world, "stop")[0].by == f"unnamed (rmw {bytes(range(16)).hex()})"
     assert told(world, "clear")[0].by == "unnamed (bridge)"
@@ -97,8 +106,8 @@ def test_a_put_on_stop_is_told_with_its_name_or_the_session_that_stamped_it(worl
     )
     world.run(0.1)
     assert [event.by for event in told(world, "stop")] == [
-        "unnamed (native, session peer)",
-        "ann (native)",
+        f"unnamed (native, session {public_name('peer')})",
+        shown("ann"),
     ]
 
 
@@ -112,7 +121,9 @@ def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
         "ready -> driving: commanded by app",
         "driving -> ready: waiting for a command: no source has sent one within its timeout",
     ]
-    assert [event.text for event in told(world, "commander")] == ["nobody -> app (somebody)"]
+    assert [event.text for event in told(world, "commander")] == [
+        f"nobody -> app ({public_name('somebody')})"
+    ]
 
 
 def test_a_higher_priority_is_another_commander_and_so_is_going_back(world: World) -> None:

@@ -46,6 +46,26 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert tally.poses == tally.poses_same >= least
 
 
+@pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
+def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(after: float) -> None:
+    """The guard of the replay lets the rest of the ramp pass, and nothing that comes too late."""
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(1.0, seconds=2.0)
+    world.run(after)
+    tape.cut = True
+    world.run(2.0)
+    (first,) = tape.states
+    lives_again(tape, PLAIN, first)
+    assert thaw(tape.states[first]).memory.commanded_ns is not None
+    late = replayed(tape, PLAIN, first)
+    guard = late._guard
+    assert late.outputs is not None
+    moving = replace(late.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    guard.left(b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    assert "ramp to rest is over" in guard.check(moving)[1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "config",

@@ -210,6 +210,43 @@ def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way
     assert told(world, "fault") == told(world, "wheels_turned") == []
 
 
+INTERRUPTIONS = (
+    ("clear", 0.05), ("clear", 0.1), ("clear", 0.2),
+    ("silence", 0.12), ("silence", 0.2), ("replug", 0.05), ("replug", 0.3),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("lag", "interruption"),
+    [
+        pytest.param(*case, marks=[] if case[0] == 0.4 else pytest.mark.slow)
+        for case in product((0.3, 0.35, 0.4, 0.45, 0.5, 0.6), INTERRUPTIONS)
+    ],
+)
+def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_speed(
+    lag: float, interruption: tuple[str, float]
+) -> None:
+    kind, seconds = interruption
+    for linear, angular in ((1, 0), (-1, 1), (0.5, 0), (0, 4), (0.7, -2), (-0.3, 0)):
+        world = World(Config(sim=SimConfig(motor_time_constant=lag)))
+        world.bus.wanted = set()
+        world.run(0.2)
+        world.drive(linear, angular, seconds=2.5)
+        if kind == "clear":
+            world.put("stop", b"")
+            world.run(seconds)
+            assert world.call("clear").success
+        elif kind == "silence":
+            with world.mcu.mute():
+                world.run(seconds)
+        else:
+            world.port.unplug()
+            world.run(seconds)
+            world.port.plug(world.mcu)
+        world.run(3.0)
+        assert told(world, "fault") == []
+
+
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("linear", "way", "within"),

@@ -24,11 +24,12 @@ from acsard.messages.signature import Signature
 from acsard.messages.topics import PUBLISHED
 from acsard.record.steps import BlackBox
 from acsard.runtime.control_loop import ControlLoop
+from acsard.runtime.kept_latches import LatchKeeper
 from acsard.runtime.period import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.told import turn_rate
 from acsard.sim.watched import Sight, WatchedMcu
-from acsard.values import NS_PER_S, Event, Instant, Outputs, Pose, Received
+from acsard.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
@@ -130,6 +131,8 @@ class World:
         *,
         plugged: bool = True,
         recorder: BlackBox | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+        keeper: LatchKeeper | None = None,
     ) -> None:
         self.config = config or Config()
         self.now_ns = START.mono_ns
@@ -165,6 +168,8 @@ class World:
             self.events.append,
             lambda: self.now_ns,
             recorder=recorder,
+            latches=latches,
+            keeper=keeper,
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}
@@ -266,8 +271,9 @@ class World:
         put: bool = True,
         stamp_ns: int | None = None,
         attachment: bytes = b"",
+        session: str = "peer",
     ) -> None:
-        peer = "peer" if stamp_ns else ""
+        peer = session if stamp_ns else ""
         self.bus.arrivals.append(
             Arrival(key, put, payload, "", self.now_ns, stamp_ns, peer, attachment=attachment)
         )
@@ -305,18 +311,26 @@ class World:
             self.run(1 / hz)
 
     def ask(
-        self, key: str, asked: str | None = None, fmt: str = "", payload: bytes = b""
+        self,
+        key: str,
+        asked: str | None = None,
+        fmt: str = "",
+        payload: bytes = b"",
+        attachment: bytes = b"",
     ) -> list[Reply]:
         """The replies to a query after one period."""
         self._queries += 1
         name = key if asked is None else asked
-        query = Query(self._queries, key, name, fmt, payload, "", self.now_ns)
+        at_ns = self.now_ns
+        query = Query(self._queries, key, name, fmt, payload, "", at_ns, attachment=attachment)
         self.bus.queries.append(query)
         self.run(2 / self.config.rate_hz)
         return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
-        """A service's answer."""
+        """Return a service's answer; `clear` names the latch of `state`, as our tools do."""
+        if service == "clear" and not payload:
+            payload = msgspec.json.encode({"latch": self.state.latch})
         (reply,) = self.ask(f"srv/{service}", payload=payload)
         return msgspec.json.decode(reply.payload, type=ServiceReply)
 

@@ -7,16 +7,21 @@ own pid.
 
 from __future__ import annotations
 
+import atexit
 import bisect
+import functools
 import itertools
 import json
 import os
 import pty
+import secrets
 import select
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import tty
@@ -29,6 +34,7 @@ import msgspec
 import zenoh
 
 from acsard.incoming.queries import BUSY
+from acsard.messages.topics import command_key
 
 T = TypeVar("T")
 
@@ -75,10 +81,19 @@ def free_endpoint() -> str:
 
 def environment(**more: str) -> dict[str, str]:
     """The environment of a shell that knows nothing of this test run."""
-    hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "ACSARD_RECORD", "RUST_LOG")
+    hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "ACSARD_RECORD", "RUST_LOG", "STATE_DIRECTORY")
     env = {key: value for key, value in os.environ.items() if key not in hidden}
     paths = [str(ROOT), *filter(None, [env.get("PYTHONPATH")])]
-    return env | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"} | more
+    env |= {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"}
+    return env | {"XDG_STATE_HOME": _states()} | more
+
+
+@functools.cache
+def _states() -> str:
+    """Make a home for the latch files of this test run; no test may stop a real robot."""
+    where = tempfile.mkdtemp(prefix="acsard-tests-")
+    atexit.register(shutil.rmtree, where, ignore_errors=True)
+    return where
 
 
 # processes
@@ -252,6 +267,9 @@ class Daemon(Program):
         given = {table: dict(values) for table, values in (config or {}).items()}
         given.setdefault("mcu", {}).setdefault("port", str(port))
         given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
+        self.states = where / f"{name}.states"
+        """Directory of the latch file; the next daemon of this name starts with its latches."""
+        given.setdefault("control", {}).setdefault("state_directory", str(self.states))
         self.config = write_config(where / f"{name}.toml", given)
         self._ready = ready
         listens = given["bus"].get("mode") != "client"
@@ -307,6 +325,8 @@ def cpu_seconds(pid: int) -> float:
 # the microcontroller that is not ours
 
 Speeds = tuple[float, float, float, float]
+
+STANDING = (0.0, 0.0, 0.0, 0.0)
 Reply = Callable[[Speeds], bytes]
 
 
@@ -456,7 +476,7 @@ class Peer:
         return self.session.said()[-1]
 
     def _serve(self, master: int, session: Session) -> None:
-        held = b""
+        held, turning, told = b"", STANDING, STANDING
         while not self._leave.is_set():
             if not self._listens.is_set():
                 self._idle += 1
@@ -473,7 +493,8 @@ class Peer:
                 session.lines.append(Heard(now, line + b"\n"))
                 speeds = _speeds(line)
                 if speeds is not None:
-                    answer = self.reply(speeds)
+                    # The wheels lag by two lines. Replies that never lag would be an echo.
+                    answer, turning, told = self.reply(turning), told, speeds
                     if answer:
                         os.write(master, answer)
 
@@ -488,14 +509,16 @@ master, slave = pty.openpty()
 tty.setraw(slave)
 os.symlink(os.ttyname(slave), sys.argv[1])
 print("plugged", flush=True)
-held = b""
+held, turning, told = b"", b"", b""
 while True:
     data = os.read(master, 4096)
     now = time.monotonic()
     *lines, held = (held + data).split(b"\\n")
     for line in lines:
         if line.startswith(b"a"):
-            os.write(master, line + b"\\n")
+            # The wheels lag by two lines. Replies that never lag would be an echo.
+            os.write(master, (turning or line) + b"\\n")
+            turning, told = told, line
         print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
 """
 
@@ -650,13 +673,21 @@ class Bus:
     def __exit__(self, *error: object) -> None:
         self.session.close()
 
-    def put(self, key: str, value: object) -> None:
-        """JSON without an encoding, as the smallest client sends it."""
-        self.session.put(f"{self.root}/{key}", json.dumps(value))
+    def put(self, key: str, value: object, sender: str = "") -> None:
+        """Put JSON without an encoding, as the smallest client does, with its sender id if any."""
+        attachment = json.dumps({"sender": sender}) if sender else None
+        self.session.put(f"{self.root}/{key}", json.dumps(value), attachment=attachment)
+
+    def payload(self, key: str, payload: object) -> str | None:
+        """Return the payload of a query as JSON; that of a clear without one names the latch."""
+        if key == "srv/clear" and payload is None:
+            states = self.ask("state")
+            payload = {"latch": json.loads(states[0].payload)["latch"]} if states else None
+        return None if payload is None else json.dumps(payload)
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """All replies to a query."""
-        data = None if payload is None else json.dumps(payload)
+        """All replies to a query; `srv/clear` names the latch of `state`, as our tools do."""
+        data = self.payload(key, payload)
         found = []
         for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
             if reply.ok is not None:
@@ -730,10 +761,16 @@ class Bus:
 
     @contextmanager
     def commanding(
-        self, linear: float, angular: float = 0.0, *, source: str = "app", neutral: bool = True
+        self,
+        linear: float,
+        angular: float = 0.0,
+        *,
+        source: str = "app",
+        neutral: bool = True,
+        certificate: str = "",
     ) -> Iterator[Commander]:
         """A commander at 20 Hz that opens with a zero, unless told to be rude, while entered."""
-        commander = Commander(self, f"cmd/{source}", linear, angular)
+        commander = Commander(self, command_key("cmd", source, certificate), linear, angular)
         if neutral:
             before, said = self.count("commands"), 0.0
 
@@ -743,13 +780,13 @@ class Bus:
                 # comes within a millisecond of another is left out.
                 state = self.state()
                 counters, waits = state["counters"], self._waits_for(state, source)
-                neutral = waits.startswith("neutral first")
+                neutral = waits.startswith("send a zero first")
                 if (
                     neutral
                     or counters.get("commands_first_contact")
                     or time.monotonic() > said + 0.5
                 ):
-                    self.put(commander.key, ZERO)
+                    self.put(commander.key, ZERO, commander.sender)
                     said = time.monotonic()
                 return not neutral and counters.get("commands", 0) > before
 
@@ -766,7 +803,7 @@ class Commander:
     """Keeps sending, whatever happens to the robot, as commanders do."""
 
     def __init__(self, bus: Bus, key: str, linear: float, angular: float) -> None:
-        self.key = key
+        self.key, self.sender = key, f"commander/{secrets.token_hex(16)}"
         self.wish = twist(linear, angular)
         self.silenced = threading.Event()
         self._bus = bus
@@ -774,7 +811,7 @@ class Commander:
 
     def _send(self) -> None:
         while not self.silenced.is_set():
-            self._bus.put(self.key, self.wish)
+            self._bus.put(self.key, self.wish, self.sender)
             self.silenced.wait(0.05)
 
 

@@ -8,6 +8,8 @@ _OPEN = """\
 import json, signal, sys, time
 import zenoh
 
+SENDER = json.dumps({"sender": "program/%d" % time.time_ns()})
+
 def open_session(endpoint):
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
@@ -40,7 +42,8 @@ session = open_session(sys.argv[1])
 speed, seconds = float(sys.argv[2]), float(sys.argv[3])
 
 def put(linear):
-    session.put("acsard/acsar/cmd/app", json.dumps({"linear": {"x": linear}, "angular": {"z": 0}}))
+    wish = json.dumps({"linear": {"x": linear}, "angular": {"z": 0}})
+    session.put("acsard/acsar/cmd/app", wish, attachment=SENDER)
 
 put(0.0)
 time.sleep(0.05)
@@ -78,13 +81,13 @@ def command(linear):
     return json.dumps({"linear": {"x": linear}, "angular": {"z": 0}})
 
 key = "acsard/acsar/cmd/app"
-session.put(key, command(0.0))
+session.put(key, command(0.0), attachment=SENDER)
 time.sleep(0.05)
 print("flooding", flush=True)
 publisher, payload, count = session.declare_publisher(key), command(speed), 0
 end = time.monotonic() + seconds
 while time.monotonic() < end:
-    publisher.put(payload)
+    publisher.put(payload, attachment=SENDER)
     count += 1
 print("flooded", count, flush=True)
 session.close()
@@ -116,7 +119,8 @@ def put(linear):
     header = {"stamp": {"sec": sec, "nanosec": nanosec}}
     twist = {"linear": {"x": linear}, "angular": {"z": 0}}
     print("put", repr(time.monotonic()), flush=True)
-    session.put("acsard/acsar/cmd/" + source, json.dumps({"header": header, "twist": twist}))
+    wish = json.dumps({"header": header, "twist": twist})
+    session.put("acsard/acsar/cmd/" + source, wish, attachment=SENDER)
 
 for _ in range(zeros):
     put(0.0)
@@ -132,8 +136,34 @@ while True:
 )
 """So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put.
 
-SIGUSR1 makes it let go: thirty zeros, longer than the pause of whom only his key tells.
+SIGUSR1 makes it return to neutral: it sends thirty zeros.
 """
+
+STOP_AND_GO = (
+    _OPEN
+    + """
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect", json.dumps({
+    "endpoints": [sys.argv[1]], "timeout_ms": -1, "exit_on_failure": False,
+    "retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1},
+}))
+session, sequence = zenoh.open(config), 0
+while True:
+    speed = 0.0 if time.monotonic() % 2.0 < 0.3 else 0.3
+    sequence += 1
+    session.put(
+        "acsard/acsar/cmd/app",
+        json.dumps({"linear": {"x": speed}, "angular": {"z": 0}}),
+        attachment=json.dumps(
+            {"sender": "patrol", "stamp": time.monotonic_ns(), "sequence": sequence}
+        ),
+    )
+    time.sleep(0.05)
+"""
+)
+"""Sends zeros for 0.3 s every 2 s and 0.3 m/s in between, for ever, also to the next daemon."""
 
 CODED_FLOOD = (
     _OPEN
@@ -142,17 +172,17 @@ session = open_session(sys.argv[1])
 base, slope, seconds = (float(word) for word in sys.argv[2:5])
 key = "acsard/acsar/cmd/app"
 text = '{"linear": {"x": %.5f}, "angular": {"z": 0}}'
-session.put(key, text % 0)
+session.put(key, text % 0, attachment=SENDER)
 time.sleep(0.05)
 publisher, count, payload, until, sent = session.declare_publisher(key), 0, "", 0.0, []
 start = time.monotonic()
 print("flooding", repr(start), flush=True)
 while (now := time.monotonic()) < start + seconds:
     if now < until:
-        publisher.put(payload)
+        publisher.put(payload, attachment=SENDER)
     else:
         payload, until = text % (base + slope * (now - start)), now + 0.0005
-        publisher.put(payload)
+        publisher.put(payload, attachment=SENDER)
         sent.append((round(now - start, 6), round(time.monotonic() - start, 6)))
     count += 1
 print("flooded", count, flush=True)

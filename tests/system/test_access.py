@@ -86,10 +86,16 @@ class Try(NamedTuple):
 
 
 def _commands() -> Iterator[Try]:
-    yield from (Try(f"{ME}/cmd/{source}", DRIVERS, TWIST_JSON) for source in SOURCES)
-    yield from (Try(f"{ME}/wheel_cmd/{source}", DRIVERS, WHEELS_JSON) for source in SOURCES)
+    for source in SOURCES:
+        for kind, payload in (("cmd", TWIST_JSON), ("wheel_cmd", WHEELS_JSON)):
+            yield Try(f"{ME}/{kind}/{source}", HERE, payload)
+            # By TLS each certificate has keys of its own.
+            for name in ("operator", "maintainer"):
+                yield Try(f"{ME}/{kind}/{source}/{name}", HERE | {name}, payload)
+            yield Try(f"{ME}/{kind}/{source}/viewer", HERE, payload)
     yield Try(f"{ME}/stop", ANYBODY)
-    unlisted = ("cmd/ghost", "cmd/app/more", "cmd", "cmd/*", "cmd/**", "cmd/ap$*", "cmd/app/**")
+    unlisted = ("cmd/ghost", "cmd/ghost/operator", "cmd/app/operator/more", "cmd", "cmd/*",
+                "cmd/**", "cmd/ap$*", "cmd/app/**", "cmd/app/*", "cmd/*/operator")  # fmt: skip
     yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in unlisted)
     yield from (Try(f"{ME}/wheel_cmd/{key}", NOBODY, WHEELS_JSON) for key in ("ghost", "*", "**"))
     wild = ("*", "**", "*/app", "sto$*", "stop/**")
@@ -181,7 +187,8 @@ def _subscriptions() -> Iterator[Try]:
     yield from (Try(key, HERE) for key in wild)
     others = (f"{OTHER}/odom", f"{OTHER}/**", "other/odom", "0/other/odom/**", "1/odom/**")
     yield from (Try(key, NOBODY) for key in others)
-    commands = (f"{ME}/cmd/app", f"{ME}/cmd/*", f"{ME}/cmd/**", "cmd_vel", RMW_CMD)
+    commands = (f"{ME}/cmd/app", f"{ME}/cmd/*", f"{ME}/cmd/**", f"{ME}/cmd/app/operator",
+                f"{ME}/cmd/*/*", "cmd_vel", RMW_CMD)  # fmt: skip
     yield from (Try(key, HERE, stirred=True) for key in commands)
 
 
@@ -390,6 +397,7 @@ class Visitor:
             if any(row.stirred for row in rows):
                 here = self._robot.here
                 here.put("cmd/app", ZERO)
+                here.put("cmd/app/operator", ZERO)
                 here.session.put("cmd_vel", CDR_TWIST)
                 here.session.put(RMW_CMD, CDR_TWIST, attachment=self._attachment(RMW_CMD))
             if any(row.key.endswith("events") for row in rows):

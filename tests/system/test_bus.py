@@ -53,7 +53,8 @@ FIELDS = {
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
-        "track", "encoders", "doubt", "sender", "recording",
+        "track", "encoders", "doubt", "sender", "recording", "latch", "latch_file",
+        "feedback_age",
     },
     "diagnostics": {"header", "status"},
     "events": {"stamp", "total", "events"},

@@ -108,7 +108,7 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
 
     def moves() -> bool:
         assert program.process.poll() is None, terminal.screen
-        return bool(bus.state()["linear"] > 0.25)
+        return bool((bus.state()["linear"] or 0.0) > 0.25)
 
     until(moves, 10.0, "the first leg moves")
     assert bus.state()["source"] == "app"

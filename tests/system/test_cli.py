@@ -743,7 +743,7 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
         during = terminal.settings
         assert during != usual
         with held(terminal, "i"):
-            until(lambda: bus.state()["linear"] > 0.1, 5.0, "moving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 5.0, "moving")
         suspended = time.monotonic()
         program.signal(signal.SIGTSTP)
         until(lambda: terminal.settings == usual, 5.0, "the terminal as it was")
@@ -777,7 +777,7 @@ def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
 def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
-            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
         assert program.ended(5.0) == 0
         until(lambda: "left: the robot stands; " in terminal.screen, 2.0, "the last word")
@@ -793,7 +793,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
         without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
     ):
         with held(terminal, "i"):
-            until(lambda: bus.state()["linear"] > 0.2, 5.0, "moving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         closed = time.monotonic()
         terminal.close()
         commands.find(lambda value: value["twist"]["linear"]["x"] == 0, 1.0, "a zero", after=closed)
@@ -862,7 +862,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
     with teleop(shared) as (terminal, program):
         during = terminal.settings
         with held(terminal, "i"):
-            until(lambda: bus.state()["linear"] > 0.3, 5.0, "moving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.3, 5.0, "moving")
         with bus.follow("cmd/teleop") as commands:
             terminal.press("\x03")
             left = time.monotonic()
@@ -897,7 +897,7 @@ def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus:
             bus.session.put("acsard/**", payload)
         with held(terminal, "i"):
             until(
-                lambda: bus.state()["linear"] > 0.2 or program.process.poll() is not None,
+                lambda: (bus.state()["linear"] or 0.0) > 0.2 or program.process.poll() is not None,
                 5.0,
                 "driving on",
             )

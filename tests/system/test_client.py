@@ -286,7 +286,7 @@ def test_a_question_that_nobody_answers_in_time_is_a_timeout(
     with zenoh.open(settings) as stuck:
         stuck.declare_queryable("acsard/acsar/srv/*", unanswered.append)
         with connect(endpoint) as robot, pytest.raises(NoAnswerError, match=r"within 0.3 s"):
-            robot.call("clear")
+            robot.call("activate")
         assert unanswered
         unanswered.clear()
 
@@ -351,9 +351,13 @@ def test_a_source_that_is_not_listed_is_told_so_in_state(shared: Daemon, fresh: 
 def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot:
         robot.call("stop")
-        with pytest.raises(NotDrivenError, match="stopped by request"):
+        with pytest.raises(NotDrivenError, match=f"stopped by {robot.name}"):
             robot.drive(0.5, seconds=0.2)
-        robot.call("clear")
+        seen = robot.get("state").latch
+        robot.call("stop")
+        refused = robot.call("clear", latch=seen)
+        assert (refused.success, "is not in force" in refused.message) == (False, True)
+        assert robot.call("clear").success
         robot.call("deactivate")
         with pytest.raises(NotDrivenError, match="srv/activate"):
             robot.drive(0.5, seconds=0.2)
@@ -368,7 +372,7 @@ def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
     with connect(shared.endpoint) as robot:
 
         def stop() -> None:
-            until(lambda: fresh.state()["linear"] > 0.1, 5.0, "driving")
+            until(lambda: (fresh.state()["linear"] or 0.0) > 0.1, 5.0, "driving")
             robot.session.put(robot.key("stop"), b"")
 
         with ThreadPoolExecutor(1) as other:
@@ -390,7 +394,7 @@ def test_a_drive_behind_another_commander_raises_and_says_who_drives(
         ThreadPoolExecutor(1) as other,
     ):
         driving = other.submit(lambda: first.drive(0.1, seconds=4.0))
-        until(lambda: fresh.state()["linear"] > 0.05, 5.0, "the first drives")
+        until(lambda: (fresh.state()["linear"] or 0.0) > 0.05, 5.0, "the first drives")
         told = first.sender if source == "app" else "teleop has the higher priority"
         with pytest.raises(NotDrivenError, match=re.escape(told)):
             robot.drive(0.5, seconds=0.2)
@@ -402,7 +406,7 @@ def test_a_drive_without_its_daemon_raises(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot, Bus(daemon.endpoint) as bus:
 
         def kill() -> None:
-            until(lambda: bus.state()["linear"] > 0.1, 10.0, "driving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 10.0, "driving")
             daemon.signal(signal.SIGKILL)
 
         with ThreadPoolExecutor(1) as other:
@@ -434,7 +438,7 @@ def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_p
         robot, bus = stack.enter_context(connect(endpoint)), stack.enter_context(Bus(endpoint))
 
         def kill() -> None:
-            until(lambda: bus.state()["linear"] > 0.1, 10.0, "driving")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 10.0, "driving")
             daemon.signal(signal.SIGKILL)
 
         killing = stack.enter_context(ThreadPoolExecutor(1)).submit(kill)
@@ -637,8 +641,8 @@ def test_a_daemon_that_is_asked_too_much_is_asked_again_but_no_verb_is_called_ag
             asked.clear()
             # Somebody may have pressed stop since.
             with pytest.raises(ReplyError, match="busy"):
-                robot.call("clear")
-            assert asked == ["acsard/acsar/srv/clear"]
+                robot.call("activate")
+            assert asked == ["acsard/acsar/srv/activate"]
         assert kept
 
 

@@ -124,7 +124,9 @@ def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
 def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_told(tmp_path: Path) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, words=("--port", str(peer.path))) as daemon:
         peer.awaits(b"ap00.00")
-        _, found = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
+        kept = tmp_path / "daemon.states"
+        file = f'[bus]\nlisten = ["{daemon.endpoint}"]\n[control]\nstate_directory = "{kept}"\n'
+        _, found = examined(tmp_path, file)
         (other,) = [one for one in found["configuration"] if "other values" in one["text"]]
         assert other["level"] == "ok"  # it was meant: the README says so
         assert f'[mcu] port = "{peer.path}"' in other["mend"]

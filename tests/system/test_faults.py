@@ -433,10 +433,10 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             before, lost_links = bus.state(), len(daemon.events("link_stale"))
             driver.wish = twist(0.2)
             spoke, silent = begun, 0.0
-            while (now := time.monotonic()) < begun + 0.5:
+            # The daemon gives up a link over which no line has left for 0.3 s.
+            while (now := time.monotonic()) < begun + 0.25:
                 spoke, silent = now, max(silent, now - spoke)
-                # Its own 100 Hz; unheard, it stops as the contract says.
-                peer.say(PLAIN((10.0 if now < begun + 0.3 else 0.0,) * 4))
+                peer.say(PLAIN((10.0,) * 4))
                 time.sleep(TICK_S)
             after = bus.state()
             heard = time.monotonic()
@@ -456,7 +456,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
         # To a link that was lost, even for a moment, there is no line to be made.
         kept = len(daemon.events("link_stale")) == lost_links
         assert kept or starved or lost(begun) > 0.01
-        assert not kept or periods.superseded + periods.missed >= 35
+        assert not kept or periods.superseded + periods.missed >= 15
         assert not kept or periods.are_all_accounted_for()
         # Those sent between the last read and the stuffing, a torn one and the newest.
         assert len(waited) <= 6
@@ -466,7 +466,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             state = bus.state()
             if state["mode"] == "fault":
                 bus.get("srv/clear")
-            driver.wish = ZERO if "neutral first" in state["reason"] else twist(0.2)
+            driver.wish = ZERO if "send a zero first" in state["reason"] else twist(0.2)
             return peer.lines[-1].line.startswith(text(0.2))
 
         # Long unheard, the MCU has stopped: we start over from zero.
@@ -631,7 +631,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
             until(lambda: time.monotonic() > begun + 1.2, 5.0, "seconds")
             woken = time.monotonic()
         with Bus(daemon.endpoint) as bus:
-            until(lambda: "neutral first" in bus.state()["reason"], 5.0, "what it waits for")
+            until(lambda: "send a zero first" in bus.state()["reason"], 5.0, "what it waits for")
             until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
             assert no_burst(peer.since(woken)) >= 0.0
             assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}

@@ -41,7 +41,9 @@ async def drives(guided: Guided, standing: Bus) -> None:
         if "ended" not in said:
             break
         await guided.says(lambda said: said.get("running") == "")
-    await beside(lambda: until(lambda: standing.state()["linear"] > 0.25, 10.0, "the leg moves"))
+    await beside(
+        lambda: until(lambda: (standing.state()["linear"] or 0.0) > 0.25, 10.0, "the leg moves")
+    )
     assert standing.state()["source"] == "app"
 
 
@@ -105,7 +107,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
                 await guided.ours.say(reply=number, value="start")
             refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
             assert "is open" in refused["reason"]
-            assert standing.state()["linear"] > 0.25
+            assert (standing.state()["linear"] or 0.0) > 0.25
             pressed = time.monotonic()
             await guided.ours.say(press="key")
             await beside(standing.at_rest)

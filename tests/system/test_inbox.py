@@ -6,7 +6,7 @@ from functools import partial
 
 import zenoh
 
-from acsard.bus.inbox import Inbox
+from acsard.bus.inbox import ARRIVALS, Inbox
 from acsard.bus.replies import TICKETS, Replies
 from tests.system.harness import Bus, client_config, free_endpoint, until
 
@@ -55,3 +55,27 @@ def test_of_settings_a_step_takes_one_however_many_are_asked_for() -> None:
         until(all_here, 5.0, "all of them")
         assert found.count("srv/set") == 5
         del held, asked
+
+
+def test_a_flood_under_certificates_pushes_out_no_command_of_this_machine_nor_of_others() -> None:
+    prefix, endpoint = "acsard/acsar/", free_endpoint()
+    inbox = Inbox(prefix, Replies(prefix), ("app", "nav"), Deaf())
+    with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
+        came: list[str] = []
+
+        def take(sample: zenoh.Sample) -> None:
+            inbox.on_sample(sample)
+            came.append(str(sample.key_expr).removeprefix(prefix))
+
+        held = [robot.declare_subscriber(f"{prefix}{key}", take) for key in ("cmd/*", "cmd/*/*")]
+        quiet = ["cmd/app", "cmd/nav", "cmd/nav/anna"]
+        flood = [f"cmd/app/{name}" for name in ("anna", "ben")] * ARRIVALS
+        for key in (*quiet, *flood):
+            bus.session.put(prefix + key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: len(came) == len(quiet) + len(flood), 5.0, "all of them")
+        taken = inbox.take(0)
+        kept = [one.key for one in taken.arrivals]
+        assert sorted(set(kept)) == sorted({*quiet, *flood})
+        assert [kept.count(key) for key in quiet] == [1, 1, 1]
+        assert (len(kept), taken.overrun) == (len(quiet) + ARRIVALS, ARRIVALS)
+        del held

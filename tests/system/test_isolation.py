@@ -166,7 +166,7 @@ class Robot:
     def _driven(bus: Bus) -> Iterator[None]:
         """Somebody at the machine drives it, while entered."""
         with bus.commanding(0.3):
-            until(lambda: bus.state()["linear"] > 0.25, 5.0, "it drives")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 5.0, "it drives")
             yield
 
     def locked(self, seconds: float) -> tuple[Periods, Mapping[str, int]]:

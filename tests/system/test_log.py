@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from acsard import __version__
 from acsard.client import connect
 from acsard.host.own_name import own_name
+from acsard.messages.signature import public_name
 from tests.system.harness import Bus, Daemon, Peer, acsard, until
 
 
@@ -34,9 +36,9 @@ def test_who_calls_is_told_by_the_name_he_gives_himself(tmp_path: Path) -> None:
         (pose,), (stop,), (clear,) = (by(daemon, name) for name in ("set_pose", "stop", "clear"))
     me = f"@{os.uname().nodename.partition('.')[0]}"
     assert me in own_name()
-    assert pose == f"{own_name()} (native)"
-    assert stop == "patrol ??2J?native? (native)"
-    assert clear.endswith(f"{me} acsard (native)")
+    assert re.fullmatch(rf"{re.escape(own_name())}/[0-9a-f]{{16}} \(native\)", pose)
+    assert re.fullmatch(r"patrol \?\?2J\?native\?/[0-9a-f]{16} \(native\)", stop)
+    assert re.search(rf"{me} acsard/[0-9a-f]{{16}} \(native\)$", clear)
     assert by(daemon, "deactivate") == ["unnamed (native)"]
 
 
@@ -45,9 +47,10 @@ def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(tmp_path: Path) 
         bus.linked()
         with connect(daemon.endpoint) as robot:
             key, stamp = robot.key("stop"), robot.session.new_timestamp()
-            robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann"}')
+            robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann/s3cret"}')
             (line,) = until(lambda: daemon.events("stop"), 5.0, "the stop is in the log")
-    assert line["by"] == f"ann (native, session {stamp.get_id()})"
+    session = public_name(str(stamp.get_id()))
+    assert line["by"] == f"{public_name('ann/s3cret')} (native, session {session})"
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ class Phone:
 
     def hold(self) -> None:
         """A finger drives forwards."""
-        self.browser.hold(lambda: bool(self.bus.state()["linear"] > 0.15))
+        self.browser.hold(lambda: (self.bus.state()["linear"] or 0.0) > 0.15)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["x"] > 1.0, 20.0, "a metre")
     assert bus.state()["source"] == "teleop"
     page.shows("who", "you")
-    assert bus.state()["linear"] <= 0.2 + 0.03  # slow to begin with
+    assert (bus.state()["linear"] or 0.0) <= 0.2 + 0.03  # slow to begin with
     page.browser.push(-80, 0)
     until(lambda: bus.state()["yaw"] > 0.3, 10.0, "it turns left")
     browser.touch("End")
@@ -151,9 +151,9 @@ def test_what_a_button_could_not_is_said_once(page: Phone) -> None:
 def test_keys_drive_while_they_are_held(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
-    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
     browser.key("Down", "ArrowLeft", "ArrowLeft")
-    until(lambda: bus.state()["angular"] > 0.15, 10.0, "and left")
+    until(lambda: (bus.state()["angular"] or 0.0) > 0.15, 10.0, "and left")
     browser.key("Up", "KeyW", "w")
     until(lambda: abs(bus.state()["linear"]) < 0.02, 10.0, "only left")
     browser.key("Up", "ArrowLeft", "ArrowLeft")
@@ -184,7 +184,8 @@ def test_keys_drive_after_the_slider_was_set_and_leave_it_where_it_is(page: Phon
             "Input.dispatchKeyEvent", type="rawKeyDown", code="ArrowUp", key="ArrowUp",
             windowsVirtualKeyCode=38,
         )  # fmt: skip
-        until(lambda: bus.state()["linear"] > float(chosen) - 0.05, 10.0, "forwards, as fast")
+        fast = float(chosen) - 0.05
+        until(lambda: (bus.state()["linear"] or 0.0) > fast, 10.0, "forwards, as fast")
     finally:
         browser.key("Up", "ArrowUp", "ArrowUp")
     bus.at_rest()
@@ -204,7 +205,7 @@ def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(pa
     assert float(browser.js(LIMIT)) == pytest.approx(before + 0.1)
     assert bus.count("commands") == commands
     browser.key("Down", "KeyW", "w")
-    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
     browser.key("Up", "KeyW", "w")
     bus.at_rest()
 
@@ -233,7 +234,7 @@ def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Pho
             mouse("Released", button="left", buttons=0)
             mouse("Pressed", button="left")
             mouse("Moved", 90)
-        return bool(bus.state()["linear"] > 0.15)
+        return bool((bus.state()["linear"] or 0.0) > 0.15)
 
     until(drives, 10.0, "it drives")
     mouse("Pressed", 90, "right", 3)
@@ -334,7 +335,7 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
     for leave in ("document.getElementById('limit').focus()", "0"):
         browser.js("document.activeElement.blur()")
         browser.key("Down", "KeyW", "w")
-        until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+        until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
         browser.js(leave)
         browser.ask("Input.dispatchKeyEvent", type="keyUp", code="KeyW", key="w", modifiers=2)
         bus.at_rest()
@@ -345,7 +346,7 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
 def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, other: str) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
-    until(lambda: bus.state()["linear"] > 0.15, 10.0, "forwards")
+    until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
     if other == "menu":
         browser.js("window.dispatchEvent(new MouseEvent('contextmenu'))")
     else:
@@ -385,7 +386,7 @@ def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
     browser.js("new Promise(done => setTimeout(done, 200))")
     assert bus.state()["source"] == ""
     browser.js(pad.replace("HELD", "true") + ";1")
-    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "it drives")
     browser.js(pad.replace("HELD", "false") + ";1")
     bus.at_rest()
 
@@ -393,7 +394,7 @@ def test_a_gamepad_drives_while_a_shoulder_button_is_held(page: Phone) -> None:
 def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.js(PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true") + ";1")
-    until(lambda: bus.state()["linear"] > 0.15, 10.0, "it drives")
+    until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "it drives")
     # What it said last stays held, as with a battery that is empty.
     browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
     page.shows("told", "the gamepad is gone")
@@ -1052,7 +1053,7 @@ def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
     assert wished == 0
     page.shows("unknown", "What was wished before")
     with bus.commanding(0.4, 0.0):
-        until(lambda: bus.state()["linear"] > 0.35, 10.0, "it drives")
+        until(lambda: (bus.state()["linear"] or 0.0) > 0.35, 10.0, "it drives")
     bus.at_rest()
     measured, wished = looked()
     assert measured > 20

@@ -163,7 +163,7 @@ def drives(person: Person, bus: Bus) -> None:
         elif not person.hidden("guide-close"):
             told.append(person.browser.text("guide-story"))
             person.click("guide-close")
-        return bool(bus.state()["linear"] > 0.25)
+        return bool((bus.state()["linear"] or 0.0) > 0.25)
 
     try:
         until(moves, 30.0, "the leg moves")

@@ -11,14 +11,17 @@ import termios
 import threading
 import tty
 from collections.abc import Sequence
+from contextlib import suppress
 
 import pytest
 
+from acsard.config.settings import McuConfig
 from acsard.host import clock
 from acsard.host.asleep import Asleep
 from acsard.mcu.check import seal
+from acsard.mcu.session import McuSession
 from acsard.serial.port import SerialPort
-from acsard.values import Event, Instant, Received
+from acsard.values import NS_PER_S, STILL, Event, Instant, Received
 
 PERIOD_NS = 10_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -218,3 +221,51 @@ def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
     assert is_open
     assert said[0] == "port_waiting"
     assert said[-1] == "port_open"
+
+
+def test_a_port_whose_driver_takes_nothing_is_told_though_it_still_receives() -> None:
+    """The far end reports by its own clock and does not read."""
+    report = GO * 2
+
+    async def links(master: int, full: int) -> list[tuple[str, bool]]:
+        wake = asyncio.Event()
+        session = McuSession(McuConfig(), 100.0)
+        async with SerialPort(path, 115200, STOP, PERIOD_NS, wake.set, lambda event: None) as port:
+            unsent, seen = False, [("down", False)]
+
+            async def until(link: str) -> None:
+                nonlocal unsent
+                deadline_ns = clock.mono_ns() + 5 * NS_PER_S
+                while session.link != link and clock.mono_ns() < deadline_ns:
+                    os.write(master, report)
+                    await asyncio.wait_for(wake.wait(), 5.0)
+                    wake.clear()
+                    now = clock.now()
+                    session.update(now, port.is_open, port.opened, port.take(), unsent)
+                    line = session.line(now.mono_ns, STILL)
+                    unsent = line is not None and port.offer(line, now) != "sent"
+                    await asyncio.sleep(0.01)  # the wire is free again
+                seen.append((session.link, session.blocked))
+
+            await until("up")
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(full, bytes(4096))
+            await until("stale")
+            with suppress(BlockingIOError):
+                while True:
+                    os.read(master, 65536)
+            await until("up")
+            return seen
+
+    master, slave = os.openpty()
+    try:
+        tty.setraw(master)
+        path = os.ttyname(slave)
+        os.set_blocking(master, False)
+        os.set_blocking(slave, False)
+        seen = asyncio.run(links(master, slave))
+        assert seen == [("down", False), ("up", False), ("stale", True), ("up", False)]
+    finally:
+        os.close(master)
+        os.close(slave)

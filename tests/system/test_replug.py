@@ -48,14 +48,16 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
 
             # The commander has never stopped sending, and never said zero.
             waiting = states.find(
-                lambda state: "neutral first" in state["reason"], 5.0, "why", after=up.at
+                lambda state: "send a zero first" in state["reason"], 5.0, "why", after=up.at
             )
             assert "app must send a zero" in waiting.value["reason"]
             peer.await_lines(100)
             assert set(peer.session.said()[1:]) == {ZERO_LINE}
 
             commander.wish = ZERO
-            until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "the zero was heard")
+            until(
+                lambda: "send a zero first" not in bus.state()["reason"], 5.0, "the zero was heard"
+            )
             assert set(peer.session.said()[1:]) == {ZERO_LINE}
             zeros = 1
 
@@ -63,7 +65,9 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
                 """It waits for another zero where the machine stood still for a second."""
                 nonlocal zeros
                 before = commander.wish
-                commander.wish = ZERO if "neutral first" in bus.state()["reason"] else twist(0.5)
+                commander.wish = (
+                    ZERO if "send a zero first" in bus.state()["reason"] else twist(0.5)
+                )
                 zeros += commander.wish == ZERO != before
                 return peer.lines[-1].line.startswith(b"ap10.00")
 

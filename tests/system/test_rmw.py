@@ -45,6 +45,7 @@ from tests.system.ros_clients import (
     listed,
     make,
     refused_without_motion,
+    released,
     rmw_key,
     settled,
     stamped,
@@ -185,8 +186,15 @@ def test_an_independent_client_stops_and_clears_the_robot(ground: Ground) -> Non
     stopped = ground.sdk.do("call", ground.prefix + "/acsard/stop", TRIGGER)
     assert stopped["success"] is True
     assert ground.bus.state()["mode"] == "stopped"
-    cleared = ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)
-    assert cleared["success"] is True
+    refused = ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)
+    assert refused["success"] is False
+    again = f"look at the robot, then call {ground.prefix}/acsard/clear again 2 s after it"
+    assert again in refused["message"]
+    until(
+        lambda: ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)["success"],
+        5.0,
+        "a plain clear is obeyed",
+    )
     assert ground.bus.state()["mode"] == "ready"
 
 
@@ -369,10 +377,10 @@ def test_every_service_is_asked_as_rmw_zenoh_asks_and_answers_once(
 
 def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: RmwClient) -> None:
     with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(lambda s: s["linear"] > 0.1 and s["source"] == "nav", 3.0, "it drives")
+        states.find(lambda s: (s["linear"] or 0.0) > 0.1 and s["source"] == "nav", 3.0, "it drives")
         assert ros.call("acsard/stop").trigger()[0]
         states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
-        assert ros.call("acsard/clear").trigger()[0]
+        released(ros)
         cleared = time.monotonic()
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
@@ -498,7 +506,7 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
         ros.session.put(ros.key("cmd_vel", TWIST), GO, attachment=attached)
 
     ros.zeros(bus)
-    refused_without_motion(bus, late, "stale", "held up on the way")
+    refused_without_motion(bus, late, "stale", "the network held it up")
 
 
 def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient) -> None:
@@ -712,7 +720,7 @@ def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: st
             else client.driving(driven, "cmd_vel", TWIST, 0.3)
         )
         with drive:
-            states.find(lambda s: s["linear"] > 0.1, 3.0, "it drives")
+            states.find(lambda s: (s["linear"] or 0.0) > 0.1, 3.0, "it drives")
     after = other.state()
     assert changes(before, after) == {}
     for key in ("x", "mode", "wheels"):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import pytest
 
+from acsard.drive.lifecycle import LOOK_FIRST_S
 from tests.system.harness import Bus, Daemon, Program, until
 from tests.system.ros_clients import (
     DDS,
@@ -36,6 +37,7 @@ from tests.system.ros_clients import (
     joints,
     listed,
     refused_without_motion,
+    released,
     session_at,
     stamped,
     twist,
@@ -135,14 +137,21 @@ def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) 
 @pytest.mark.usefixtures("restored")
 def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: BridgeHalf) -> None:
     with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(lambda s: s["source"] == "nav" and s["linear"] > 0.1, 3.0, "nav drives")
+        states.find(
+            lambda s: s["source"] == "nav" and (s["linear"] or 0.0) > 0.1, 3.0, "nav drives"
+        )
         with ros.driving(bus, "cmd_vel_teleop", TWIST, -0.2):
             states.find(
-                lambda s: s["source"] == "teleop" and s["linear"] < -0.1, 3.0, "teleop drives"
+                lambda s: s["source"] == "teleop" and (s["linear"] or 0.0) < -0.1,
+                3.0,
+                "teleop drives",
             )
         let_go = time.monotonic()
         states.find(
-            lambda s: s["source"] == "nav" and s["linear"] > 0.1, 3.0, "nav again", after=let_go
+            lambda s: s["source"] == "nav" and (s["linear"] or 0.0) > 0.1,
+            3.0,
+            "nav again",
+            after=let_go,
         )
 
 
@@ -153,6 +162,9 @@ def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
 ) -> None:
     if verb == "clear":
         bus.get("srv/stop")
+        # A Trigger has no number, so it waits 2 s after a stop.
+        stopped = time.monotonic()
+        until(lambda: time.monotonic() > stopped + LOOK_FIRST_S, 5.0, "two seconds")
     called = ros.call(f"acsard/{verb}", TRIGGER, request_bytes)
     for undo in ("clear", "activate"):
         bus.get(f"srv/{undo}")
@@ -166,7 +178,10 @@ def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
 def test_a_stop_stops_until_clear(bus: Bus, ros: BridgeHalf) -> None:
     assert ros.call("acsard/stop").trigger()[0]
     assert bus.state()["mode"] == "stopped"
-    assert ros.call("acsard/clear").trigger()[0]
+    success, message = ros.call("acsard/clear").trigger()
+    assert not success
+    assert "look at the robot, then call /acsard/clear again 2 s after it" in message
+    released(ros)
     assert bus.state()["mode"] == "ready"
 
 

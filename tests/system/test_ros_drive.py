@@ -56,7 +56,7 @@ def test_whoever_ends_it_in_the_middle_ends_it_with_zeros(
             client.follow("cmd_vel", TWIST) as samples,
             Program(words, ROOT, environment() | given) as drive,
         ):
-            until(lambda: bus.state()["linear"] > 0.1, 20.0, "it drives")
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 20.0, "it drives")
             drive.signal(number)
             assert drive.ended(5.0) == 128 + number
             assert "Traceback" not in drive.stderr, drive.stderr

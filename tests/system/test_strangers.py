@@ -90,7 +90,8 @@ def visit(endpoint):
             if reply.ok:
                 counters = json.loads(reply.ok.payload.to_bytes())["counters"]
                 counted.append(counters.get("commands", 0))
-        session.put("acsard/acsar/cmd/app", '{"linear": {"x": 0.0}, "angular": {"z": 0.0}}')
+        for key in ("acsard/acsar/cmd/app", "acsard/acsar/cmd/app/operator"):
+            session.put(key, '{"linear": {"x": 0.0}, "angular": {"z": 0.0}}')
         time.sleep(0.05)
     session.close()
 

@@ -175,6 +175,11 @@ def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> N
             async with session.post("/api/srv/stop") as answer:
                 assert (answer.status, (await answer.json())["success"]) == (200, True)
             async with session.post("/api/srv/clear") as answer:
+                assert answer.status == 409
+                assert "look at the robot" in (await answer.json())["message"]
+            async with session.get("/api/state") as answer:
+                latch = (await answer.json())["latch"]
+            async with session.post("/api/srv/clear", json={"latch": latch}) as answer:
                 assert answer.status == 200
             wish = {"settings": {"limits.linear_speed": 99.0}}
             async with session.post("/api/srv/set", json=wish) as answer:

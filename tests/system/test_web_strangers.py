@@ -66,12 +66,15 @@ def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
             holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
             answer = await theirs.call("stop")
             assert answer["ok"], answer
-            await ours.state(lambda s: s["mode"] == "stopped" and s["linear"] == 0)
+            state = await ours.state(lambda s: s["mode"] == "stopped" and s["linear"] == 0)
             holding.cancel()
             refused = await theirs.call("clear")
             assert not refused["ok"]
             assert "operator" in refused["text"]
-            assert (await ours.call("clear"))["ok"]
+            plain = await ours.call("clear")
+            assert not plain["ok"]
+            assert "look at the robot" in plain["text"]
+            assert (await ours.call("clear", latch=state["latch"]))["ok"]
 
     run(story)
 

@@ -14,6 +14,7 @@ import pytest
 from tests.system.bystander import lost
 from tests.system.harness import (
     PLAIN,
+    STANDING,
     ZERO,
     ZERO_LINE,
     Bus,
@@ -166,9 +167,6 @@ def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -
         assert rejects <= leaps, after["counters"]
 
 
-STANDING = (0.0, 0.0, 0.0, 0.0)
-
-
 def always(data: bytes) -> Reply:
     """The same answer to everything."""
     return lambda speeds: data
@@ -226,7 +224,7 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
             # What came counts for nothing: not even together with a commander who insists.
             bus.put("cmd/app", twist(0.5))
             state = bus.state()
-            assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, 0.0), name
+            assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, None), name
             assert state["counters"]["lines"] == 0, name
         assert set(peer.session.said()[1:]) == {ZERO_LINE}
         # The next newline resynchronises: three good lines and the link is up.
@@ -271,13 +269,16 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             peer.reply = PLAIN
             back = states.find(lambda state: state["link"] == "up", 5.0, "up", after=stale.at).at
             waiting = states.find(
-                lambda state: "neutral first" in state["reason"], 5.0, "why it waits", after=back
+                lambda state: "send a zero first" in state["reason"],
+                5.0,
+                "why it waits",
+                after=back,
             )
             assert waiting.value["mode"] == "ready"
             peer.await_lines(50)
             assert _moving_since(peer, zeros_from) is None
             commander.wish = ZERO  # for a second: only his key tells who he is
-            until(lambda: "neutral first" not in bus.state()["reason"], 5.0, "neutral")
+            until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
             commander.wish = twist(0.5)
             until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 

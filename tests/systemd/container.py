@@ -48,6 +48,14 @@ ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
 
 UNITS = "/etc/systemd/system"
 
+STATES = "/var/lib/private"
+"""Where the services have their state directories."""
+
+LIES = "/run/board-lies"
+"""While this file is there, the board reports speeds that no wheel can have."""
+
+ACSARD = f"{HOME}/venv/bin/acsard"
+
 
 class UnavailableError(Exception):
     """This machine cannot do it; why."""
@@ -119,8 +127,12 @@ class Ran(NamedTuple):
 class Container:
     """A booted systemd; leaving ends it and everything in it."""
 
-    def __init__(self, rootfs: Path, scratch: Path, name: str = "acsard-test") -> None:
+    def __init__(
+        self, rootfs: Path, scratch: Path, name: str = "acsard-test", keeps: Path | None = None
+    ) -> None:
+        """`keeps` is a directory that holds the state of the services over a reboot."""
         self._rootfs, self._log, self._name = rootfs, scratch / "console", name
+        self._keeps = keeps
         root = _cgroups()
         assert root is not None
         self._cgroup = root / f"{name}-{os.getpid()}"
@@ -144,6 +156,8 @@ class Container:
         words += [f"--bind-ro={sysconfig.get_path('purelib')}:{HOME}/packages"]
         if OURS not in SUITES:
             words += [f"--bind-ro={sys.base_prefix}:{LENT}"]
+        if self._keeps is not None:
+            words += [f"--bind={self._keeps}:{STATES}"]
         settings = {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
         settings |= {"SYSTEMD_NSPAWN_API_VFS_WRITABLE": "yes"}
         with self._log.open("wb") as log:
@@ -250,7 +264,13 @@ class Container:
             shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
         self.run("systemctl", "daemon-reload")
         self.run("systemctl", "reset-failed", UNIT, DOOR, PAGE)
+        self.forget()
         self.write(CONFIG, USUAL)
+
+    def forget(self) -> None:
+        """Remove the latch files: the next start is a first one."""
+        for file in self.path(f"{STATES}/acsard").glob("*.latches.*"):
+            file.unlink()
 
     def drop_in(self, name: str, text: str, unit: str = UNIT) -> None:
         """A file in a unit's drop-in directory."""
@@ -314,7 +334,7 @@ os.chmod(slave, 0o660)
 os.close(slave)
 os.symlink(name, sys.argv[1])
 print("plugged", flush=True)
-held = b""
+held = turning = told = b""
 while True:
     try:
         data = os.read(master, 4096)
@@ -328,7 +348,11 @@ while True:
     *lines, held = (held + data).split(b"\\n")
     for line in lines:
         if line.startswith(b"a"):
-            os.write(master, line + b"\\n")
+            lies = os.path.exists(sys.argv[2])
+            # The wheels lag by two lines. Replies that never lag would be an echo.
+            says = b"ap99.00,bp99.00,cp99.00,dp99.00\\r" if lies else turning or line
+            turning, told = told, line
+            os.write(master, says + b"\\n")
         print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
 """
 
@@ -336,13 +360,13 @@ while True:
 class Board(Program):
     """A serial board in the container, in a process ahead of all others: its times can be trusted.
 
-    It answers each command with the speeds asked for.
+    It answers each command with the speeds asked for two lines before, unless it lies.
     """
 
     def __init__(self, container: Container) -> None:
         self._heard: list[Heard] = []
         container.path(PORT).unlink(missing_ok=True)
-        super().__init__(container.inside("python3", "-c", _BOARD, PORT, only="mnC"), "/")
+        super().__init__(container.inside("python3", "-c", _BOARD, PORT, LIES, only="mnC"), "/")
 
     def __enter__(self) -> Board:
         super().__enter__()
@@ -374,12 +398,12 @@ config.insert_json5("connect", json.dumps({
     "endpoints": ["tcp/127.0.0.1:7448"], "timeout_ms": -1, "exit_on_failure": False,
     "retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1},
 }))
-speed = 0.0
+speed, patrols, sequence = 0.0, False, 0
 
 def listen():
-    global speed
+    global speed, patrols
     for line in sys.stdin:
-        speed = float(line)
+        speed, patrols = float(line.split()[0]), "patrols" in line
 
 def show(sample):
     state = json.loads(sample.payload.to_bytes()) if "json" in str(sample.encoding) else None
@@ -392,7 +416,14 @@ threading.Thread(target=listen, daemon=True).start()
 session = zenoh.open(config)
 keep = session.declare_subscriber("acsard/acsar/state", show)
 while True:
-    session.put("acsard/acsar/cmd/app", json.dumps({"linear": {"x": speed}, "angular": {"z": 0.0}}))
+    now = 0.0 if patrols and time.monotonic() % 2.0 < 0.3 else speed
+    sequence += 1
+    signature = {"sender": "patrol", "stamp": time.monotonic_ns(), "sequence": sequence}
+    session.put(
+        "acsard/acsar/cmd/app",
+        json.dumps({"linear": {"x": now}, "angular": {"z": 0.0}}),
+        attachment=json.dumps(signature if patrols else {"sender": "driver"}),
+    )
     time.sleep(0.05)
 """
 
@@ -408,6 +439,12 @@ class Driver(Program):
         """From now on this speed."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{speed}\n".encode())
+        self.process.stdin.flush()
+
+    def patrols(self, speed: float = 0.3) -> None:
+        """Send zeros for 0.3 s every 2 s and this speed in between, as a sender of its own."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{speed} patrols\n".encode())
         self.process.stdin.flush()
 
     def states(self, after: float) -> list[tuple[float, str]]:

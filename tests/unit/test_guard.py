@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import binascii
 import random
-from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from acsard.config.contradictions import contradictions
 from acsard.config.settings import (
     CommandsConfig,
     Config,
     DriveConfig,
+    FeedbackConfig,
     LimitsConfig,
+    McuConfig,
     Source,
     WheelMap,
 )
 from acsard.drive.kinematics import Kinematics
 from acsard.drive.limits import Limiter
-from acsard.guard import Guard
+from acsard.guard import MARGIN_NS, Guard, Memory
 from acsard.mcu.check import seal
 from acsard.mcu.codec import Codec
 from acsard.robot import Robot
@@ -31,6 +34,7 @@ from acsard.values import (
     Inputs,
     Instant,
     Outputs,
+    Plain,
     Received,
     Request,
     Twist,
@@ -49,6 +53,7 @@ NOT_A_LINE = "it is not a whole line of four wheels"
 TOO_FAST = "a wheel is over limits.wheel_speed"
 NO_LINK = "it moves a wheel without a link"
 GROWS = "a wheel grows without a fresh command in mode driving"
+LATE = "it still moves a wheel although the longest ramp to rest is over"
 
 
 def line(*wheels: float) -> bytes:
@@ -63,10 +68,11 @@ def outputs(
     linked: bool = True,
     source: str = "app",
     age_ms: float | None = 0.0,
+    at_ns: int = NOW_NS,
 ) -> Outputs:
     """A step's outputs with this line; by default a fresh command is followed on a live link."""
     return Outputs(
-        now=Instant(NOW_NS, NOW_NS),
+        now=Instant(at_ns, at_ns),
         due=True,
         line=data,
         speeds=STILL,
@@ -77,7 +83,7 @@ def outputs(
         reason="",
         link="up" if linked else "down",
         source=source,
-        command_ns=None if age_ms is None else NOW_NS - int(age_ms * MS),
+        command_ns=None if age_ms is None else at_ns - int(age_ms * MS),
         status_changed=False,
     )
 
@@ -88,20 +94,31 @@ def coasting(data: bytes) -> Outputs:
 
 
 class Guarded:
-    """A guard, and the line that went last as the control loop remembers it."""
+    """A guard, and the line that it let pass last."""
 
-    def __init__(self, stop: bytes, *settings: Any, **more: Any) -> None:
-        self._guard = Guard(stop, *settings, **more)
-        self._last = self._passed = stop
+    def __init__(
+        self,
+        stop: bytes,
+        wheel_speed: float,
+        sources: tuple[Source, ...],
+        require_check: bool = False,
+    ) -> None:
+        config = Config(
+            mcu=McuConfig(link_check="require" if require_check else "off"),
+            limits=LimitsConfig(wheel_speed=wheel_speed),
+            commands=CommandsConfig(sources=sources),
+        )
+        self.guard = Guard(stop, config)
+        self._passed = stop
         self.trip = ""
 
     def check(self, found: Outputs) -> bytes | None:
-        line, self.trip = self._guard.check(found, self._last)
+        line, self.trip = self.guard.check(found)
         self._passed = line or self._passed
         return line
 
     def note_sent(self) -> None:
-        self._last = self._passed
+        self.guard.left(self._passed)
 
 
 @pytest.fixture
@@ -366,6 +383,154 @@ def test_the_trip_is_of_the_last_line_only(guard: Guarded) -> None:
     assert guard.trip == ""
 
 
+# the end of every ramp
+
+SLOW_TO_STOP = LimitsConfig(
+    linear_speed=1.0,
+    angular_speed=2.0,
+    linear_deceleration=0.5,
+    angular_deceleration=4.0,
+    linear_stop_deceleration=2.0,
+    angular_stop_deceleration=5.0,
+)
+"""The longest ramp takes 2 s, and 0.5 s by a stop."""
+
+
+class Clocked:
+    """A guard and its time, ms after the last fresh command; lines that pass go out."""
+
+    def __init__(self, limits: LimitsConfig = SLOW_TO_STOP) -> None:
+        self.guard = Guard(STOP, Config(limits=limits))
+        self.drive(0)
+
+    def drive(self, ms: float, speed: float = 10.0) -> None:
+        """Follow a fresh command at this time."""
+        assert self.trip(ms, "driving", speed) == ""
+
+    def trip(self, ms: float, mode: str, speed: float = 10.0, line_due: bool = True) -> str:
+        """What the guard says of a line at this time; only in mode driving a command is fresh."""
+        fresh = mode == "driving"
+        found = outputs(
+            line(speed) if line_due else None,
+            mode=mode,
+            source="app" if fresh else "",
+            age_ms=0.0 if fresh else None,
+            at_ns=NOW_NS + int(ms * MS),
+        )
+        passed, trip = self.guard.check(found)
+        assert passed == (STOP if trip else found.line)
+        if passed is not None:
+            self.guard.left(passed)
+        return trip
+
+
+def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
+    clocked = Clocked()
+    trips = [clocked.trip(ms, "stopped") for ms in range(10, 3_600_000, 10)]
+    first = next(n for n, trip in enumerate(trips) if trip)
+    assert trips[first] == LATE
+    assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10
+    assert set(trips[first + 1 :]) == {GROWS}  # nothing starts from the stop that went out
+
+
+@pytest.mark.parametrize(
+    ("mode", "ramp_ms"),
+    [
+        ("ready", 2000), ("waiting", 2000), ("inactive", 2000),
+        ("stopped", 500), ("fault", 500), ("leaving", 500),
+    ],
+)  # fmt: skip
+def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
+    mode: str, ramp_ms: float
+) -> None:
+    last_ms = ramp_ms + MARGIN_NS / MS
+    clocked = Clocked()
+    assert clocked.trip(0, mode) == clocked.trip(last_ms, mode) == ""
+    assert clocked.trip(last_ms + 0.001, mode, 0.01) == LATE
+    assert clocked.trip(last_ms + 1, mode, 0.0) == ""
+
+
+def test_a_stale_command_in_mode_driving_does_not_keep_the_robot_going() -> None:
+    clocked = Clocked()
+    stale = outputs(line(10.0), age_ms=251, at_ns=NOW_NS + 2301 * MS)
+    assert clocked.guard.check(stale) == (STOP, LATE)
+
+
+def test_each_fresh_command_begins_the_time_anew() -> None:
+    clocked = Clocked()
+    for ms in range(0, 60_000, 250):
+        clocked.drive(ms)
+    assert clocked.trip(59_750 + 2300, "ready") == ""
+    assert clocked.trip(59_750 + 2301, "ready") == LATE
+
+
+def test_a_stop_in_the_middle_of_a_ramp_has_its_own_time_and_no_more_than_the_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(1000, "ready") == clocked.trip(1100, "stopped") == ""
+    assert clocked.trip(1900, "stopped") == ""
+    assert clocked.trip(1901, "stopped") == LATE
+    late = Clocked()
+    assert late.trip(2000, "stopped") == late.trip(2300, "stopped") == ""
+    assert late.trip(2301, "stopped") == LATE
+
+
+def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(0, "stopped") == ""
+    assert clocked.trip(500, "ready", line_due=False) == ""
+    assert clocked.trip(1000, "ready") == clocked.trip(1000, "stopped") == ""
+    assert clocked.trip(1800, "stopped") == ""
+    assert clocked.trip(1801, "stopped") == LATE
+
+
+def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -> None:
+    clocked = Clocked()
+    slower = replace(SLOW_TO_STOP, linear_speed=0.1, linear_deceleration=5.0)
+    for ms in range(0, 2300, 100):
+        clocked.guard.use(Config(limits=slower))
+        assert clocked.trip(ms, "ready") == ""
+    assert clocked.trip(2300, "ready") == ""
+    assert clocked.trip(2301, "ready") == LATE
+
+
+def test_at_rest_new_settings_bring_their_own_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(100, "ready", 0.0) == ""
+    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))  # 0.4 s
+    clocked.drive(1000)
+    assert clocked.trip(1700, "ready") == ""
+    assert clocked.trip(1701, "ready") == LATE
+
+
+@pytest.mark.parametrize(
+    ("limits", "ramp_ms"),
+    [
+        (LimitsConfig(), 1000),
+        (LimitsConfig(angular_deceleration=2.0), 2000),
+        # the wheels allow only 0.5 m/s and 3.33 rad/s
+        (LimitsConfig(linear_speed=9.0, angular_speed=0.0, wheel_speed=10.0), 500),
+        (LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0), 833),
+    ],
+)
+def test_the_longest_ramp_is_worked_by_hand(limits: LimitsConfig, ramp_ms: int) -> None:
+    assert Guard(STOP, Config(limits=limits)).memory.ramp_ns // MS == ramp_ms
+
+
+def test_a_guard_goes_on_from_the_memory_of_another() -> None:
+    clocked = Clocked()
+    assert clocked.trip(10, "stopped") == ""
+    memory = clocked.guard.memory
+    assert memory == Memory(line(10.0), NOW_NS, NOW_NS + 10 * MS, 2000 * MS, 500 * MS)
+    clocked.guard = Guard(STOP, Config(limits=SLOW_TO_STOP), memory)
+    assert clocked.trip(810, "stopped") == ""
+    assert clocked.trip(811, "stopped") == LATE
+
+
+def test_a_line_that_moves_before_any_command_is_late() -> None:
+    guard = Guard(STOP, Config(), Memory(line(1.0)))
+    assert guard.check(coasting(line(1.0))) == (STOP, LATE)
+
+
 # with a robot
 
 
@@ -377,6 +542,8 @@ class Loop:
         self.stop = self.robot.session.codec.stop
         most = config.limits.wheel_speed if wheel_speed is None else wheel_speed
         self.guard = Guarded(self.stop, most, config.commands.sources)
+        self.guard.guard.use(replace(config, limits=replace(config.limits, wheel_speed=most)))
+        self.config = config
         self.now_ns = NOW_NS
         self.opened = 1
         self.superseded = False
@@ -389,6 +556,7 @@ class Loop:
         self,
         *commands: Command,
         ask: Verb | None = None,
+        settings: dict[str, Plain] | None = None,
         ms: float = 10.0,
         tick: bool = True,
         heard: int = 1,
@@ -405,12 +573,15 @@ class Loop:
                 opened=self.opened,
                 received=(Received(now, self.stop * heard),),
                 commands=commands,
-                requests=(Request(ask),) if ask else (),
+                requests=(Request(ask, settings=settings or {}),) if ask else (),
                 guard_trip=self.trip,
                 superseded=self.superseded,
             )
         )
         self.events += [event.name for event in found.events]
+        if self.robot.config is not self.config:
+            self.config = self.robot.config
+            self.guard.guard.use(self.config)
         data, self.trip = self.guard.check(found), self.guard.trip
         self.trips += [self.trip] * bool(self.trip)
         if data is None:
@@ -435,6 +606,97 @@ def test_one_trip_is_one_fault_that_names_it() -> None:
     assert loop.trips == [TOO_FAST]
     assert loop.events.count("fault") == 1
     assert TOO_FAST in found.reason
+    assert loop.wire[-1][0] == STOP
+
+
+@st.composite
+def legal(draw: st.DrawFn) -> Config:
+    """A configuration whose slowest ramps are often as long as the rules allow."""
+    drive = DriveConfig(
+        draw(st.floats(0.03, 0.2)),
+        draw(st.floats(0.2, 0.8)),
+        draw(st.floats(0.5, 2.0)),
+        draw(st.floats(0.8, 1.2)),
+        draw(st.floats(0.8, 1.2)),
+    )
+    wheel_speed = draw(st.floats(1.0, 90.0))
+    sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
+    rim = wheel_speed * drive.wheel_radius * sides / 2
+    most = (rim, 2 * rim / (drive.wheel_separation * drive.wheel_separation_multiplier))
+    numbers: dict[str, float] = {"wheel_speed": wheel_speed}
+    for axis, reach, limit in zip(("linear", "angular"), most, (10.0, 50.0), strict=True):
+        speed = draw(st.floats(0.0, limit))
+        fastest = min(speed, reach)
+        least = max(0.02, 1.001 * fastest / 5)
+        softer = draw(st.one_of(st.just(least), st.floats(least, 100.0)))
+        harder = max(softer, 1.001 * fastest / 2)
+        numbers |= {
+            f"{axis}_speed": speed,
+            f"{axis}_acceleration": 100.0,
+            f"{axis}_deceleration": softer,
+            f"{axis}_stop_deceleration": draw(st.one_of(st.just(harder), st.floats(harder, 100.0))),
+            f"{axis}_jerk": draw(st.sampled_from((0.0, 0.0, 500.0))),
+        }
+    return Config(
+        drive=drive,
+        limits=LimitsConfig(**numbers),
+        feedback=FeedbackConfig(wheel_speed=99.99, fault_time=0.0),
+    )
+
+
+HAPPENINGS = (
+    "silence", "stall", "superseded", "command", "half", "stop", "clear", "lower", "harder"
+)  # fmt: skip
+
+
+def happen(loop: Loop, what: str, steps: int, ms: float, full: Twist) -> None:
+    """One thing that may happen in the middle of a ramp."""
+    limits = loop.config.limits
+    match what:
+        case "stall":
+            loop.step(ms=ms * 10)
+        case "superseded":
+            for _ in range(steps):
+                loop.step(ms=ms, goes=False)
+        case "command" | "half":
+            share = 1.0 if what == "command" else 0.5
+            for _ in range(steps):
+                loop.step(loop.command(full.linear * share, full.angular * share), ms=ms)
+        case "stop" | "clear":
+            loop.step(ask=what, ms=ms)
+        case "lower":
+            slower = limits.linear_speed / 2, limits.angular_speed / 2
+            names = "limits.linear_speed", "limits.angular_speed"
+            loop.step(ask="set", settings=dict(zip(names, slower, strict=True)), ms=ms)
+        case "harder":
+            braking = limits.linear_stop_deceleration
+            settings: dict[str, Plain] = {"limits.linear_deceleration": braking}
+            loop.step(ask="set", settings=settings, ms=ms)
+    for _ in range(steps):
+        loop.step(ms=ms)
+
+
+@given(
+    config=legal(),
+    ms=st.sampled_from((3.0, 10.0, 24.0, 90.0)),
+    signs=st.tuples(st.sampled_from((-1, 0, 1)), st.sampled_from((-1, 0, 1))),
+    happenings=st.lists(st.tuples(st.sampled_from(HAPPENINGS), st.integers(0, 12)), max_size=6),
+)
+def test_no_legal_ramp_is_cut_short_whatever_happens_in_it(
+    config: Config, ms: float, signs: tuple[int, int], happenings: list[tuple[str, int]]
+) -> None:
+    assume(not contradictions(config))
+    loop = Loop(config)
+    full = Twist(signs[0] * 10.0, signs[1] * 50.0)
+    loop.step(heard=3)
+    loop.step(loop.command(0.0))
+    for _ in range(30):
+        loop.step(loop.command(full.linear, full.angular), ms=24.0)
+    for what, steps in happenings:
+        happen(loop, what, steps, ms, full)
+    for _ in range(round(5500 / ms)):
+        loop.step(ms=ms)
+    assert loop.trips == []
     assert loop.wire[-1][0] == STOP
 
 

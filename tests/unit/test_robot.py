@@ -15,9 +15,11 @@ from acsard.config.settings import (
     Config,
     ControlConfig,
     FeedbackConfig,
+    LimitsConfig,
     McuConfig,
     Source,
 )
+from acsard.drive.told import MAX_SENDER
 from acsard.drive.words import waiting
 from acsard.mcu.codec import Codec
 from acsard.robot import Robot
@@ -30,7 +32,10 @@ from acsard.values import (
     Event,
     Inputs,
     Instant,
+    Latch,
+    Latches,
     Outputs,
+    Plain,
     Pose,
     Received,
     Refusal,
@@ -51,10 +56,14 @@ ROLLING = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
 class Bench:
     """A robot, its time, and an MCU that answers every period with `reply`."""
 
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+    ) -> None:
         # Its MCU says the same whatever it is told, which `sanity` would call a fault in time.
         config = replace(config or Config(), feedback=FeedbackConfig(fault_time=0.0))
-        self.robot = Robot(config)
+        self.robot = Robot(config, latches)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self.now_ns = 50 * NS_PER_S
         self.period_ms = 1000 / config.rate_hz
@@ -80,7 +89,12 @@ class Bench:
         guard_trip: str = "",
         refusals: tuple[Refusal, ...] = (),
     ) -> Outputs:
-        """One period later (or `ms`): what happened meanwhile goes in, the outputs come out."""
+        """One period later (or `ms`): what happened meanwhile goes in, the outputs come out.
+
+        A `clear` names the latch of the step before, as the tools do.
+        """
+        latches = self.out.latches
+        latch = latches.next.number if ask == "clear" and latches.next else None
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
         heard = self.reply is not None and self.port_open
         self.out = self.robot.step(
@@ -91,7 +105,7 @@ class Bench:
                 opened=self.opened,
                 received=(Received(self.now, self.reply),) if heard and self.reply else (),
                 commands=tuple(Command(source, twist, self.now_ns) for twist in commands),
-                requests=(Request(ask, 7, pose),) if ask else (),
+                requests=(Request(ask, 7, pose, latch=latch),) if ask else (),
                 refusals=refusals,
                 guard_trip=guard_trip,
                 superseded=superseded,
@@ -138,6 +152,20 @@ class Bench:
     def said(self) -> WheelSpeeds | None:
         """What the last line tells the wheels; None without a line."""
         return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
+
+    @property
+    def robot_latch(self) -> int:
+        """Number of the latch that `clear` releases next."""
+        latch = self.robot.step(Inputs(self.now, False, True, self.opened)).latches.next
+        return 0 if latch is None else latch.number
+
+    def set(self, settings: dict[str, Plain]) -> dict[str, float]:
+        """Change settings, and return the limits that are kept lowered then."""
+        self.now_ns += 10 * MS
+        requests = (Request("set", 7, settings=settings),)
+        self.out = self.robot.step(Inputs(self.now, True, True, self.opened, requests=requests))
+        assert self.out.answers[0].success
+        return self.out.latches.lowered
 
     def link(self) -> str:
         return self.out.link
@@ -260,7 +288,7 @@ def test_a_commander_that_never_sent_a_zero_does_not_drive() -> None:
     for _ in range(100):
         assert bench.step(GO).applied == REST
     assert bench.mode() == "ready"
-    assert bench.out.reason.startswith("neutral first: app must send a zero")
+    assert bench.out.reason.startswith("send a zero first: app must send a zero")
     assert bench.out.source == "app"
 
 
@@ -477,7 +505,7 @@ def test_after_a_long_gap_each_source_must_be_neutral_again() -> None:
     bench.reply = reply
     for _ in range(20):
         assert bench.step(GO).applied == REST
-    assert bench.out.reason.startswith("neutral first")
+    assert bench.out.reason.startswith("send a zero first")
     bench.let_go()
     assert bench.step(GO).mode == "driving"
 
@@ -488,7 +516,7 @@ def test_after_a_reopened_port_each_source_must_be_neutral_again() -> None:
     bench.replug()
     for _ in range(20):
         assert bench.step(GO).applied == REST
-    assert bench.out.reason.startswith("neutral first")
+    assert bench.out.reason.startswith("send a zero first")
 
 
 def test_a_port_reopened_between_two_steps_is_a_new_session() -> None:
@@ -518,7 +546,7 @@ def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
     assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
     assert bench.mode() == "stopped"
-    assert bench.out.reason == "stopped by request; call srv/clear"
+    assert bench.out.reason == "stopped by request at 2027-01-15 08:00:50 UTC; call srv/clear"
 
 
 def test_a_stop_is_an_event() -> None:
@@ -535,7 +563,9 @@ def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
 def test_a_refused_request_is_no_event() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
-    assert bench.answer("activate") == Answer(7, False, "stopped: call srv/clear first")
+    assert bench.answer("activate") == Answer(
+        7, False, "the robot is stopped: call srv/clear first"
+    )
     assert names(bench.out) == []
 
 
@@ -543,7 +573,7 @@ def test_a_clear_of_nothing_succeeds_says_so_and_changes_nothing() -> None:
     bench = Bench().driving()
     mode, twist = bench.mode(), bench.out.applied
     assert bench.step(GO, ask="clear").answers == (
-        Answer(7, True, "nothing to clear: neither stopped nor in fault"),
+        Answer(7, True, "nothing to clear: the robot is neither stopped nor in fault"),
     )
     assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
 
@@ -563,7 +593,7 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
     bench = Bench().driving()
     bench.step(ask="stop")
     answer = bench.answer("clear")
-    assert answer == Answer(7, True, "cleared; each source must be neutral once before it drives")
+    assert answer == Answer(7, True, "cleared; each sender must send a zero before it drives")
     assert bench.mode() == "ready"
     for _ in range(20):
         bench.step(GO)
@@ -591,7 +621,9 @@ def test_clear_leaves_a_robot_that_was_switched_off_switched_off() -> None:
 def test_a_stopped_robot_refuses_to_be_activated() -> None:
     bench = Bench().linked()
     bench.step(ask="stop")
-    assert bench.answer("activate") == Answer(7, False, "stopped: call srv/clear first")
+    assert bench.answer("activate") == Answer(
+        7, False, "the robot is stopped: call srv/clear first"
+    )
     assert bench.mode() == "stopped"
 
 
@@ -603,7 +635,8 @@ def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     for _ in range(50):
         bench.step(GO)
     assert (bench.mode(), bench.out.applied) == ("inactive", REST)
-    assert bench.out.reason == "switched off; call srv/activate"
+    off = "switched off by request at 2027-01-15 08:00:50 UTC; call srv/activate"
+    assert bench.out.reason == off
 
 
 def test_activating_switches_it_on_and_each_source_must_be_neutral() -> None:
@@ -689,12 +722,13 @@ def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
     asked_ns = bench.now_ns + 5 * MS
     bench.step(ask="stop")
     bench.now_ns += 10 * MS
-    late = (Request("clear", 7, asked_ns=asked_ns),)
+    latch = bench.robot_latch
+    late = (Request("clear", 7, asked_ns=asked_ns, latch=latch),)
     out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
     assert (out.mode, out.answers[0].success) == ("stopped", False)
     assert "call it again" in out.answers[0].message
     bench.now_ns += 10 * MS
-    again = (Request("clear", 8, asked_ns=bench.now_ns),)
+    again = (Request("clear", 8, asked_ns=bench.now_ns, latch=latch),)
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
 
 
@@ -733,7 +767,7 @@ def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> 
     told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
     first, second = told
     assert first.text.startswith("malformed: cmd/app")
-    assert (first.by, first.count) == ("a" * 40, 1)
+    assert (first.by, first.count) == ("a" * MAX_SENDER, 1)
     assert second.text.startswith("100 x malformed; the last: ")
 
 
@@ -781,7 +815,8 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     bench = Bench().driving()
     out = bench.step(GO, guard_trip="a wheel is too fast")
     assert out.mode == "fault"
-    assert out.reason == "the guard replaced a line: a wheel is too fast; call srv/clear"
+    at = "latched at 2027-01-15 08:00:50 UTC"
+    assert out.reason == f"the guard replaced a line: a wheel is too fast, {at}; call srv/clear"
     event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
     assert mode.text.startswith("driving -> fault: the guard replaced a line: a wheel is too fast")
@@ -842,15 +877,19 @@ def test_a_fault_keeps_its_first_reason() -> None:
     bench = Bench().driving()
     bench.step(GO, guard_trip="a wheel is too fast")
     bench.step(GO, guard_trip="a wheel grows")
-    assert bench.out.reason == "the guard replaced a line: a wheel is too fast; call srv/clear"
+    assert bench.out.reason.startswith("the guard replaced a line: a wheel is too fast, latched")
 
 
-def test_a_fault_is_cleared_by_clear_alone() -> None:
+def test_a_fault_and_a_stop_are_cleared_one_after_the_other() -> None:
     bench = Bench().driving()
     bench.step(guard_trip="a wheel is too fast")
     assert not bench.answer("activate").success
     assert bench.answer("stop").success
     assert bench.mode() == "fault"
+    assert bench.answer("clear") == Answer(
+        7, True, "fault cleared; still stopped by request: call srv/clear again"
+    )
+    assert bench.mode() == "stopped"
     assert bench.answer("clear").success
     assert bench.mode() == "ready"
 
@@ -1065,17 +1104,93 @@ def test_a_linked_robot_is_ready_in_the_step_that_activates_it() -> None:
     assert (bench.mode(), bench.link()) == ("ready", "up")
 
 
-def test_a_stop_on_the_way_down_does_not_claim_to_be_latched() -> None:
+def test_a_stop_on_the_way_down_is_latched_for_the_next_start() -> None:
     bench = Bench().linked()
     bench.leaving = True
-    assert "going down" in bench.answer("stop").message
+    assert bench.answer("stop") == Answer(7, True, "stopped and latched; the daemon is going down")
+    assert bench.out.mode == "leaving"
+    assert bench.out.latches.stop is not None
 
 
-def test_a_stop_in_fault_says_that_the_fault_holds_the_robot() -> None:
+# the latches that a robot starts with
+
+
+STOPPED = Latches(stop=Latch(7, WALL_NS, "ann", "stopped by ann", kept=True))
+FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", kept=True))
+OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", kept=True))
+
+
+@pytest.mark.parametrize(
+    ("latches", "mode", "why"),
+    [
+        (STOPPED, "stopped", "was stopped by ann at 2027-01-15 08:00:00 UTC, before the restart"),
+        (
+            FAULTED,
+            "fault",
+            "a wheel is dead, latched at 2027-01-15 08:00:00 UTC, before the restart",
+        ),
+        (OFF, "inactive", "was switched off by joe at 2027-01-15 08:00:00 UTC, before the restart"),
+    ],
+)
+def test_a_robot_starts_in_the_mode_of_its_latches_and_one_event_says_so(
+    latches: Latches, mode: str, why: str
+) -> None:
+    bench = Bench(latches=latches)
+    release = "srv/activate" if mode == "inactive" else "srv/clear"
+    assert (bench.out.mode, bench.out.reason) == (mode, f"{why}; call {release}")
+    assert bench.out.latches is latches
+    (event,) = bench.out.events
+    assert event == Event(
+        "mode", f"start -> {mode}: {why}; call {release}", "warning", kind=event.kind
+    )
+    bench.linked().step(REST)
+    for _ in range(100):
+        assert bench.step(GO).applied == REST
+    assert (bench.mode(), bench.out.latches) == (mode, latches)
+    assert bench.answer("activate" if mode == "inactive" else "clear").success
+    assert bench.out.latches == Latches()
+    bench.let_go()
+    assert bench.step(GO).mode == "driving"
+
+
+def test_latches_are_the_same_object_until_one_changes() -> None:
     bench = Bench().driving()
-    bench.step(guard_trip="a wheel is too fast")
-    assert "in fault" in bench.answer("stop").message
-    assert bench.mode() == "fault"
+    before = bench.out.latches
+    assert bench.step(GO).latches is before
+    stopped = bench.step(ask="stop").latches
+    assert stopped != before
+    assert bench.step(GO).latches is stopped
+
+
+# limits that `set` lowered
+
+
+SLOW = {"limits.linear_speed": 0.3}
+
+
+def test_a_lowered_limit_is_kept_until_it_is_raised_to_that_of_the_file() -> None:
+    bench = Bench().linked()
+    assert bench.set({"limits.linear_speed": 0.3, "limits.angular_speed": 5.0}) == SLOW
+    assert bench.set({"limits.linear_speed": 0.9}) == {"limits.linear_speed": 0.9}
+    assert bench.set({"limits.linear_speed": 1.0}) == {}
+
+
+def test_a_lowered_limit_holds_after_a_restart_and_an_event_says_so() -> None:
+    bench = Bench(latches=Latches(lowered=SLOW))
+    (event,) = bench.out.events
+    assert (event.name, event.level) == ("set", "warning")
+    assert event.text == "limits.linear_speed = 0.3 (was 1.0): lowered before the restart"
+    bench.driving(Twist(1.0, 0.0), steps=100)
+    assert bench.out.applied == Twist(0.3, 0.0)
+    assert bench.out.latches.lowered == SLOW
+    assert bench.set({"limits.linear_speed": 1.0}) == {}
+
+
+def test_a_kept_limit_above_that_of_the_file_does_not_count() -> None:
+    bench = Bench(Config(limits=LimitsConfig(linear_speed=0.2)), latches=Latches(lowered=SLOW))
+    assert bench.out.events == ()
+    assert bench.robot.config.limits.linear_speed == 0.2
+    assert bench.out.latches.lowered == {}
 
 
 def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> None:

@@ -43,6 +43,8 @@ from acsard.values import (
     Command,
     Inputs,
     Instant,
+    Latch,
+    Latches,
     Outputs,
     Plain,
     Pose,
@@ -74,6 +76,20 @@ CONFIGS = [
     Config(commands=COMMANDS, control=ControlConfig(rate=20.0)),
     Config(commands=COMMANDS, control=ControlConfig(rate=250.0, auto_activate=False)),
 ]
+
+STOP = Latch(5, 0, "ann", "stopped by ann", kept=True)
+FAULT = Latch(6, 0, "", "a wheel is dead", kept=True)
+OFF = Latch(7, 0, "joe", "switched off by joe", kept=True)
+
+KEPT = [
+    Latches(),
+    Latches(),
+    Latches(),
+    Latches(stop=STOP),
+    Latches(STOP, FAULT, OFF),
+    Latches(lowered={"limits.linear_speed": 0.6, "limits.angular_speed": 2.0}),
+]
+"""Latches that a robot starts with; most often none."""
 
 Wheels = tuple[float, float, float, float]
 
@@ -129,7 +145,6 @@ class Books:
         self.timeout_ns = round(source.timeout * NS_PER_S)
         self.neutral_first = neutral_first
         self.promptest: tuple[int, int] | None = None
-        self.moved_ns = -(10**15)
         self.start_over()
 
     def start_over(self) -> None:
@@ -140,12 +155,8 @@ class Books:
         return now_ns - self.heard_ns <= self.timeout_ns
 
     def take(self, wish: Twist, at_ns: int) -> None:
-        was_heard = self.heard_ns > 0
-        let_go = wish == REST and at_ns - self.moved_ns > self.timeout_ns
-        if let_go or (was_heard and at_ns - self.heard_ns > NS_PER_S):
+        if wish == REST:
             self.neutral = True
-        if wish != REST:
-            self.moved_ns = at_ns
         if not self.live(at_ns):
             self.since_ns = at_ns
         self.wish, self.heard_ns = wish, at_ns
@@ -159,14 +170,16 @@ def did(answer: Answer) -> bool:
 class RobotMachine(RuleBasedStateMachine):
     """One robot, its guard, a port, a microcontroller and a few commanders."""
 
-    @initialize(config=st.sampled_from(CONFIGS), rolling=st.booleans())
-    def start(self, config: Config, rolling: bool) -> None:
-        self.config, self.limits = config, config.limits
-        self.robot = Robot(config)
-        self.guard = Guard(
-            self.robot.session.codec.stop, config.limits.wheel_speed, config.commands.sources
-        )
-        self.last = self.robot.session.codec.stop
+    @initialize(
+        config=st.sampled_from(CONFIGS), rolling=st.booleans(), latches=st.sampled_from(KEPT)
+    )
+    def start(self, config: Config, rolling: bool, latches: Latches = KEPT[0]) -> None:
+        self.latches = latches
+        self.robot = Robot(config, latches)
+        self.config, self.limits = config, self.robot.config.limits
+        for key, kept in latches.lowered.items():
+            assert getattr(self.limits, key.removeprefix("limits.")) == kept
+        self.guard = Guard(self.robot.session.codec.stop, self.robot.config)
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s, config.commands.neutral_first) for s in SOURCES}
@@ -343,18 +356,22 @@ class RobotMachine(RuleBasedStateMachine):
     @rule(
         verb=st.sampled_from(["stop", "clear", "clear", "activate", "deactivate"]),
         now=st.booleans(),
+        off=st.sampled_from([0, 0, 0, -1, 1, None]),
     )
-    def somebody_asks(self, verb: Verb, now: bool) -> None:
-        self.ask(verb)
+    def somebody_asks(self, verb: Verb, now: bool, off: int | None) -> None:
+        """A clear names the current latch, one next to it or none."""
+        self.ask(verb, off)
         if now:
             self.step(reply=True)
 
     @rule()
     def everything_is_released(self) -> None:
-        """Clear, activate, and the port open: without it most runs end in a latch."""
+        """Clear both latches, activate, open the port: otherwise most runs end in a latch."""
         self.opened += not self.port_open
         self.port_open, self.blocked = True, False
-        self.ask("clear")
+        for _ in range(2):
+            self.ask("clear")
+            self.step(reply=True)
         self.ask("activate")
         for _ in range(4):
             self.step(reply=True)
@@ -393,8 +410,11 @@ class RobotMachine(RuleBasedStateMachine):
 
     # how it is told
 
-    def ask(self, verb: Verb) -> None:
-        self.requests.append(Request(verb, 1))
+    def ask(self, verb: Verb, off: int | None = 0) -> None:
+        held = self.latches.next
+        named = held is not None and verb == "clear" and off is not None
+        latch = held.number + (off or 0) if held is not None and named else None
+        self.requests.append(Request(verb, 1, latch=latch))
 
     def command(
         self, name: str, twist: Twist, arrived_ns: int | None = None, stamp_ns: int | None = None
@@ -499,11 +519,7 @@ class RobotMachine(RuleBasedStateMachine):
             if name.endswith("deceleration") and value < getattr(before, name):
                 assert at_rest
             self.limits = msgspec.structs.replace(self.limits, **{name: value})
-        self.guard = Guard(
-            self.robot.session.codec.stop,
-            self.limits.wheel_speed,
-            self.config.commands.sources,
-        )
+        self.guard.use(self.robot.config)
 
     def keep_books(
         self, outputs: Outputs, commands: tuple[Command, ...], requests: tuple[Request, ...]
@@ -535,6 +551,7 @@ class RobotMachine(RuleBasedStateMachine):
     def check(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         assert outputs.reason
         self.check_mode(outputs, requests)
+        self.check_latches(outputs, requests)
         self.check_odometry(outputs)
         snapshot = self.robot.snapshot(self.now_ns)
         told = msgspec.to_builtins((outputs.estimates, snapshot, outputs.applied, outputs.speeds))
@@ -553,13 +570,39 @@ class RobotMachine(RuleBasedStateMachine):
         elif was in ("stopped", "fault") and "clear" not in done:
             assert mode in (was, "fault")
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
-            assert mode == "fault"
+            assert mode in ("fault", "leaving")
         if mode == "ready" and outputs.due:
-            told = ("neutral first: ", "waiting for a command: ")
-            assert outputs.reason.startswith(told) or "may be late" in outputs.reason
+            begins = ("send a zero first: ", "waiting for a command: ", "commands of ")
+            assert outputs.reason.startswith(begins) or "is new here" in outputs.reason
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")
             assert outputs.linked
+
+    def check_latches(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
+        """Only a clear that names the latch, or that names none long after it, releases it."""
+        before, after = self.latches, outputs.latches
+        self.latches = after
+        done = [r for r, a in zip(requests, outputs.answers, strict=True) if did(a)]
+        clears = [request for request in done if request.verb == "clear"]
+        lost = [
+            was
+            for was, now in ((before.stop, after.stop), (before.fault, after.fault))
+            if was is not None and now is None
+        ]
+        assert len(lost) <= len(clears)
+        assert {r.latch for r in clears if r.latch} <= {latch.number for latch in lost}
+        if before.inactive is not None and after.inactive is None:
+            assert "activate" in {request.verb for request in done}
+        if any(request.verb == "stop" for request in done):
+            assert after.stop is not None
+            assert before.stop is None or after.stop.number > before.stop.number
+        assert (before is after) == (before == after)
+        limits, file = self.robot.config.limits, self.config.limits
+        for name in ("linear_speed", "angular_speed", "wheel_speed"):
+            lowered = getattr(limits, name) < getattr(file, name)
+            assert (after.lowered.get(f"limits.{name}") == getattr(limits, name)) == lowered
+        held = after.fault or after.stop or after.inactive
+        assert not held or outputs.mode not in ("waiting", "ready", "driving")
 
     def check_odometry(self, outputs: Outputs) -> None:
         """No step is longer than the fastest wheel of its two ends can make it in the time since.
@@ -591,7 +634,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     def send(self, outputs: Outputs) -> None:
         """The rest of `ControlLoop._send`, with the wire watched."""
-        line, self.trip = self.guard.check(outputs, self.last)
+        line, self.trip = self.guard.check(outputs)
         assert self.trip == ""
         if line is None:
             self.superseded = False
@@ -601,7 +644,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.superseded = self.blocked or not self.port_open
         if self.superseded:
             return
-        self.last = line
+        self.guard.left(line)
         self.sent, self.sent_ns, self.sent_twist = wheels, self.now_ns, outputs.applied
         self.broken = False
         self.told = wheels

@@ -182,6 +182,8 @@ class Riding:
             return f"the daemon does not follow us, it waits for {waits}"
         if now - self._changed < OBEYED_S:
             return ""
+        if not state.wheels:
+            return "the microcontroller sends no feedback"
         right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
         linear = self._drive.wheel_radius * (right + left) / 4
         track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier

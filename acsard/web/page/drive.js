@@ -99,7 +99,7 @@ export class Drive {
    *  with one stamp the second, a zero maybe, would be taken for a repetition. */
   #send(cmd) {
     this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
-    const message = { cmd, stamp: this.#stamp };
+    const message = { cmd, stamp: this.#stamp, steady: true };
     if (this.held) this.#link.send(message);
     else this.#link.urge(message);
   }

@@ -3,6 +3,7 @@
 
 const AGAIN = [300, 600, 1200, 2500, 5000];
 const BEAT = 1000; // between two pings
+const STOOD = 150; // ms that the browser's clock may fall behind the wall clock between two pings
 const SILENT = 3000; // without an answer for so long the way is cut, whatever the socket says
 
 export class Link extends EventTarget {
@@ -12,6 +13,7 @@ export class Link extends EventTarget {
   #answers = new Map();
   #number = 0;
   #heard = 0;
+  #ahead = null; // of performance.now(), how far the wall clock was ahead at the last ping
   #asked = null; // a ping that has no answer yet, since when
   #timer = null;
   #refused;
@@ -131,9 +133,14 @@ export class Link extends EventTarget {
   }
 
   #ping() {
+    const before = this.#ahead;
+    this.#ahead = Date.now() - performance.now();
     if (!this.open) return;
-    if (performance.now() - this.#heard > SILENT) {
-      this.#end("no answer");
+    // While a computer sleeps, performance.now() may stand. Commands stamped by it would look late
+    // for ever, so they need a connection of their own, which gives them a new sender.
+    const stood = before !== null && Math.abs(this.#ahead - before) > STOOD;
+    if (stood || performance.now() - this.#heard > SILENT) {
+      this.#end(stood ? "this device slept, or its clock was set" : "no answer");
       this.#connect();
       return;
     }

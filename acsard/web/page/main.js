@@ -80,8 +80,8 @@ async function posted() {
   }
 }
 
-async function asked(verb) {
-  const told = await link.call(verb);
+async function asked(verb, payload) {
+  const told = await link.call(verb, payload);
   views.alarm(told.ok ? "" : words(told.text)); // which is seen in every view
   said(told.ok ? told : { ok: true, text: "" });
 }
@@ -167,8 +167,7 @@ function stated({ detail }) {
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
-  // Without the board nobody measures: what stands there is zero, or was so.
-  const { linear, angular } = state.link === "up" ? state : { linear: null, angular: null };
+  const { linear, angular } = state; // null while no feedback comes
   views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
   views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
   const late = state.figures.period_lateness?.last_minute;
@@ -277,7 +276,8 @@ addEventListener("keydown", (event) => {
   if (!event.repeat) stop();
 }, true);
 addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
-$("clear").addEventListener("click", () => (stopping.over(), asked("clear")));
+// The daemon refuses if a stop came after the state that this person sees.
+$("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
 addEventListener("pagehide", () => stopping.over());
 $("activate").addEventListener("click", () => asked("activate"));
 $("deactivate").addEventListener("click", () => asked("deactivate"));

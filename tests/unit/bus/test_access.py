@@ -49,7 +49,9 @@ class Access:
         self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
 
     def rules_of(self, who: str) -> list[dict[str, Any]]:
-        policies = [p for p in self.value["policies"] if who in p["subjects"]]
+        """Those of a role, and of the certificate that has its name."""
+        subjects = {who, f"certificate {who}"}
+        policies = [p for p in self.value["policies"] if subjects & set(p["subjects"])]
         return [self.rules[name] for policy in policies for name in policy["rules"]]
 
     def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
@@ -70,7 +72,7 @@ class Access:
         return {who for who in EVERYBODY if self.lets(who, message, key)}
 
 
-DEFAULT = Access()
+DEFAULT, DOOR = Access(), Access(door_access)
 REAL, GYRO = McuConfig(port="/dev/ttyACM0"), OdometryConfig(gyro=True)
 SENSING = Access(mcu=REAL, odometry=GYRO)
 TRUSTING = Access(access=AccessConfig(wildcards=True))
@@ -84,7 +86,8 @@ FROM: dict[Role, set[str]] = {
 
 def written(key: str) -> str:
     """A row of the table with names in the places for names."""
-    return key.replace("<source>", "app").replace("<Type>", "Twist").replace("<role>", "operator")
+    key = key.replace("<source>", "app").replace("<certificate>", "anna")
+    return key.replace("<Type>", "Twist").replace("<role>", "operator")
 
 
 # the roles
@@ -147,15 +150,34 @@ def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: s
 
 @pytest.mark.parametrize("role", ROLES)
 def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
-    heard = [rule for rule in DEFAULT.rules_of(role) if "ingress" in rule["flows"]]
+    heard = [rule for rule in DOOR.rules_of(role) if "ingress" in rule["flows"]]
     named = [key for rule in heard for key in rule["key_exprs"]]
     assert named
     assert not [key for key in named if "*" in key]
 
 
+def test_by_tls_each_certificate_commands_on_its_own_keys_and_no_other() -> None:
+    people = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
+    door = Access(door_access, access=people)
+    for kind in ("cmd", "wheel_cmd"):
+        for who in ("wall", "anna", "ben", "chief", "viewer", "operator", "maintainer"):
+            for name in ("anna", "ben", "chief", "wall", "*", "ann$*"):
+                own = who == name and who != "wall"
+                assert door.lets(who, "put", door.key(f"{kind}/app/{name}")) == own
+            assert not door.lets(who, "put", door.key(f"{kind}/app"))
+
+
+def test_a_router_hands_on_the_commands_of_any_certificate_and_has_none_without() -> None:
+    for role in ("operator", "maintainer"):
+        assert DEFAULT.lets(role, "put", DEFAULT.key("cmd/app/anna"))
+        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/ghost/anna"))
+        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/app"))
+    assert not DEFAULT.lets("viewer", "put", DEFAULT.key("cmd/app/anna"))
+
+
 LEAST: dict[str, Role] = {
-    "cmd/<source>": "operator",
-    "wheel_cmd/<source>": "operator",
+    "cmd/<source>/<certificate>": "operator",
+    "wheel_cmd/<source>/<certificate>": "operator",
     "imu": "maintainer",
     "stop": "viewer",
     "info": "viewer",
@@ -181,7 +203,7 @@ def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic:
     access = SENSING if topic.gyro else DEFAULT
     key = access.key(written(topic.key))
     message = "put" if topic.direction == "in" else "query"
-    allowed = {"local"} if topic.key == "door" else FROM[LEAST[topic.key]]
+    allowed = FROM[LEAST[topic.key]] if topic.key in LEAST else {"local"}
     assert access.who(message, key) == allowed
     declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
     for who in EVERYBODY:
@@ -198,7 +220,7 @@ def test_a_role_may_ask_for_its_own_name_and_those_below_and_no_other(access: Ac
 
 def test_the_least_role_of_a_key_is_the_one_that_the_rules_have() -> None:
     for topic in TOPICS:
-        if topic.direction != "out" and topic.key not in ("door", WHOAMI):
+        if topic.direction != "out" and topic.key in LEAST and topic.key != WHOAMI:
             assert least_role(written(topic.key)) == LEAST[topic.key]
         elif topic.direction == "out":
             assert least_role(topic.key) == "viewer"
@@ -262,6 +284,9 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
         "stop/**",
         "*/app",
         "cmd/ghost",
+        "cmd/app",
+        "cmd/app/**",
+        "cmd/*/anna",
     ]
     below += ["json/*", "json/**", *TOLD]
     for key in (*map(DEFAULT.key, below), "acsard/*/cmd/app", "acsard/**", "**"):
@@ -316,13 +341,13 @@ def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> Non
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))
 def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
     sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
-    access = Access(commands=CommandsConfig(sources=sources), ros=RosConfig())
+    access = Access(door_access, commands=CommandsConfig(sources=sources), ros=RosConfig())
     for kind in ("cmd", "wheel_cmd"):
         for name in names:
-            assert access.lets("operator", "put", access.key(f"{kind}/{name}"))
-            assert not access.lets("viewer", "put", access.key(f"{kind}/{name}"))
+            assert access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
+            assert not access.lets("viewer", "put", access.key(f"{kind}/{name}/operator"))
         for name in {"teleop", "app", "nav", "ros2_control"}.difference(names):
-            assert not access.lets("operator", "put", access.key(f"{kind}/{name}"))
+            assert not access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
     for endpoint in endpoints(RosConfig(), ZID):
         if endpoint.direction == "in" and endpoint.native != "imu":
             listed = endpoint.native.partition("/")[2] in names
@@ -330,10 +355,11 @@ def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
 
 
 def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() -> None:
-    access = Access(commands=CommandsConfig(sources=()))
-    assert not access.lets("maintainer", "put", access.key("cmd/app"))
-    assert access.lets("viewer", "put", access.key("stop"))
-    zenoh.Config().insert_json5("access_control", json.dumps(access.value))
+    for rules in (access_control, door_access):
+        access = Access(rules, commands=CommandsConfig(sources=()))
+        assert not access.lets("maintainer", "put", access.key("cmd/app/maintainer"))
+        assert access.lets("viewer", "put", access.key("stop"))
+        zenoh.Config().insert_json5("access_control", json.dumps(access.value))
 
 
 @pytest.mark.parametrize("namespace", ["", "robot1"])
@@ -400,8 +426,11 @@ def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
     ],
     ids=["defaults", "no ROS", "ROS elsewhere", "no certificates", "long id"],
 )
-def test_zenoh_accepts_the_rules(tables: dict[str, Any]) -> None:
-    access = Access(**tables)
+@pytest.mark.parametrize("rules", [access_control, door_access])
+def test_zenoh_accepts_the_rules(
+    tables: dict[str, Any], rules: Callable[[Config], dict[str, object]]
+) -> None:
+    access = Access(rules, **tables)
     config = zenoh.Config()
     config.insert_json5("access_control", json.dumps(access.value))
     assert json.loads(config.get_json("access_control"))["default_permission"] == "deny"
@@ -411,9 +440,13 @@ def test_zenoh_accepts_the_rules(tables: dict[str, Any]) -> None:
 
 
 def test_at_the_door_each_role_may_what_it_may_and_the_daemon_all() -> None:
-    door = Access(door_access)
+    door = DOOR
     for role in ROLES:
-        assert door.rules_of(role) == DEFAULT.rules_of(role)
+        there, here = (
+            [rule for rule in access.rules_of(role) if "/cmd/" not in rule["key_exprs"][0]]
+            for access in (door, DEFAULT)
+        )
+        assert there == here
     for flow in ("ingress", "egress"):
         for message in ("put", "delete", "query", "reply", "declare_subscriber"):
             for key in ("acsard/acsar/odom", "acsard/acsar/tf_static/@adv/x", "@ros2_lv/0/x", "**"):

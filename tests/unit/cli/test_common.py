@@ -220,6 +220,7 @@ def test_what_is_never_published_says_what_to_type_instead(key: str, instead: st
     [
         ("srv/clear", "call clear"),
         ("cmd/app", "echo cmd/app"),
+        ("cmd/app/anna", "echo cmd/app/anna"),
         ("alive", "acsard fleet"),
         ("**", "get asks one"),
         ("schema/*", "get asks one"),
@@ -231,10 +232,11 @@ def test_what_answers_nothing_or_acts_is_not_asked(key: str, instead: str) -> No
 
 
 def test_what_is_published_is_followed_and_asked_and_so_is_what_is_not_in_the_table() -> None:
-    for key in ("odom", "state", "nonsense", "schema", "cmd/app/x"):
+    for key in ("odom", "state", "nonsense", "schema", "cmd/app/x/y"):
         require_followed(key)
         require_asked(key)
-    require_followed("cmd/app")
+    for key in ("cmd/app", "cmd/app/anna"):
+        require_followed(key)
     require_asked("config")
 
 

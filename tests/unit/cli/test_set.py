@@ -10,6 +10,7 @@ import pytest
 from acsard.cli import parser
 from acsard.cli.set import pairs
 from acsard.host.errors import UsageError
+from acsard.messages.schema import ServiceReply
 
 
 @pytest.mark.parametrize(
@@ -60,3 +61,29 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     exception = r"--write`?[^.]*file[^.]* a source's timeout[^.]*\[\[commands\.sources"
     for told in (capsys.readouterr().out, page):
         assert re.search(exception, " ".join(told.split()))
+
+
+@pytest.mark.parametrize(
+    ("key", "until"),
+    [
+        ("limits.linear_speed", "; until the next start; a lowered limit survives it"),
+        ("limits.linear_deceleration", "; until the next start"),
+        ("rates.state", "; until the next start"),
+    ],
+)
+def test_the_answer_says_how_long_the_setting_lasts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], key: str, until: str
+) -> None:
+    class Robot:
+        def __enter__(self) -> Robot:
+            return self
+
+        def __exit__(self, *words: object) -> None: ...
+
+        def set(self, settings: dict[str, object]) -> ServiceReply:
+            return ServiceReply(True, "done")
+
+    monkeypatch.setattr("acsard.client.connect", lambda *words, **more: Robot())
+    args = parser().parse_args(["set", key, "0.5"])
+    assert args.main(args) == 0
+    assert capsys.readouterr().out == f"done{until}\n"

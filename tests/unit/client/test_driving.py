@@ -29,7 +29,7 @@ from acsard.messages.schema import RobotState, SourceState, Time
 from acsard.values import NS_PER_S
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
-NEUTRAL = "neutral first: app must send a zero"
+NEUTRAL = "send a zero first: app must send a zero"
 
 
 def source(waits_for: str = "", age: float | None = 0.01, name: str = "app") -> SourceState:
@@ -183,6 +183,14 @@ def test_a_robot_that_something_else_moves_is_not_waited_for(
 ) -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3))
     assert 2.3 < world.drive(monkeypatch) < 3.0
+
+
+def test_a_robot_that_reports_no_speed_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(t: float, last: float, sent: list[float]) -> RobotState:
+        state = followed(t, last, sent)
+        return state if t < 1.3 else replace(state, linear=None, angular=None)
+
+    assert 2.0 < World(lost).drive(monkeypatch) < 3.0
 
 
 def test_a_long_ramp_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

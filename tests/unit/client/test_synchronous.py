@@ -58,7 +58,7 @@ def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Se
         client.send(0.5)
     assert [one.sequence for one in session.heard] == [1, 2, 3]
     (sender,) = {one.sender for one in session.heard}
-    assert sender.endswith("/01234567")
+    assert sender == client.sender
     stamps = [one.stamp_ns or 0 for one in session.heard]
     assert before_ns <= stamps[0] + 1_000_000
     assert stamps == sorted(stamps)

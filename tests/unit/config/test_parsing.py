@@ -695,3 +695,32 @@ def test_leaving_this_machine_with_the_default_id_is_a_warning() -> None:
 def test_a_rate_slower_than_the_mcu_waits_for_is_refused() -> None:
     (line,) = problems_of("[control]\nrate = 4")
     assert line.startswith("control.rate = 4: ")
+
+
+# names of certificates
+
+
+@pytest.mark.parametrize("name", ["anna", "laptop anna", "a_b.c:d@e+f-g", "J\u00fcrgen", "x" * 64])
+def test_a_certificate_may_have_any_name_that_fits_into_a_key(name: str) -> None:
+    assert accepted(f'[access]\noperators = ["{name}"]').access.operators == (name,)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "a/b", "a*", "a$b", "a#b", "a?b", "@a", "a[b]", "two\\nlines", "x" * 65]
+)
+def test_a_certificate_whose_name_fits_into_no_key_is_refused_with_what_would(name: str) -> None:
+    (problem,) = problems_of(f'[access]\noperators = ["{name}"]')
+    assert problem.startswith("access.operators = ")
+    assert "letters, digits" in problem
+
+
+@pytest.mark.parametrize("directory", ["states", "./states", "~joe/states"])
+def test_a_state_directory_that_depends_on_the_working_directory_is_refused(directory: str) -> None:
+    with pytest.raises(ConfigError, match=r"control\.state_directory = .*begins with / or ~/"):
+        parse(f'[control]\nstate_directory = "{directory}"'.encode())
+
+
+@pytest.mark.parametrize("directory", ["", "/states", "~/states"])
+def test_a_state_directory_is_absolute_or_in_the_home_directory(directory: str) -> None:
+    config = parse(f'[control]\nstate_directory = "{directory}"'.encode())
+    assert config.control.state_directory == directory

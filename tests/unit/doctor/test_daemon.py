@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.settings import BusConfig, Config
-from acsard.doctor.daemon import clocks, door, gyro, late
+from acsard.doctor.daemon import clocks, door, gyro, latch_file, late
 from acsard.doctor.running import Running
 from acsard.messages.schema import DiagnosticStatus, Time
 from tests.unit.doctor.test_running import INFO, STATE
@@ -87,3 +87,11 @@ def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None
     assert finding.level == "warning"
     assert "12 second sender, 3 absurd" in finding.text
     assert finding.mend
+
+
+def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> None:
+    trouble = "a stop cannot be kept over a restart: /x/a.latches.json: Read-only file system"
+    (finding,) = latch_file(trouble)
+    assert (finding.subject, finding.level, finding.text) == ("latch file", "warning", trouble)
+    assert "control.state_directory" in finding.mend
+    assert not list(latch_file(""))

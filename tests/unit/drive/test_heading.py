@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from msgspec import Struct
 
@@ -167,6 +167,8 @@ def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> Non
 def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
     before: float, turning: float, ahead: float
 ) -> None:
+    # A dead wheel that should hardly turn does not contradict the others.
+    assume(abs(KINEMATICS.wheel_speeds(Twist(ahead, turning)).front_left) > 1.0)
     bench = Turning()
     bench.run(1.0, Twist(ahead, 0.0))
     bench.run(before, Twist(ahead, turning))

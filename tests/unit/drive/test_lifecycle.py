@@ -1,116 +1,648 @@
-"""The mode beside its table: on or off, latched why, and whether a clear came too soon."""
+"""Latches and mode: single stories, and a model check of every reachable state."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
+from copy import copy
+from typing import NamedTuple
+
 import pytest
 
-from acsard.drive.lifecycle import Lifecycle
-from acsard.drive.modes import Mode, RefusedError, Trigger
+from acsard.drive.lifecycle import LOOK_FIRST_S, Lifecycle
+from acsard.drive.modes import Mode, RefusedError, mode_of
+from acsard.values import NS_PER_S, Instant, Latch, Latches
+
+WALL_NS = 1_800_000_000 * NS_PER_S
+AT = "2027-01-15 08:00"
 
 
-def ready() -> Lifecycle:
-    life = Lifecycle(active=True)
+def at(seconds: float) -> Instant:
+    ns = int(seconds * NS_PER_S)
+    return Instant(ns, WALL_NS + ns)
+
+
+def ns(seconds: float) -> int:
+    return int(seconds * NS_PER_S)
+
+
+def ready(active: bool = True) -> Lifecycle:
+    life = Lifecycle(active)
     life.link(up=True)
     return life
 
 
-def test_it_waits_for_its_link_or_is_switched_off_at_the_start() -> None:
+def stop(life: Lifecycle, seconds: float, by: str = "ann") -> str:
+    return life.stop(by, ns(seconds), at(seconds))
+
+
+def clear(life: Lifecycle, seconds: float, number: int | None = None) -> str:
+    return life.clear(number, ns(seconds), at(seconds))
+
+
+def number(life: Lifecycle) -> int:
+    assert life.latches.next is not None
+    return life.latches.next.number
+
+
+def mode(life: Lifecycle) -> Mode:
+    """Return the mode; a type checker would take two asserts of the attribute for one."""
+    return life.mode
+
+
+# the start
+
+
+def test_the_robot_starts_waiting_for_its_link_or_switched_off() -> None:
     assert Lifecycle(active=True).mode is Mode.WAITING
-    assert Lifecycle(active=False).mode is Mode.INACTIVE
+    off = Lifecycle(active=False)
+    assert (off.mode, off.why) == (Mode.INACTIVE, "switched off; call srv/activate")
+    assert off.latches == Latches()
 
 
-def test_activating_tells_whether_it_was_off() -> None:
-    life = Lifecycle(active=False)
-    assert life.activate(linked=True)
-    assert life.mode is Mode.READY
-    assert not life.activate(linked=True)
+def test_activate_reports_whether_the_robot_was_off() -> None:
+    life = ready(active=False)
+    assert life.activate()
+    assert mode(life) is Mode.READY
+    assert not life.activate()
+
+
+STOP = Latch(7, WALL_NS, "ann", "stopped by ann", kept=True)
+FAULT = Latch(8, WALL_NS, "", "a wheel is dead", kept=True)
+OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
+
+
+@pytest.mark.parametrize(
+    ("latches", "begins", "why"),
+    [
+        (
+            Latches(stop=STOP),
+            Mode.STOPPED,
+            f"was stopped by ann at {AT}:00 UTC, before the restart; call srv/clear",
+        ),
+        (
+            Latches(fault=FAULT),
+            Mode.FAULT,
+            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; call srv/clear",
+        ),
+        (
+            Latches(inactive=OFF),
+            Mode.INACTIVE,
+            f"was switched off by joe at {AT}:00 UTC, before the restart; call srv/activate",
+        ),
+        (
+            Latches(STOP, FAULT, OFF),
+            Mode.FAULT,
+            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; also was stopped by ann "
+            f"at {AT}:00 UTC, before the restart; call srv/clear twice",
+        ),
+        (
+            Latches(stop=Latch(7, WALL_NS, "acsard", "stopped at the start, because", kept=True)),
+            Mode.STOPPED,
+            f"stopped at the start, because (latched at {AT}:00 UTC, before the restart); "
+            "call srv/clear",
+        ),
+    ],
+)
+def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why: str) -> None:
+    life = Lifecycle(active=True, latches=latches)
+    life.link(up=True)
+    life.command(fresh=True)
+    assert (life.mode, life.why) == (begins, why)
+    assert life.latches is latches
+
+
+def test_after_restart_marks_every_latch_as_kept_and_changes_nothing_else() -> None:
+    fresh = [Latch(x.number, x.at_ns, x.by, x.why) for x in (STOP, FAULT, OFF)]
+    lowered = {"limits.linear_speed": 0.3}
+    assert Latches(fresh[0], fresh[1], fresh[2], lowered).after_restart() == Latches(
+        STOP, FAULT, OFF, lowered
+    )
+    assert Latches().after_restart() == Latches()
+
+
+# one stop
 
 
 def test_a_stop_latches_until_a_later_clear() -> None:
     life = ready()
-    life.stop(now_ns=100)
-    assert (life.mode, life.latched) == (Mode.STOPPED, "stopped by request")
-    life.clear(asked_ns=101, now_ns=110, linked=True)
-    assert (life.mode, life.latched) == (Mode.READY, "")
+    assert stop(life, 1.0) == "stopped and latched; srv/clear releases it"
+    assert mode(life) is Mode.STOPPED
+    assert life.why == f"stopped by ann at {AT}:01 UTC; call srv/clear"
+    done = clear(life, 1.5, number(life))
+    assert done == "cleared; each sender must send a zero before it drives"
+    assert (life.mode, life.latches) == (Mode.READY, Latches())
 
 
-@pytest.mark.parametrize(("asked_ns", "now_ns"), [(99, 110), (100, 110), (101, 100)])
-def test_a_clear_that_did_not_know_of_the_stop_is_refused(asked_ns: int, now_ns: int) -> None:
+def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_that_does_not() -> None:
     life = ready()
-    life.stop(now_ns=100)
-    with pytest.raises(RefusedError, match="call it again"):
-        life.clear(asked_ns, now_ns, linked=True)
-    assert life.mode is Mode.STOPPED
+    stop(life, 1.0)
+    assert number(life) == (WALL_NS + NS_PER_S) // 1_000_000
+    first = number(life)
+    life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
+    assert number(life) == first + 1
+    early = ready()
+    early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
+    assert number(early) == 1  # 0 stands for none
+    kept = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
+    kept.stop("ann", ns(1.0), Instant(ns(1.0), 0))
+    assert number(kept) == OFF.number + 1
 
 
-def test_without_a_stop_a_clear_is_never_too_soon() -> None:
+def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
     life = ready()
-    life.fault("wheel", 0)
-    life.clear(asked_ns=1, now_ns=1, linked=True)
-    assert life.mode is Mode.READY
+    stop(life, 1.0)
+    first = number(life)
+    clear(life, 1.5, first)
+    life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
+    assert number(life) == first + 1
 
 
-def test_a_clear_without_a_link_waits_for_it() -> None:
+def test_the_same_stop_arriving_twice_has_one_number() -> None:
     life = ready()
-    life.stop(now_ns=1)
-    life.clear(asked_ns=2, now_ns=3, linked=False)
-    assert life.mode is Mode.WAITING
+    life.stop("ann", ns(1.0), at(1.001))
+    life.stop("joe", ns(1.1), at(1.101))
+    latched = life.latches
+    life.stop("ann", ns(1.0), at(1.102))
+    life.stop("joe", ns(1.1), at(1.103))
+    assert life.latches is latched
+    assert latched.stop is not None
+    assert latched.stop.by == "joe"
 
 
-def test_a_robot_that_was_off_is_off_after_stop_and_clear() -> None:
+def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -> None:
     life = ready()
-    life.deactivate()
-    life.stop(now_ns=1)
-    life.clear(asked_ns=2, now_ns=3, linked=True)
-    assert life.mode is Mode.INACTIVE
+    stop(life, 1.0)
+    clear(life, 4.0, number(life))
+    life.stop("joe", ns(0.5), at(4.1))
+    assert mode(life) is Mode.STOPPED
 
 
-def test_the_first_fault_is_the_one_that_is_told() -> None:
+# clear
+
+
+@pytest.mark.parametrize("asked_s", [0.5, 1.0])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_clear_that_arrived_before_the_stop_is_refused(asked_s: float, named: bool) -> None:
     life = ready()
-    assert life.fault("first", 0)
-    assert not life.fault("second", 0)
-    assert (life.mode, life.latched) == (Mode.FAULT, "first")
+    stop(life, 1.0)
+    with pytest.raises(RefusedError):
+        life.clear(number(life) if named else None, ns(asked_s), at(9.0))
+    assert mode(life) is Mode.STOPPED
 
 
-def test_a_fault_after_a_stop_takes_its_place() -> None:
+def test_a_clear_of_the_same_step_as_the_stop_is_refused() -> None:
     life = ready()
-    life.stop(now_ns=1)
-    assert life.fault("wheel", 0)
-    assert (life.mode, life.latched) == (Mode.FAULT, "wheel")
+    life.stop("ann", ns(0.9), at(1.0))
+    with pytest.raises(RefusedError, match="at the same time or later"):
+        life.clear(number(life), ns(1.001), at(1.0))
 
 
-def test_stopping_in_fault_or_on_the_way_down_says_what_holds_the_robot() -> None:
+@pytest.mark.parametrize("since_s", [0.1, 0.4, 1.999])
+def test_a_clear_without_a_number_is_refused_right_after_a_stop(since_s: float) -> None:
     life = ready()
-    life.fault("wheel", 0)
-    assert "in fault" in life.stop(now_ns=1)
-    assert life.latched == "wheel"
-    life.fire(Trigger.LEAVE)
-    assert "going down" in life.stop(now_ns=2)
-    assert not life.fault("too late", 0)
+    stop(life, 1.0)
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 1.0 + since_s)
+    age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
+    assert str(caught.value) == (
+        f"a stop by ann came {age} s ago: look at the robot, then call srv/clear again 2 s after "
+        "it, or with the latch of the state that you have looked at"
+    )
+    assert mode(life) is Mode.STOPPED
 
 
-def test_a_clear_that_was_asked_before_the_fault_does_not_release_it() -> None:
+def test_a_clear_without_a_number_releases_a_stop_of_two_seconds_ago() -> None:
     life = ready()
-    life.stop(10)
-    life.clear(asked_ns=11, now_ns=11, linked=True)
-    life.fault("wheel", 30)
-    with pytest.raises(RefusedError, match="fault"):
-        life.clear(asked_ns=20, now_ns=30, linked=True)
-    assert life.latched == "wheel"
-    life.clear(asked_ns=40, now_ns=40, linked=True)
-    assert life.mode is Mode.READY
+    stop(life, 1.0)
+    clear(life, 1.0 + LOOK_FIRST_S)
+    assert mode(life) is Mode.READY
 
 
-def test_a_fault_that_goes_on_does_not_put_its_clear_off() -> None:
+def test_the_two_seconds_count_from_the_last_stop() -> None:
     life = ready()
-    life.fault("wheel", 30)
-    assert not life.fault("wheel", 50)
-    life.clear(asked_ns=40, now_ns=50, linked=True)
-    assert life.mode is Mode.READY
+    stop(life, 1.0)
+    stop(life, 4.0, "joe")
+    with pytest.raises(RefusedError, match=r"a stop by joe came 0\.5 s ago"):
+        clear(life, 4.5)
+
+
+def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError, match=r"came 0\.5 s ago"):
+        life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
+
+
+def test_the_two_seconds_of_a_kept_stop_count_by_the_wall_clock() -> None:
+    life = Lifecycle(active=True, latches=Latches(stop=STOP))
+    with pytest.raises(RefusedError, match=r"a stop by ann came 1\.5 s ago"):
+        life.clear(None, ns(0.2), at(1.5))
+    assert life.clear(None, ns(0.3), at(2.0))
+
+
+def test_a_clear_that_names_an_earlier_stop_is_refused_by_name_of_the_later_one() -> None:
+    life = ready()
+    stop(life, 1.0)
+    seen = number(life)
+    stop(life, 10.0, "joe")
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 20.0, seen)
+    assert str(caught.value) == (
+        f"latch {seen} is not in force; the robot is still stopped by joe: look at it, then call "
+        "srv/clear again"
+    )
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_that_has_seen_no_latch_is_refused() -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError, match="still stopped by ann"):
+        clear(life, 20.0, 0)
 
 
 def test_a_clear_of_nothing_changes_nothing() -> None:
     life = ready()
-    life.fire(Trigger.COMMAND)
-    assert not life.clear(asked_ns=1, now_ns=1, linked=True)
-    assert life.mode is Mode.DRIVING
+    life.command(fresh=True)
+    before = life.latches
+    assert clear(life, 1.0) == clear(life, 2.0, 5) == ""
+    assert mode(life) is Mode.DRIVING
+    assert life.latches is before
+
+
+def test_a_clear_without_a_link_waits_for_it() -> None:
+    life = ready()
+    stop(life, 1.0)
+    life.link(up=False)
+    clear(life, 4.0)
+    assert mode(life) is Mode.WAITING
+
+
+# a fault and a stop
+
+
+def both() -> Lifecycle:
+    life = ready()
+    stop(life, 1.0)
+    assert life.fault("a wheel is dead", at(2.0))
+    return life
+
+
+def test_the_first_fault_stays() -> None:
+    life = ready()
+    assert life.fault("first", at(1.0))
+    assert not life.fault("second", at(2.0))
+    assert mode(life) is Mode.FAULT
+    assert life.why == f"first, latched at {AT}:01 UTC; call srv/clear"
+
+
+def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:
+    life = both()
+    assert mode(life) is Mode.FAULT
+    assert life.why == (
+        f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
+        "call srv/clear twice"
+    )
+    assert clear(life, 5.0) == "fault cleared; still stopped by ann: call srv/clear again"
+    assert mode(life) is Mode.STOPPED
+    with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
+        clear(life, 6.9)  # the same clear, which the network delivered twice
+    assert clear(life, 7.1) == "cleared; each sender must send a zero before it drives"
+    assert mode(life) is Mode.READY
+
+
+def test_a_stop_keeps_the_fault() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    said = stop(life, 2.0)
+    assert said == "stopped and latched; srv/clear releases the fault first, then the stop"
+    assert mode(life) is Mode.FAULT
+    clear(life, 5.0)
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_named_clear_of_a_fault_does_not_release_a_stop_that_came_meanwhile() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    seen = number(life)
+    stop(life, 2.0)
+    life.clear(seen, ns(2.1), at(2.1))
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
+    life = ready()
+    stop(life, 1.0)
+    seen = number(life)
+    life.fault("a wheel is dead", at(2.0))
+    with pytest.raises(RefusedError, match=r"still in fault \(a wheel is dead\)"):
+        clear(life, 9.0, seen)
+    assert life.latches.stop is not None
+
+
+def test_a_second_clear_of_the_same_fault_does_not_release_the_stop_under_it() -> None:
+    life = both()
+    fault = number(life)
+    clear(life, 5.0, fault)
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 5.1, fault)
+    assert str(caught.value) == (
+        f"latch {fault} is not in force; the robot is still stopped by ann: look at it, then call "
+        "srv/clear again"
+    )
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_that_arrived_before_the_fault_does_not_release_it() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(3.0))
+    with pytest.raises(RefusedError, match="call it again"):
+        life.clear(None, ns(2.0), at(3.1))
+    life.clear(None, ns(4.0), at(4.0))
+    assert mode(life) is Mode.READY
+
+
+def test_a_fault_that_goes_on_does_not_put_its_clear_off() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(3.0))
+    assert not life.fault("a wheel is dead", at(5.0))
+    life.clear(None, ns(4.0), at(5.0))
+    assert mode(life) is Mode.READY
+
+
+# switched off
+
+
+def test_a_robot_that_was_off_is_off_after_stop_and_clear() -> None:
+    life = ready()
+    life.deactivate("joe", at(1.0))
+    stop(life, 2.0)
+    clear(life, 9.0)
+    assert mode(life) is Mode.INACTIVE
+    assert life.why == f"switched off by joe at {AT}:01 UTC; call srv/activate"
+
+
+def test_the_first_deactivate_is_the_one_that_is_reported() -> None:
+    life = ready()
+    life.deactivate("joe", at(1.0))
+    before = life.latches
+    life.deactivate("ann", at(2.0))
+    assert life.latches is before
+
+
+def test_a_robot_that_starts_switched_off_can_be_switched_off_by_a_client_too() -> None:
+    life = ready(active=False)
+    life.deactivate("joe", at(1.0))
+    assert life.latches.inactive is not None
+    assert life.activate()
+    assert (life.mode, life.latches) == (Mode.READY, Latches())
+
+
+# going down
+
+
+def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:
+    life = ready()
+    life.leave()
+    assert stop(life, 1.0) == "stopped and latched; the daemon is going down"
+    assert life.fault("a wheel is dead", at(2.0))
+    assert mode(life) is Mode.LEAVING
+    assert life.latches.stop is not None
+    assert life.latches.fault is not None
+    with pytest.raises(RefusedError, match="going down"):
+        clear(life, 9.0, number(life))
+
+
+def test_the_limits_are_kept_beside_the_latches() -> None:
+    life = both()
+    stopped = life.latches
+    life.lower({})
+    assert life.latches is stopped
+    life.lower({"limits.linear_speed": 0.3})
+    assert life.latches.lowered == {"limits.linear_speed": 0.3}
+    assert (life.latches.stop, life.latches.fault) == (stopped.stop, stopped.fault)
+
+
+# the model check
+
+
+class State(NamedTuple):
+    """Everything that decides the mode."""
+
+    leaving: bool
+    fault: bool
+    stopped: bool
+    inactive: bool
+    linked: bool
+    commanded: bool
+    dormant: bool
+
+
+Do = Callable[[Lifecycle, float], object]
+
+FACTS: dict[str, Do] = {
+    "link up": lambda life, _: life.link(up=True),
+    "link lost": lambda life, _: life.link(up=False),
+    "command": lambda life, _: life.command(fresh=True),
+    "no command": lambda life, _: life.command(fresh=False),
+    "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
+    "leave": lambda life, _: life.leave(),
+}
+
+REQUESTS: dict[str, Do] = {
+    "stop": stop,
+    "the last stop again": lambda life, now: life.stop("ann", life._stop_asked_ns, at(now)),
+    "clear by number": lambda life, now: clear(
+        life, now, life.latches.next.number if life.latches.next else 0
+    ),
+    "clear without a number": clear,
+    "clear by the number before": lambda life, now: clear(
+        life, now, life.latches.next.number - 1 if life.latches.next else 0
+    ),
+    "clear by a later number": lambda life, now: clear(
+        life, now, life.latches.next.number + 1 if life.latches.next else 9
+    ),
+    "clear from before": lambda life, now: life.clear(
+        life.latches.next.number if life.latches.next else 0, 0, at(now)
+    ),
+    "activate": lambda life, _: life.activate(),
+    "deactivate": lambda life, now: life.deactivate("joe", at(now)),
+}
+
+TRIGGERS = FACTS | REQUESTS
+PAUSES = (0.5, LOOK_FIRST_S + 1.0)
+"""Seconds before a trigger: within the time in which a plain clear is refused, and after it."""
+
+
+def state_of(life: Lifecycle) -> State:
+    latches = life.latches
+    return State(
+        life._leaving,
+        latches.fault is not None,
+        latches.stop is not None,
+        latches.inactive is not None,
+        life._linked,
+        life._commanded,
+        life._dormant,
+    )
+
+
+class Edge(NamedTuple):
+    before: State
+    trigger: str
+    pause_s: float
+    after: State
+    refused: bool
+    latches: tuple[Latches, Latches]
+    mode: Mode
+
+
+def explore() -> list[Edge]:
+    """Return every edge of the machine: each trigger, soon and late, in each reachable state."""
+    edges: list[Edge] = []
+    seen: set[tuple[State, bool]] = set()
+    queue = deque((Lifecycle(active), 10.0) for active in (True, False))
+    while queue:
+        life, now = queue.popleft()
+        # A stop older than two seconds is a state of its own: a plain clear differs there.
+        recent = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
+        if (state_of(life), recent) in seen:
+            continue
+        seen.add((state_of(life), recent))
+        for name, do in TRIGGERS.items():
+            for pause_s in PAUSES:
+                after, then, refused = copy(life), now + pause_s, False
+                try:
+                    do(after, then)
+                except RefusedError:
+                    refused = True
+                latches = (life.latches, after.latches)
+                edges.append(
+                    Edge(state_of(life), name, pause_s, state_of(after), refused, latches,
+                         after.mode)
+                )  # fmt: skip
+                queue.append((after, then))
+    return edges
+
+
+EDGES = explore()
+
+
+def test_every_combination_of_facts_and_latches_is_reached() -> None:
+    states = {edge.before for edge in EDGES}
+    assert len(states) == 2**7
+    assert len({(e.before, e.trigger, e.pause_s) for e in EDGES}) == 2**7 * len(TRIGGERS) * 2
+
+
+def test_the_mode_always_follows_from_the_list() -> None:
+    for edge in EDGES:
+        *held, inactive, linked, commanded, dormant = edge.after
+        leaving, fault, stopped = held
+        assert edge.mode is mode_of(
+            leaving=leaving, fault=fault, stopped=stopped, inactive=inactive or dormant,
+            linked=linked, commanded=commanded,
+        )  # fmt: skip
+
+
+def test_nothing_but_clear_releases_a_stop_or_a_fault() -> None:
+    releases = {
+        edge.trigger
+        for edge in EDGES
+        if edge.before.stopped > edge.after.stopped or edge.before.fault > edge.after.fault
+    }
+    assert releases == {"clear by number", "clear without a number"}
+
+
+def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
+    cleared = 0
+    for edge in EDGES:
+        if not edge.trigger.startswith("clear") or edge.refused:
+            continue
+        before, after = edge.before, edge.after
+        assert before._replace(fault=False, stopped=False) == after._replace(
+            fault=False, stopped=False
+        )
+        if before.fault or before.stopped:
+            assert (after.fault, after.stopped) == (False, before.fault and before.stopped)
+            cleared += 1
+        else:
+            assert before == after
+    assert cleared > 100
+
+
+def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down() -> None:
+    for edge in EDGES:
+        if edge.trigger == "clear by number":
+            assert edge.refused == edge.before.leaving
+
+
+def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -> None:
+    wrong = {"clear by the number before", "clear by a later number", "clear from before"}
+    for edge in EDGES:
+        if edge.trigger in wrong:
+            assert edge.before == edge.after
+            held = edge.before.fault or edge.before.stopped or edge.before.leaving
+            assert edge.refused == held
+
+
+def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
+    for edge in EDGES:
+        if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
+            assert edge.refused == edge.before.leaving
+
+
+def test_nothing_but_activate_ends_inactive() -> None:
+    ends = {
+        edge.trigger
+        for edge in EDGES
+        if edge.before.inactive > edge.after.inactive or edge.before.dormant > edge.after.dormant
+    }
+    assert ends == {"activate"}
+
+
+def test_a_refused_request_changes_nothing() -> None:
+    for edge in EDGES:
+        if edge.refused:
+            assert edge.latches[0] is edge.latches[1]
+            assert edge.before == edge.after
+
+
+def test_a_fact_and_a_stop_are_never_refused() -> None:
+    refused = {edge.trigger for edge in EDGES if edge.refused}
+    assert not refused & {*FACTS, "stop", "the last stop again"}
+
+
+def test_a_stop_always_ends_in_a_latched_stop() -> None:
+    for edge in EDGES:
+        if edge.trigger == "stop":
+            assert edge.after.stopped
+            (before, after) = (latches.stop for latches in edge.latches)
+            assert after is not None
+            assert before is None or after.number > before.number
+
+
+def test_the_shutdown_is_for_good() -> None:
+    assert all(edge.after.leaving for edge in EDGES if edge.before.leaving)
+
+
+def test_driving_begins_only_without_any_latch() -> None:
+    driving = [edge for edge in EDGES if edge.mode is Mode.DRIVING]
+    assert driving
+    for edge in driving:
+        assert edge.after == State(False, False, False, False, True, True, False)
+
+
+def test_latches_stay_the_same_object_until_one_changes() -> None:
+    for edge in EDGES:
+        before, after = edge.latches
+        assert (before is after) == (before == after)
+
+
+def test_switching_on_and_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> None:
+    for edge in EDGES:
+        if edge.trigger in ("activate", "deactivate"):
+            before = edge.before
+            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            if not edge.refused:
+                assert edge.after.inactive == (edge.trigger == "deactivate")

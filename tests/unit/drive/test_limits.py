@@ -417,6 +417,12 @@ def test_coasting_brings_both_axes_down_together_by_the_slower_of_them() -> None
     assert pair(moving(1.0, 1.0).coast(0.25)) == approx(0.75, 0.75)
 
 
+def test_coasting_for_a_negative_time_changes_nothing() -> None:
+    found = moving(0.5, 4.0)
+    assert pair(found.coast(-0.1)) == approx(0.5, 4.0)
+    assert pair(found.coast(-1e9, stop=True)) == approx(0.5, 4.0)
+
+
 def test_coasting_at_rest_stays_at_rest() -> None:
     assert limiter().coast(DT) == REST
     assert limiter().coast(0.0) == REST

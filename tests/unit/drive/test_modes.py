@@ -1,133 +1,71 @@
-"""The mode table, cell by cell."""
+"""The ordered list of modes, and the requests that a mode refuses."""
 
 from __future__ import annotations
 
+from itertools import product
+from typing import get_args
+
 import pytest
 
-from acsard.drive.modes import REFUSALS, TABLE, Mode, RefusedError, Trigger, next_mode
+from acsard.drive.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
+from acsard.values import Verb
 
-CELLS = {(mode, trigger) for mode in Mode for trigger in Trigger}
+FACTS = ("leaving", "fault", "stopped", "inactive", "linked", "commanded")
 
-FACTS = {
-    Trigger.LINK_UP,
-    Trigger.LINK_LOST,
-    Trigger.COMMAND,
-    Trigger.NO_COMMAND,
-    Trigger.FAULT,
-    Trigger.LEAVE,
-}
+ALL = [dict(zip(FACTS, values, strict=True)) for values in product((False, True), repeat=6)]
 
-LATCHED = {Mode.STOPPED, Mode.FAULT}
-
-# The whole table once more, drawn by hand as DESIGN and SAFETY tell it. A capital letter is the
-# mode it leads to, "." stays, "-" is refused.
-#
-#            link_up link_lost command no_command fault leave stop clear activate deactivate
 DRAWN = """
-    inactive    .       .        .        .        F     L     S     .      W         .
-    waiting     R       .        .        .        F     L     S     .      .         I
-    ready       .       W        D        .        F     L     S     .      .         I
-    driving     .       W        .        R        F     L     S     .      .         I
-    stopped     .       .        .        .        F     L     .     I      -         -
-    fault       .       .        .        .        .     L     .     I      -         -
-    leaving     .       .        .        .        .     .     .     -      -         -
+    1.....  leaving
+    01....  fault
+    001...  stopped
+    0001..  inactive
+    00000.  waiting
+    000011  driving
+    000010  ready
 """
+"""The whole list once more, drawn by hand: a dot matches both, in the order of `FACTS`."""
 
-LETTERS = {mode.value[0].upper(): mode for mode in Mode}
 
-
-def drawn() -> dict[tuple[Mode, Trigger], str]:
+def drawn(facts: dict[str, bool]) -> list[str]:
+    bits = "".join(str(int(facts[name])) for name in FACTS)
     rows = [line.split() for line in DRAWN.strip().splitlines()]
-    return {
-        (Mode(mode), trigger): cell
-        for mode, *cells in rows
-        for trigger, cell in zip(Trigger, cells, strict=True)
-    }
+    return [
+        mode
+        for pattern, mode in rows
+        if all(cell in (".", bit) for cell, bit in zip(pattern, bits, strict=True))
+    ]
 
 
-def test_every_mode_has_its_own_letter_in_the_drawing() -> None:
-    assert len(LETTERS) == len(Mode)
-    assert set(drawn()) == CELLS
+@pytest.mark.parametrize("facts", ALL, ids=str)
+def test_the_mode_is_the_one_row_of_the_drawing_that_matches(facts: dict[str, bool]) -> None:
+    assert drawn(facts) == [mode_of(**facts)]
 
 
-@pytest.mark.parametrize(("mode", "trigger"), sorted(CELLS))
-def test_a_trigger_leads_where_the_drawing_says(mode: Mode, trigger: Trigger) -> None:
-    cell = drawn()[mode, trigger]
-    if cell == "-":
-        with pytest.raises(RefusedError):
-            next_mode(mode, trigger)
-    else:
-        assert next_mode(mode, trigger) is (mode if cell == "." else LETTERS[cell])
+def test_every_mode_can_be_reached() -> None:
+    assert {mode_of(**facts) for facts in ALL} == set(Mode)
 
 
-def test_the_table_and_the_refusals_share_no_cell() -> None:
-    assert not set(TABLE) & set(REFUSALS)
+def test_only_a_linked_commanded_robot_without_any_latch_drives() -> None:
+    drives = [facts for facts in ALL if mode_of(**facts) is Mode.DRIVING]
+    assert drives == [dict.fromkeys(FACTS[:4], False) | dict.fromkeys(FACTS[4:], True)]
 
 
-def test_the_table_and_the_refusals_fill_every_cell() -> None:
-    assert set(TABLE) | set(REFUSALS) == CELLS
-
-
-@pytest.mark.parametrize(("mode", "trigger"), sorted(REFUSALS))
-def test_a_refusal_says_why(mode: Mode, trigger: Trigger) -> None:
+@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+def test_a_refused_request_says_why(mode: Mode, verb: Verb) -> None:
     with pytest.raises(RefusedError) as caught:
-        next_mode(mode, trigger)
-    assert str(caught.value) == REFUSALS[mode, trigger]
-    assert len(str(caught.value)) > 10
+        require_allowed(mode, verb)
+    assert str(caught.value) == REFUSALS[mode, verb]
 
 
-@pytest.mark.parametrize(("mode", "trigger"), sorted(REFUSALS))
-def test_a_refusal_of_a_latched_mode_names_the_way_out(mode: Mode, trigger: Trigger) -> None:
-    assert ("srv/clear" in REFUSALS[mode, trigger]) == (mode in LATCHED)
+@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+def test_a_refusal_names_clear_only_where_clear_helps(mode: Mode, verb: Verb) -> None:
+    assert ("call srv/clear first" in REFUSALS[mode, verb]) == (mode is not Mode.LEAVING)
 
 
-def test_a_fact_is_never_refused() -> None:
-    assert {trigger for _, trigger in REFUSALS} == {
-        Trigger.CLEAR,
-        Trigger.ACTIVATE,
-        Trigger.DEACTIVATE,
-    }
-    assert not FACTS & {trigger for _, trigger in REFUSALS}
-
-
-def test_a_stop_is_never_refused() -> None:
-    assert all((mode, Trigger.STOP) in TABLE for mode in Mode)
-
-
-def test_only_a_command_in_ready_begins_driving() -> None:
-    begins = {cell for cell, to in TABLE.items() if to is Mode.DRIVING} - {
-        (Mode.DRIVING, trigger) for trigger in Trigger
-    }
-    assert begins == {(Mode.READY, Trigger.COMMAND)}
-
-
-def test_only_a_command_a_link_and_a_needless_clear_or_activate_leave_driving_as_it_is() -> None:
-    stays = {trigger for trigger in Trigger if TABLE.get((Mode.DRIVING, trigger)) is Mode.DRIVING}
-    assert stays == {Trigger.COMMAND, Trigger.LINK_UP, Trigger.CLEAR, Trigger.ACTIVATE}
-
-
-def test_a_latched_mode_is_left_only_by_clear_a_fault_or_leaving() -> None:
-    exits = {trigger for (mode, trigger), to in TABLE.items() if mode in LATCHED and to is not mode}
-    assert exits == {Trigger.CLEAR, Trigger.FAULT, Trigger.LEAVE}
-
-
-def test_a_fault_is_left_only_by_clear_or_leaving() -> None:
-    exits = {
-        trigger for (mode, trigger), to in TABLE.items() if mode is Mode.FAULT and to is not mode
-    }
-    assert exits == {Trigger.CLEAR, Trigger.LEAVE}
-
-
-def test_leaving_is_for_good() -> None:
-    assert {to for (mode, _), to in TABLE.items() if mode is Mode.LEAVING} == {Mode.LEAVING}
-
-
-def test_clear_never_leads_straight_to_motion() -> None:
-    assert {
-        to for (mode, trigger), to in TABLE.items() if trigger is Trigger.CLEAR and to is not mode
-    } == {Mode.INACTIVE}
-
-
-@pytest.mark.parametrize("mode", Mode)
-def test_without_a_link_nothing_is_driving_or_ready(mode: Mode) -> None:
-    assert next_mode(mode, Trigger.LINK_LOST) not in (Mode.READY, Mode.DRIVING)
+def test_every_other_request_is_allowed() -> None:
+    cells = set(product(Mode, get_args(Verb)))
+    for mode, verb in cells - set(REFUSALS):
+        require_allowed(mode, verb)
+    held = (Mode.FAULT, Mode.STOPPED, Mode.LEAVING)
+    refused = {(mode, verb) for mode in held for verb in ("activate", "deactivate")}
+    assert set(REFUSALS) == refused | {(Mode.LEAVING, "clear")}

@@ -356,6 +356,24 @@ def test_forgetting_does_not_make_a_runaway_a_push() -> None:
     assert "faster than" in pushed(sanity, 10.0, 1.0)[0][0]
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wheel_that_still_slows_down_after_forgetting_is_no_fault(sign: float) -> None:
+    sanity, speed = driven(sign * 20.0), sign * 20.0
+    faults: list[str] = []
+    sanity.forget()
+    while abs(speed) > 0.5:
+        speed *= 1.0 - DT / 0.4
+        faults.append(sanity.watch(STILL, noisy(only(1, speed), len(faults)), DT))
+    assert not any(faults)
+
+
+def test_a_runaway_is_found_in_half_a_second_after_forgetting() -> None:
+    sanity = driven(10.0)
+    sanity.forget()
+    lines = (sanity.watch(STILL, noisy(only(1, 10.0), step), DT) for step in range(52))
+    assert "faster than" in next(filter(None, lines))
+
+
 def test_without_a_fault_time_a_push_is_still_told() -> None:
     sanity = Sanity(FeedbackConfig(fault_time=0.0))
     faults, told = pushed(sanity, 5.0, 0.5)

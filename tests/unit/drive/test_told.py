@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from acsard.drive.arbiter import Choice
 from acsard.drive.modes import Mode
-from acsard.drive.told import Told, missed, refused
+from acsard.drive.told import MAX_SENDER, Told, missed, refused
 from acsard.values import REST, Event, Refusal, Twist, Wait
 
 NOBODY = Choice()
@@ -93,7 +93,12 @@ def test_who_sends_to_a_stopped_robot_is_not_told_to_wait() -> None:
 def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
     event = refused(Refusal("stale", "source app: late", "app", "joe" * 100))
     assert event == Event(
-        "command_refused", "source app: late", "warning", ("joe" * 100)[:40], "stale", news=False
+        "command_refused",
+        "source app: late",
+        "warning",
+        ("joe" * 100)[:MAX_SENDER],
+        "stale",
+        news=False,
     )
 
 

@@ -15,17 +15,18 @@ SENTENCES = [
     (Wait("command"), "a command"),
     (
         Wait("neutral", "slow", 1.0),
-        "neutral first: slow must send a zero, or pause for 1 s, before it can drive",
+        "send a zero first: slow must send a zero before it can drive",
     ),
     (
-        Wait("neutral", "high", 0.5),
-        "neutral first: high must send a zero, or pause for 0.5 s, before it can drive",
+        Wait("neutral", "high", 0.5, shared=True),
+        "send a zero first: high must send a zero, and no speed for 0.5 s after it, before it can "
+        "drive",
     ),
     (
         Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
-        "neutral first: nav must send a zero, or pause for 1 s, before it can drive, and sends "
-        'speeds for over 3 s (`ros2 topic pub` of a speed never does that: "Drive" in '
-        "deploy/ros2/README.md has what does)",
+        "send a zero first: nav must send a zero before it can drive; it has sent speeds for over "
+        '3 s (`ros2 topic pub` of a speed sends none: "After a clear" in deploy/ros2/README.md has '
+        "tools that do)",
     ),
     (Wait("zeros", "app", lasts=3.0), "held by app, which sends nothing but zeros for over 3 s"),
     (
@@ -36,8 +37,12 @@ SENTENCES = [
     (Wait("zeros", "app", lasts=3600.0), "held by app, which sends nothing but zeros for over 1 h"),
     (
         Wait("proof", "high", 0.25),
-        "high may be late: its delays must be steady for 0.25 s if its clock is new here, for "
-        "1.5 s if that was set",
+        "high is new here: it drives once its delays have been steady for 0.25 s",
+    ),
+    (
+        Wait("late", "high", 0.25),
+        "commands of high come too late, by more than 0.25 s: the network holds them up, or the "
+        "sender's clock was set",
     ),
     (Wait("higher", "high"), "high has the higher priority: until it is silent"),
     (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),
@@ -61,13 +66,12 @@ def test_every_wait_has_its_sentence_above() -> None:
         (Choice(), "waiting for a command: no source has sent one within its timeout"),
         (
             Choice(wait=Wait("proof", "app", 2.0)),
-            "app may be late: its delays must be steady for 2 s if its clock is new here, for "
-            "1.5 s if that was set",
+            "app is new here: it drives once its delays have been steady for 2 s",
         ),
         (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
         (
             Choice("app", None, Wait("neutral", "app", 0.25)),
-            "neutral first: app must send a zero, or pause for 0.25 s, before it can drive",
+            "send a zero first: app must send a zero before it can drive",
         ),
     ],
 )

@@ -35,11 +35,13 @@ def read(payload: bytes, way: Way = Way("cmd/nav"), put: bool = True) -> TwistSt
 
 
 def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
-    assert set(found("app", RosConfig())) == {"acsard/robot/cmd/app", "acsard/robot/wheel_cmd/app"}
+    app = {f"acsard/robot/{kind}/app{end}" for kind in ("cmd", "wheel_cmd") for end in ("", "/*")}
+    assert set(found("app", RosConfig())) == app
     nav = found("nav", RosConfig())
     assert {way.via for way in nav.values()} == {"native", "bridge", "rmw"}
-    assert {way.native for way in nav.values()} == {"cmd/nav", "wheel_cmd/nav"}
-    assert len(nav) == 2 + 1 + 2  # over rmw a topic of two types has two keys
+    native = {way.native for way in nav.values()}
+    assert native == {"cmd/nav", "wheel_cmd/nav", "cmd/nav/*", "wheel_cmd/nav/*"}
+    assert len(nav) == 4 + 1 + 2  # over rmw a topic of two types has two keys
 
 
 def test_all_keys_of_ros_that_command_are_somebody_s() -> None:
@@ -51,7 +53,7 @@ def test_all_keys_of_ros_that_command_are_somebody_s() -> None:
 def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none() -> None:
     apart = found("nav", RosConfig(namespace="one", rmw=False))
     assert [key for key, way in apart.items() if way.via != "native"] == ["one/cmd_vel"]
-    assert len(found("nav", RosConfig(bridge=False, rmw=False))) == 2
+    assert len(found("nav", RosConfig(bridge=False, rmw=False))) == 4
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -18,6 +18,7 @@ from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, sende
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.messages.schema import JointState, TwistStamped
 from acsard.messages.schema import Twist as TwistMessage
+from acsard.messages.signature import public_name
 from acsard.ros.attachments import Attachment
 from acsard.values import Command, Pose, Request, Twist, WheelSpeeds
 from tests.each import each
@@ -473,7 +474,7 @@ def test_a_native_command_has_the_same_limit_as_any_other() -> None:
 @pytest.mark.parametrize(
     "key",
     ["cmd/*", "cmd/**", "**", "*/app", "wheel_cmd/*", "wheel_cmd/**", "cmd/a$*", "*",
-     "acsard/*/cmd/app", "cmd/app/more", "acsard/**"],
+     "acsard/*/cmd/app", "cmd/app/anna/more", "cmd/app/*", "acsard/**"],
 )  # fmt: skip
 def test_a_command_needs_its_exact_key(key: str) -> None:
     assert refused(twist(), key=key) == "wildcard"
@@ -519,7 +520,7 @@ def test_wheel_commands_are_stamped_the_same_way() -> None:
 
 
 def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
-    assert command(twist(), sender="z1").clock == "z1"
+    assert command(twist(), sender="z1").clock == public_name("z1")
     assert command(twist(), sender="").clock == "native/app"
 
 
@@ -530,10 +531,32 @@ def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
 # services
 
 
-@pytest.mark.parametrize("verb", ["stop", "clear", "activate", "deactivate", "reset_odometry"])
+@pytest.mark.parametrize("verb", ["stop", "activate", "deactivate", "reset_odometry"])
 @pytest.mark.parametrize("payload", [b"", b"{}", b"\xff garbage"])
 def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_clear_takes_the_number_of_a_latch(form: Format) -> None:
+    payload = encode({"latch": 1_800_000_000_123}, form)
+    request = Receiver.request("clear", 7, "", payload, 5)
+    assert request == Request("clear", 7, asked_ns=5, latch=1_800_000_000_123)
+
+
+@pytest.mark.parametrize("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
+def test_clear_may_come_without_a_number(payload: bytes) -> None:
+    assert Receiver.request("clear", 7, "", payload) == Request("clear", 7)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xff garbage", b'{"latch": "5"}', b'{"latch": -1}', b'{"latch": 5.5}', b'{"stop": 5}',
+     b'{"latch": 9007199254740992}', b'{"latch": true}'],
+)  # fmt: skip
+def test_clear_refuses_any_other_payload(payload: bytes) -> None:
+    with pytest.raises(DecodeError):
+        Receiver.request("clear", 7, "", payload)
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])
@@ -683,7 +706,7 @@ def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
 
 def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
-    gid = GID.hex()
+    gid = f"gid {public_name(GID.hex())}"
     assert command == Command(
         "nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, gid, gid, sequence=1, ros=True
     )
@@ -693,7 +716,7 @@ def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None
     command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
     assert (command.stamp_ns, command.clock) == (
         12_000_000_034,
-        f"{GID.hex()}, header on rmw/cmd/nav",
+        f"gid {public_name(GID.hex())}, header on rmw/cmd/nav",
     )
     assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
 
@@ -719,7 +742,7 @@ def test_by_a_bridge_any_attachment_is_ignored() -> None:
 def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
     assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/nav"
     seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
-    assert (seen.stamp_ns, seen.clock) == (SENT_NS, "router")
+    assert (seen.stamp_ns, seen.clock) == (SENT_NS, f"bridge/{public_name('router')}")
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
@@ -765,13 +788,15 @@ def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_sen
 
 def test_the_sender_over_rmw_is_the_publisher() -> None:
     other = Attachment(1, SENT_NS, bytes(16)).pack()
-    assert RECEIVER.command(by_ros("rmw", twist(), sender="router")).sender == GID.hex()
-    assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender == bytes(16).hex()
+    name = f"gid {public_name(GID.hex())}"
+    assert RECEIVER.command(by_ros("rmw", twist(), sender="router")).sender == name
+    assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender != name
 
 
 def test_the_sender_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
-    assert command(twist(), sender="z1", stamp_ns=5).sender == "z1"
-    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).sender == "z2"
+    assert command(twist(), sender="z1", stamp_ns=5).sender == public_name("z1")
+    bridged = RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5))
+    assert bridged.sender == f"bridge/{public_name('z2')}"
 
 
 def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
@@ -781,7 +806,7 @@ def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
 
 def test_a_header_s_stamp_changes_no_sender() -> None:
     assert command(stamped(12)).sender == "native/app"
-    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == GID.hex()
+    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == f"gid {public_name(GID.hex())}"
 
 
 def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
@@ -791,24 +816,32 @@ def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> Non
     assert sender(replace(ros, payload=b"")) == RECEIVER.command(ros).sender
 
 
+def test_half_a_gid_passes_for_no_other_sender() -> None:
+    nameless = public_name("z1")
+    assert sender(by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))) == ""
+
+
 # our own attachment
 
 
+JOYSTICK = public_name("joystick/s3cret")
+
+
 def signed(**told: Any) -> bytes:
-    return msgspec.msgpack.encode({"sender": "joystick-7"} | told)
+    return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | told)
 
 
 def test_our_attachment_says_who_sent_it_when_and_as_which() -> None:
     told = command(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5)
-    assert (told.sender, told.clock, told.stamp_ns) == ("joystick-7", "joystick-7", 9)
+    assert (told.sender, told.clock, told.stamp_ns) == (JOYSTICK, JOYSTICK, 9)
     assert (told.sequence, told.shared) == (3, False)
 
 
 def test_a_message_s_own_stamp_goes_before_our_attachment_s() -> None:
     told = command(stamped(12), attachment=signed(stamp=9))
     assert told.stamp_ns == 12_000_000_000
-    assert told.clock == "joystick-7, header on native/cmd/app"
-    assert told.sender == "joystick-7"
+    assert told.clock == f"{JOYSTICK}, header on native/cmd/app"
+    assert told.sender == JOYSTICK
 
 
 def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
@@ -824,7 +857,7 @@ def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
 def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
     assert RECEIVER.command(by_ros("bridge", twist())).shared
     assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
-    assert not RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
+    assert RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
     assert command(twist()).shared
     assert command(stamped(12)).shared
     assert not command(twist(), sender="z2", stamp_ns=5).shared
@@ -844,3 +877,38 @@ def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_
     assert told.stamp_ns == SENT_NS + ahead_ns
     assert not command(twist(), attachment=attachment).stamp_replaced
     assert not command(twist(), received_ns=SENT_NS).stamp_replaced
+
+
+# certificates
+
+
+def test_the_certificate_in_the_key_is_part_of_the_sender_s_name() -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    came = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
+    told = receiver.command(came)
+    assert (told.source, told.sender, told.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
+    assert sender(came) == told.sender
+    by_zenoh = receiver.command(replace(came, attachment=b"", sender="z1", stamp_ns=5))
+    assert by_zenoh.sender == f"{public_name('z1')} [anna]"
+    by_key = receiver.command(replace(came, attachment=b""))
+    assert (by_key.sender, by_key.shared) == ("native/app/anna", True)
+
+
+@pytest.mark.parametrize(("first", "second"), [("", "/anna"), ("/anna", ""), ("/anna", "/ben")])
+def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: str) -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    came = arrival(written(twist(), "json"), key=f"cmd/app{first}", attachment=signed())
+    receiver.command(came)
+    with pytest.raises(DecodeError, match="first seen under") as raised:
+        receiver.command(replace(came, key=f"cmd/app{second}"))
+    assert raised.value.reason == "other_certificate"
+    assert receiver.command(came).sender == sender(came)
+
+
+def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    receiver.command(arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed()))
+    bridged = by_ros("bridge", twist(), key="cmd/app", attachment=signed())
+    assert receiver.command(bridged).sender == "bridge/app"
+    for key in ("cmd/app", "cmd/app/anna", "cmd/app/ben"):
+        assert receiver.command(arrival(written(twist(), "json"), key=key)).shared

@@ -18,6 +18,7 @@ from acsard.messages.encodings import FORMATS, DecodeError, Format, encode, enco
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.report import Report
 from acsard.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
+from acsard.messages.signature import public_name
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.ros import parameters as rcl
 from acsard.ros.attachments import Attachment, unpack
@@ -153,11 +154,14 @@ def test_config_is_the_configuration_in_force(form: Format) -> None:
 
 @pytest.mark.parametrize("role", ROLES)
 def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
-    sender = msgspec.msgpack.encode({"sender": "joe@laptop"})
+    sender = msgspec.msgpack.encode({"sender": "joe@laptop/s3cret"})
     asked = f"whoami/{role}"
     reply = answer(query("whoami/<role>", asked, attachment=sender))
     assert reply.key == asked
-    assert msgspec.json.decode(reply.payload) == {"role": role, "sender": "joe@laptop (native)"}
+    assert msgspec.json.decode(reply.payload) == {
+        "role": role,
+        "sender": f"{public_name('joe@laptop/s3cret')} (native)",
+    }
 
 
 @pytest.mark.parametrize("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
@@ -264,11 +268,12 @@ def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
 # services
 
 POSE = encode({"x": 1.0, "y": 2.0, "yaw": 3.0}, "json")
+CLEAR = encode({"latch": 5}, "json")
 SETTINGS = encode({"settings": {"limits.linear_speed": 0.8, "log.level": "debug"}}, "json")
 
 
 def payload_for(verb: str) -> bytes:
-    return {"set_pose": POSE, "set": SETTINGS}.get(verb, b"")
+    return {"set_pose": POSE, "set": SETTINGS, "clear": CLEAR}.get(verb, b"")
 
 
 @pytest.mark.parametrize("verb", SERVICES)
@@ -277,7 +282,8 @@ def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
     told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
     settings = told if verb == "set" else {}
-    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings)
+    latch = 5 if verb == "clear" else None
+    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
 
 
 @each("asked", WILDCARDS)

@@ -12,6 +12,7 @@ import zenoh
 
 from acsard.host.errors import UsageError
 from acsard.lan.router_file import router_file
+from acsard.messages.topics import source_keys
 from acsard.values import ROLES, Role
 
 TEMPLATE = (Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5").read_text()
@@ -67,14 +68,48 @@ def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
 
 
 def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> None:
-    who: dict[Role, list[str]] = {"operator": ["laptop-anna", 'b"c'], "viewer": ["wall"]}
+    who: dict[Role, list[str]] = {
+        "operator": ["laptop-anna", "robot1-ben"],
+        "viewer": ["wall"],
+        "maintainer": ["chief"],
+    }
     names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], who)["subjects"]}
     assert names == {
         "viewers": ["viewer", "wall"],
-        "operators": ["operator", "laptop-anna", 'b"c'],
-        "maintainers": ["maintainer"],
+        "operators": ["operator", "laptop-anna", "robot1-ben"],
+        "maintainers": ["maintainer", "chief"],
         "robot-a-1": ["a-1"],
+        **{f"certificate {name}": [name] for name in DRIVE},
     }
+
+
+DRIVE = ("operator", "laptop-anna", "robot1-ben", "maintainer", "chief")
+
+
+@pytest.mark.parametrize("robots", [["a-1"], ["operator-1", "robot1", "x"]])
+def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
+    robots: list[str],
+) -> None:
+    people: dict[Role, list[str]] = {
+        "operator": ["laptop-anna", "robot1-ben"],
+        "maintainer": ["chief"],
+        "viewer": ["wall"],
+    }
+    access = made(robots, people)
+    rules = {rule["id"]: rule for rule in access["rules"]}
+    commands = [rule for rule in rules.values() if any("cmd/" in key for key in rule["key_exprs"])]
+    own = {f"own-{robot}" for robot in robots}
+    assert {rule["id"] for rule in commands} == {f"commands of {name}" for name in DRIVE} | own
+    for name in DRIVE:
+        rule = rules[f"commands of {name}"]
+        assert set(rule["key_exprs"]) == {
+            f"acsard/{robot}/{key}"
+            for robot in robots
+            for key in source_keys(("teleop", "app", "ros2_control", "nav"), name)
+        }
+        assert (rule["flows"], rule["messages"]) == (["ingress"], ["put"])
+        (policy,) = [p for p in access["policies"] if rule["id"] in p["rules"]]
+        assert policy["subjects"] == [f"certificate {name}"]
 
 
 @pytest.mark.parametrize(
@@ -101,4 +136,6 @@ def test_no_robot_is_called_as_something_else_in_the_file_is() -> None:
 
 
 def test_every_role_has_its_list() -> None:
-    assert all(f'cert_common_names: ["{role}"]' in TEMPLATE for role in ROLES)
+    for role in ROLES:
+        subject = f'{{ id: "{role}s", link_protocols: ["tls"], cert_common_names: ["{role}"] }}'
+        assert subject in TEMPLATE

@@ -102,6 +102,23 @@ def test_every_question_is_a_stop() -> None:
             assert line == STOP or line.startswith(STOP[:-2] + b"#")
 
 
+def test_a_question_that_did_not_leave_is_asked_again_at_once() -> None:
+    check, ms = Bench().check, 1000
+    check.settle(True)
+    kinds = []
+    for left in (False, False, True, False, True):
+        line = check.question(ms * MS)
+        assert line is not None
+        kinds.append(kind(line))
+        check.settle(left)
+        if left:
+            assert check.question((ms + 1) * MS) is None
+            check.settle(True)
+            ms += 100
+        ms += 1
+    assert kinds == ["plain"] * 3 + ["checked"] * 2
+
+
 def test_an_mcu_that_says_nothing_is_asked_in_turn_plainly_and_with_a_check_at_10_hz() -> None:
     bench = Bench()
     asked = bench.ask(2000)

@@ -711,3 +711,97 @@ def test_an_mcu_that_has_started_again_may_be_another() -> None:
     counts_after(bench, 20)
     bench.wait(10, BOOTED)
     assert bench.session.snapping.counts == (0,) * 4
+
+
+@pytest.mark.parametrize("reads", [1, 4])
+def test_the_bad_lines_of_an_update_are_one_event_for_each_reason(reads: int) -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
+    told = [(event.kind, event.count, event.text) for event in bench.session.events]
+    assert told == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
+    assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
+
+
+# an output that is blocked
+
+
+def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> None:
+    """Let time pass after a line that left or did not, then bring the session up to date."""
+    bench.now_ns += int(ms * MS)
+    received = (Received(bench.now, read),) if read else ()
+    bench.session.update(bench.now, bench.port_open, bench.opened, received, unsent=not left)
+
+
+def blocked(bench: Bench, ms: float) -> Bench:
+    """The session after lines did not leave for this long, while good lines kept coming."""
+    bench.line()
+    update(bench, left=True)
+    for _ in range(round(ms / 10)):
+        bench.line()
+        update(bench, left=False)
+    return bench
+
+
+def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() -> None:
+    bench = blocked(Bench().up(), 290)
+    assert (bench.link(), bench.session.blocked) == ("up", False)
+    bench.line()
+    update(bench, left=False, ms=20)
+    assert (bench.link(), bench.session.blocked) == ("stale", True)
+    assert bench.names() == ["link_stale"]
+    assert bench.session.words() == bench.session.events[0].text
+    assert "sends nothing" in bench.session.words()
+
+
+@pytest.mark.parametrize(("ms", "restarted"), [(900, False), (1010, True)])
+def test_a_line_that_leaves_ends_the_block_and_a_second_of_it_is_a_new_session(
+    ms: float, restarted: bool
+) -> None:
+    bench = blocked(Bench().up(), ms)
+    bench.line()
+    update(bench, left=True)
+    assert (bench.session.blocked, bench.session.restarted) == (False, restarted)
+    for _ in range(GOOD_LINES):
+        bench.line()
+        update(bench, left=True)
+    assert bench.link() == "up"
+
+
+def test_a_step_that_comes_late_is_no_blocked_output() -> None:
+    bench = Bench().up()
+    bench.line()
+    update(bench, left=False, ms=400)
+    bench.line()
+    update(bench, left=True)
+    assert not bench.session.blocked
+
+
+def test_a_block_ends_with_its_opening() -> None:
+    bench = blocked(Bench().up(), 500)
+    bench.close().wait(10)
+    assert not bench.session.blocked
+    bench.up()
+    assert bench.link() == "up"
+
+
+def test_for_a_closed_port_stops_are_made_at_ten_hertz_and_the_opening_gets_one_at_once() -> None:
+    bench = Bench()
+    made = []
+    for _ in range(100):
+        update(bench, left=False, read=b"")
+        made.append(bench.line())
+    assert len([line for line in made if line]) == 10
+    bench.open()
+    update(bench, left=False, read=b"")
+    assert bench.line() == ZERO + b"\r\n"
+
+
+def test_a_blind_stop_that_did_not_leave_is_made_again_with_the_next_line() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    assert bench.line() == ZERO + b"\r\n"
+    update(bench, left=False, read=b"")
+    assert bench.line() == ZERO + b"\r\n"
+    update(bench, left=True, read=b"")
+    assert bench.line() is None

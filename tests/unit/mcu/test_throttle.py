@@ -30,6 +30,16 @@ def test_who_is_not_let_through_does_not_prolong_the_wait() -> None:
     assert throttle.lets(100, 100)
 
 
+def test_one_that_did_not_leave_uses_nothing_up() -> None:
+    throttle = Throttle()
+    assert throttle.lets(0, 100)
+    throttle.undo()
+    assert throttle.lets(1, 100)
+    assert throttle.lets(101, 100)
+    throttle.undo()
+    assert [throttle.lets(at, 100) for at in (100, 101)] == [False, True]
+
+
 @given(st.lists(st.integers(0, 50), max_size=60), st.integers(1, 100))
 def test_any_two_that_go_are_the_wait_apart(steps: list[int], wait_ns: int) -> None:
     throttle, now_ns, went = Throttle(), 0, []

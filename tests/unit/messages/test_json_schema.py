@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from acsard.config.parsing import effective
 from acsard.config.settings import Config, JointsConfig, McuConfig, OdometryConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.drive.modes import TABLE as MODES
+from acsard.drive.modes import Mode
 from acsard.incoming.commands import Arrival, Receiver
 from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import interfaces, topic_table
@@ -25,7 +25,9 @@ from acsard.messages.topics import PUBLISHED, TOPICS
 from acsard.values import GyroDoes, Role
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
-INCOMING = {"Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Settings", "DoorState"}
+INCOMING = {
+    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Clear", "Settings", "DoorState"
+}  # fmt: skip
 OUTGOING = set(SCHEMAS) - INCOMING
 
 
@@ -78,7 +80,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
     for topic in TOPICS:
         said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
     out = said["out"] | said["service"] | said["query"] | {"Imu"}  # that of the simulator
-    came = said["in"] | {"SetPose", "Settings"}
+    came = said["in"] | {"SetPose", "Clear", "Settings"}
     assert {name.removesuffix("In") for name in INCOMING} == came
     assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
     assert out | {"Config"} == OUTGOING
@@ -87,7 +89,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
 @pytest.mark.parametrize(
     ("name", "part", "field", "values"),
     [
-        ("RobotState", "", "mode", {str(mode) for mode, _ in MODES}),
+        ("RobotState", "", "mode", {str(mode) for mode in Mode}),
         ("RobotState", "", "link", {state for state, _ in LINKS} | set(LINKS.values())),
         ("RobotState", "", "gyro", set(get_args(GyroDoes))),
         ("DiagnosticArray", "DiagnosticStatus", "level", {0, 1, 2, 3}),
@@ -125,7 +127,7 @@ def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topi
         assert refused(topic.type, {key: one for key, one in value.items() if key != field})
 
 
-@pytest.mark.parametrize("mode", [*MODES.values()])
+@pytest.mark.parametrize("mode", [*Mode])
 def test_each_mode_may_be_said_and_no_other(mode: str) -> None:
     report = Report(Config(), START)
     list(report.due(replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
@@ -171,6 +173,8 @@ def taken(name: str, value: object) -> bool:
     """Whether the daemon takes it where that type comes in."""
     key = {"J": "wheel_cmd/app", "T": "cmd/app", "I": "imu"}.get(name[0], "set_pose")
     payload = msgspec.json.encode(value)
+    if name == "Clear":
+        return _decodes(lambda: Receiver.request("clear", 1, "application/json", payload))
     if key == "set_pose":
         return _decodes(lambda: Receiver.request("set_pose", 1, "application/json", payload))
     arrival = Arrival(key, True, payload, "application/json", 1_000_000_000, None, "")
@@ -213,6 +217,12 @@ def _decodes(call: Any) -> bool:
         ("SetPose", {"x": 1, "y": 2.0, "yaw": 0}, True),
         ("SetPose", {"x": 1, "y": 2.0}, False),
         ("SetPose", {"x": 1, "y": 2.0, "yaw": 0, "z": 0}, False),
+        ("Clear", {"latch": 5}, True),
+        ("Clear", {"latch": None}, True),
+        ("Clear", {}, True),
+        ("Clear", {"latch": -1}, False),
+        ("Clear", {"latch": 2**53}, False),
+        ("Clear", {"number": 5}, False),
     ],
 )  # fmt: skip
 def test_the_schema_takes_what_the_daemon_takes(name: str, value: object, good: bool) -> None:

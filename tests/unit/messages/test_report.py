@@ -575,7 +575,7 @@ def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     report.due(at(later(9), estimates=()), set(), never)
-    odom: Message | None = report.current("odom", never)
+    odom: Message | None = report.current("odom", look)
     assert odom == published()["odom"]
 
 

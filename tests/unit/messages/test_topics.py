@@ -13,6 +13,7 @@ from acsard.messages.topics import (
     TOPICS,
     VERBS,
     by_key,
+    command_key,
     full_key,
     json_key,
     offered,
@@ -34,6 +35,8 @@ PROMISED = [
     ("json/<key>", "out", "JSON"),
     ("cmd/<source>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>", "in", "JointState"),
+    ("cmd/<source>/<certificate>", "in", "Twist or TwistStamped"),
+    ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
     ("imu", "in", "Imu"),
     ("stop", "in", "anything"),
     ("door", "in", "DoorState"),
@@ -118,6 +121,7 @@ def test_a_full_key_has_the_robot_in_it() -> None:
 @pytest.mark.parametrize(
     ("key", "pattern"),
     [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
+     ("cmd/<source>/<certificate>", "cmd/*/*"),
      ("schema/<Type>", "schema/*"), ("json/<key>", "json/**"),
      ("odom", "odom"), ("srv/stop", "srv/stop")],
 )  # fmt: skip
@@ -130,6 +134,11 @@ def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
 def test_a_source_commands_by_twist_or_by_wheels() -> None:
     keys = ["cmd/app", "cmd/nav", "wheel_cmd/app", "wheel_cmd/nav"]
     assert source_keys(["app", "nav"]) == keys
+    assert source_keys(["app"], "anna") == ["cmd/app/anna", "wheel_cmd/app/anna"]
+    assert [command_key("cmd", "app"), command_key("cmd", "app", "anna")] == [
+        "cmd/app",
+        "cmd/app/anna",
+    ]
 
 
 def test_a_published_key_is_in_the_json_tree_by_its_whole_name() -> None:
@@ -145,10 +154,11 @@ def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
     for topic in TOPICS:
         filled = (
             topic.key.replace("<source>", "app")
+            .replace("<certificate>", "laptop anna")
             .replace("<Type>", "Twist")
             .replace("<role>", "viewer")
         )
         assert row_of(filled) is topic
         assert row_of(topic.key) is topic
-    for key in ("", "cmd", "cmd/", "cmd/app/x", "schema/", "odometry", "srv/ghost"):
+    for key in ("", "cmd", "cmd/", "cmd/app/x/y", "cmd//x", "schema/", "odometry", "srv/ghost"):
         assert row_of(key) is None

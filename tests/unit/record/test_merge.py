@@ -5,6 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.config.settings import Config
+from acsard.guard import Memory
 from acsard.record.merge import adopt
 from acsard.record.state import freeze
 from acsard.robot import Robot
@@ -21,9 +22,9 @@ def driven() -> Robot:
 
 def test_the_same_configuration_changes_nothing() -> None:
     robot = driven()
-    before = freeze(robot, b"")
+    before = freeze(robot, Memory())
     adopt(robot, Robot(PLAIN), Robot(PLAIN))
-    assert freeze(robot, b"") == before
+    assert freeze(robot, Memory()) == before
 
 
 def test_what_follows_from_the_configuration_is_of_the_other_and_what_happened_stays() -> None:

@@ -31,7 +31,7 @@ from acsard.record.recorder import MOST, Recorder
 from acsard.record.replayed import live, steps
 from acsard.record.steps import unfinished
 from acsard.robot import Robot
-from acsard.values import Event, Inputs, Instant, Outputs
+from acsard.values import Event, Inputs, Instant, Latch, Latches, Outputs
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -45,13 +45,19 @@ def config(where: Path, megabytes: float = 10.0) -> Config:
 class Bench:
     """A world whose recorder writes when told: its thread waits for the end."""
 
-    def __init__(self, where: Path, monkeypatch: pytest.MonkeyPatch, megabytes: float = 10.0):
+    def __init__(
+        self,
+        where: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        megabytes: float = 10.0,
+        latches: Latches = Latches(),  # noqa: B008
+    ) -> None:
         monkeypatch.setattr(module, "FLUSH_S", 1000.0)
         monkeypatch.setattr(module, "CLOSE_S", 20.0)
         self.said: list[Event] = []
         self.where = where
         self.recorder = Recorder(config(where, megabytes), self.said.append)
-        self.world = World(config(where, megabytes), recorder=self.recorder)
+        self.world = World(config(where, megabytes), recorder=self.recorder, latches=latches)
 
     def write(self) -> None:
         """What the thread does each second."""
@@ -82,6 +88,22 @@ def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
     assert lived.tally.steps == bench.world.steps
     assert [event.text for event in bench.said] == [f"to {bench.where}"]
     assert bench.recorder.status.missing == 0
+
+
+def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = Latch(5, START.wall_ns, "ann", "stopped by ann", kept=True)
+    latches = Latches(stop=stop, lowered={"limits.linear_speed": 0.3})
+    bench = Bench(tmp_path, monkeypatch, latches=latches)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    assert bench.world.call("clear").success
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    assert bench.world.state.mode == "driving"
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+    assert lived.tally.steps == bench.world.steps
 
 
 def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
@@ -719,11 +741,11 @@ def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     world.drive(0.5, seconds=0.5)
     taken = tape.taken[-1]
     recorder = Recorder(config(tmp_path), lambda event: None)
-    recorder.step(*taken, world.loop.robot, b"")
+    recorder.step(*taken, world.loop.robot, world.loop._guard)
     assert asked.wait(20.0)
     before = len(recorder._queue)
     for _ in range(1000):
-        recorder.step(*taken, world.loop.robot, b"")
+        recorder.step(*taken, world.loop.robot, world.loop._guard)
     hung = not goes.is_set()
     assert (len(recorder._queue) - before, who, hung) == (1000, {"record"}, True)
     assert recorder._queue[-1][0] is taken.inputs

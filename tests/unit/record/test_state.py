@@ -11,6 +11,7 @@ import pytest
 
 from acsard.config.settings import Config
 from acsard.drive.freshness import Freshness
+from acsard.guard import Memory
 from acsard.host.errors import RecordingError
 from acsard.mcu.lattice import Search
 from acsard.record.export import export
@@ -24,15 +25,19 @@ from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 from tests.unit.record.attacks import text
 
+MEMORY = Memory(b"line", 5, None, 7, 8)
+
 
 def test_it_comes_back_as_it_was() -> None:
     world = World()
     world.drive(0.5, 0.3, seconds=2.0)
-    state = thaw(freeze(world.loop.robot, b"line"))
-    assert state.last == b"line"
+    memory = world.loop._guard.memory
+    assert memory.commanded_ns is not None
+    state = thaw(freeze(world.loop.robot, memory))
+    assert state.memory == memory
     assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
-    again = freeze(state.robot, b"")
-    assert freeze(thaw(again).robot, b"") == again
+    again = freeze(state.robot, Memory())
+    assert freeze(thaw(again).robot, Memory()) == again
 
 
 def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
@@ -44,16 +49,16 @@ def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
         freshness.judge(command, NS_PER_S // 4)
     later_ns = 8 * NS_PER_S
     freshness.judge(Command("app", REST, later_ns, later_ns, "me"), NS_PER_S // 4)
-    assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), b"")) / 10
+    assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), Memory())) / 10
 
 
 def test_a_robot_of_parts_that_have_moved_since_comes_back_as_it_was() -> None:
-    data = freeze(Robot(Config()), b"line")
+    data = freeze(Robot(Config()), MEMORY)
     older = data
     for before, now in MOVED.items():
         assert text(now) in data
         older = older.replace(text(now), text(before))
-    assert freeze(thaw(older).robot, b"line") == data
+    assert freeze(thaw(older).robot, MEMORY) == data
 
 
 @pytest.mark.parametrize("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
@@ -63,7 +68,7 @@ def test_what_is_no_robot_is_refused(value: object) -> None:
 
 
 def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
-    data = freeze(World().loop.robot, b"")
+    data = freeze(World().loop.robot, Memory())
     with pytest.raises(StateError, match="this version"):
         thaw(data[:1000])
     with pytest.raises(StateError):
@@ -72,7 +77,7 @@ def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
 
 
 def test_whatever_bit_is_another_it_is_a_robot_or_refused() -> None:
-    data, dice, refused = freeze(World().loop.robot, b""), random.Random(1), list[str]()
+    data, dice, refused = freeze(World().loop.robot, Memory()), random.Random(1), list[str]()
     for _ in range(60):
         bad = bytearray(data)
         bad[dice.randrange(len(bad))] ^= 1 << dice.randrange(8)
@@ -88,9 +93,9 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
     """A recording that begins within a drive, with a robot that lacks what `forget` takes away."""
     first, tape = 100, Tape(every=100)
     World(recorder=tape).drive(0.5, seconds=2.0)
-    robot, last = thaw(tape.states[first])
+    robot, memory = thaw(tape.states[first])
     forget(robot)
-    tape.states[first] = freeze(robot, last)
+    tape.states[first] = freeze(robot, memory)
     tape.write(path, Config(), first)
     return Recording(path)
 
@@ -127,9 +132,9 @@ def taped() -> Tape:
 def test_a_robot_with_something_else_in_place_of_a_part_is_a_sentence(
     how: str, taped: Tape, tmp_path: Path
 ) -> None:
-    robot, last = thaw(taped.states[100])
+    robot, memory = thaw(taped.states[100])
     SPOILERS[how](robot)
-    spoilt = replace_state(taped, freeze(robot, last))
+    spoilt = replace_state(taped, freeze(robot, memory))
     spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
     recording = Recording(path)
     words = r"spoilt\.mcap: this version cannot read the state at its start: "

@@ -14,6 +14,7 @@ from collections import Counter, deque
 import pytest
 
 from acsard.drive.modes import Mode
+from acsard.guard import Memory
 from acsard.record.state import TABLE, freeze, part, thaw
 from acsard.record.unpickling import DEEPEST, MOST_BYTES, MOST_OPCODES, MOST_PARTS, unpickled
 from acsard.values import Twist
@@ -105,7 +106,7 @@ def test_a_robot_with_all_there_is_has_room() -> None:
     for number in range(40):
         world.send(0.1, source=f"somebody-{number}")
         world.run(0.02)
-    states = [*tape.states.values(), freeze(world.loop.robot, b"")]
+    states = [*tape.states.values(), freeze(world.loop.robot, Memory())]
     for data in states:
         assert 8 * len(data) < MOST_BYTES
         assert 8 * sum(1 for _ in pickletools.genops(data)) < MOST_OPCODES

@@ -64,7 +64,7 @@ def test_the_bands_of_the_mode_are_those_recorded() -> None:
     recorded = [step.said.status[0] for step in steps]
     changes = [recorded[0], *[b for a, b in pairwise(recorded) if a != b]]
     assert [kind for at, kind in enumerate(modes) if not at or kind != modes[at - 1]] == changes
-    assert "stopped by request" in next(
+    assert "stopped by unnamed (native) at 2027-01-15 08:00" in next(
         s.words for s in course.modes.spans() if s.kind == "stopped"
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.messages.schema import Happening, RobotState, SourceState, Time
 from acsard.ros.shapes import Counter, Log, Source, log, state
@@ -26,6 +27,7 @@ STATE = RobotState(
     refused="",
     counters={"lines": 7, "commands": 2},
     sender="joystick",
+    feedback_age=0.01,
 )
 
 
@@ -56,6 +58,12 @@ def test_a_source_never_heard_has_no_age() -> None:
     assert math.isnan(never.age)
 
 
+def test_what_is_null_in_state_is_not_a_number_in_ros() -> None:
+    told = state(replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None))
+    assert all(map(math.isnan, (told.linear, told.angular, told.feedback_age)))
+    assert told.wheels == []
+
+
 def test_state_is_the_same_field_by_field() -> None:
     told = state(STATE)
     assert told.header.stamp == STATE.stamp
@@ -63,4 +71,5 @@ def test_state_is_the_same_field_by_field() -> None:
     plain = set(told.__struct_fields__) - {"header", "sources", "counters"}
     assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
     left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
-    assert left_out == {"stamp", "figures", "encoders"}
+    # A ROS Trigger has no place for the number of a latch; diagnostics tell of the latch file.
+    assert left_out == {"stamp", "figures", "encoders", "latch", "latch_file"}

@@ -8,6 +8,7 @@ import itertools
 import os
 import pty
 import termios
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,7 +59,20 @@ def test_nothing_to_read_is_no_hang_up_and_a_hang_up_is() -> None:
     os.close(master)
     with pytest.raises(SerialException, match=r"hung up|read failed"):
         device.read(10)
-    close(device, lost=True).join(5.0)
+    close(device, lost=True, wait_s=5.0)
+
+
+def test_a_port_that_no_thread_could_close_is_closed_by_the_next_opening(path: str) -> None:
+    device = open_raw(path, 115200)
+    usual = threading.stack_size(1 << 46)  # no machine has room for such a thread
+    try:
+        close(device, lost=True)
+    finally:
+        threading.stack_size(usual)
+    device.close()
+    again = open_raw(path, 115200)  # its lock would refuse us if the first were still open
+    close(again, wait_s=5.0)
+    again.close()
 
 
 def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
@@ -66,7 +80,7 @@ def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str)
     with pytest.raises(OSError, match=r"lock|busy") as locked:
         open_raw(path, 115200)
     assert isinstance(refusal(path, locked.value), InUseError)
-    close(device).join(5.0)
+    close(device, wait_s=5.0)
     # Root may pass the mark, so it is looked for itself.
     after = os.open(path, os.O_RDWR | os.O_NOCTTY)
     exclusive = bytearray(4)
@@ -74,7 +88,7 @@ def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str)
     os.close(after)
     assert not any(exclusive)
     again = open_raw(path, 115200)
-    close(again).join(5.0)
+    close(again, wait_s=5.0)
     again.close()
     device.close()
 
@@ -100,7 +114,7 @@ def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
             open_raw(path, 115200)
     assert lost.value.errno == errno.EIO
     assert code_of(refusal(path, lost.value)) is Exit.FAILURE
-    close(open_raw(path, 115200)).join(5.0)  # nothing of it was left open or locked
+    close(open_raw(path, 115200), wait_s=5.0)  # nothing of it was left open or locked
 
 
 def test_a_device_that_is_no_tty_is_told_so() -> None:
@@ -111,7 +125,7 @@ def test_a_device_that_is_no_tty_is_told_so() -> None:
 
 def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:
     device = open_raw(path, 115200)
-    close(device, lost=True).join(5.0)
+    close(device, lost=True, wait_s=5.0)
     assert os.readlink(f"/proc/self/fd/{device.fileno()}") == os.devnull
     with pytest.raises(termios.error):
         device.flush()

@@ -21,9 +21,8 @@ def test_a_line_has_all_of_a_robot() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("link", ["stale", "down", "booting"])
-def test_without_a_link_the_last_speed_is_no_news(link: str) -> None:
-    (_, line) = table([replace(ROW, state=replace(STATE, link=link))], 120)
+def test_without_feedback_no_speed_is_shown() -> None:
+    (_, line) = table([replace(ROW, state=replace(STATE, linear=None))], 120)
     assert line.split()[2] == "-"
 
 

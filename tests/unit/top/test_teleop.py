@@ -94,6 +94,9 @@ def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
     assert told(parting(of(**still), 80)).startswith("left: the robot stands; driving: commanded")
     for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
         assert told(parting(moving, 80)).startswith("left: the robot still moves; driving: ")
+    unknown = of(**still | {"linear": None, "angular": None, "wheels": []})
+    assert told(parting(unknown, 80)).startswith("left: the robot reports no speed; driving: ")
+    assert "forward - m/s" in told(parting(unknown, 80))
     assert "yaw +57.3°" in told(parting(of(**still), 40))
     assert told(parting(replace(SEEN, age=7.0), 80)).startswith("left: no word from the daemon")
 

@@ -52,8 +52,9 @@ def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
     assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
 
 
-def test_without_a_link_no_old_speed_is_told() -> None:
-    got = parsed(text("acsar", replace(STATE, link="down"), True, 0, {}, {}))
+def test_without_feedback_no_speed_is_told() -> None:
+    unknown = replace(STATE, link="down", linear=None, angular=None, wheels=[])
+    got = parsed(text("acsar", unknown, True, 0, {}, {}))
     assert not any("speed" in name for name, _ in got)
     assert got["acsard_link", frozenset({("robot", "acsar"), ("state", "down")})] == 1
 

@@ -65,7 +65,8 @@ def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns
 
 def test_what_nobody_heard_or_measured_is_none() -> None:
     minute = Minute()
-    minute.add(0, replace(STATE, link="down", figures={}), None)
+    unknown = replace(STATE, linear=None, angular=None, wheels=[], figures={})
+    minute.add(0, unknown, None)
     told = minute.plotted(1)
     assert told.age == [0]
     assert {value for column in columns(told)[1:] for value in column} == {None}

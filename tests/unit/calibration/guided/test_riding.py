@@ -76,11 +76,11 @@ def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -
 
 def test_nothing_moves_until_zeros_count() -> None:
     world = World(LEG)
-    waiting = [SourceState("app", 50, 0.01, "neutral first: app must send a zero")]
+    waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
     world.tells = changed(sources=waiting)
     world.run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
-    assert "neutral first" in world.riding.halted
+    assert "send a zero first" in world.riding.halted
 
 
 STOPS: dict[str, Late] = {
@@ -95,6 +95,7 @@ STOPS: dict[str, Late] = {
     ),
     "it waits for a command|a command": changed(sources=[SourceState("app", 50, 3.0, "")]),
     "where 0.30 are commanded": changed(wheels=[0.0] * 4),
+    "sends no feedback": changed(wheels=[]),
 }
 
 

@@ -1,0 +1,183 @@
+"""A sender is armed by a zero of its own, never by a pause and never by the zero of another."""
+
+from __future__ import annotations
+
+import random
+from typing import get_args
+
+import pytest
+
+from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, moved
+from tests.scenarios.world import World
+
+OWN: tuple[Way, ...] = ("client", "signed", "rmw", "zenoh")
+
+
+def quiet() -> World:
+    world = World()
+    world.bus.wanted = set()
+    world.run(0.3)
+    return world
+
+
+def long(count: int) -> object:
+    return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
+
+
+def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
+    """A world after `stop` and `clear`, and senders whose clocks it knows."""
+    world = quiet()
+    speakers = [Speaker(world, way, name) for name in names]
+    for speaker in speakers:
+        speaker.open()
+        world.run(1.2)
+    world.call("stop")
+    world.run(2.1)
+    assert world.call("clear").success
+    world.run(0.1)
+    return world, speakers
+
+
+@pytest.mark.parametrize("count", [4, pytest.param(30, marks=pytest.mark.slow), long(100)])
+@pytest.mark.parametrize("way", get_args(Way))
+def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) -> None:
+    """One sends zeros at 10 Hz, the other 0.5 m/s and never stopped: it moved 2.1 m in 5 s."""
+    for seed in range(count):
+        dice = random.Random(seed)
+        world = quiet()
+        zeros, speeds = Speaker(world, way, "zeros"), Speaker(world, way, "speeds")
+        zero_hz, speed_hz = dice.choice((5.0, 10.0, 30.0)), dice.choice((10.0, 20.0, 50.0))
+        due = [dice.uniform(0.0, 0.5), dice.uniform(0.0, 0.5)]
+        start_ns = world.now_ns
+        while min(due) < 5.0:
+            number = due.index(min(due))
+            at_ns = start_ns + int(due[number] * 1e9)
+            world.run(max(0.0, (at_ns - world.now_ns) / 1e9))
+            (zeros, speeds)[number].send((0.0, 0.5)[number])
+            due[number] += 1 / (zero_hz, speed_hz)[number] * dice.uniform(0.9, 1.1)
+        assert not moved(world, start_ns), seed
+
+
+@pytest.mark.parametrize("way", SHARED)
+def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way) -> None:
+    world = quiet()
+    zeros, speeds = Speaker(world, way), Speaker(world, way)
+    crowd = [Speaker(world, "signed", f"stranger {number}") for number in range(40)]
+    start_ns = world.now_ns
+    for number in range(100):
+        speeds.send(0.5)
+        if number % 2:
+            zeros.send(0.0)
+        crowd[number % 40].send(0.3)
+        world.run(0.05)
+    assert not moved(world, start_ns)
+
+
+@pytest.mark.parametrize("way", get_args(Way))
+@pytest.mark.parametrize("pause", [1.1, 5.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_a_pause_arms_nobody(way: Way, pause: float) -> None:
+    """As with `ros2 topic pub -r 10 /cmd_vel`, Ctrl-C, and the same line again: 2.0 m."""
+    world, (speaker,) = cleared(way, "a")
+    since_ns = world.now_ns
+    for _ in range(3):
+        speaker.hold(0.5, 1.0, 10.0)
+        world.run(pause)
+    assert not moved(world, since_ns)
+
+
+@pytest.mark.parametrize("way", get_args(Way))
+def test_a_network_that_loses_all_for_a_while_arms_nobody(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    since_ns = world.now_ns
+    for _ in range(3):
+        speaker.hold(0.5, 1.0)
+        for _ in range(30):
+            speaker.message(0.5)  # lost
+            world.run(0.05)
+    assert not moved(world, since_ns)
+
+
+@pytest.mark.parametrize("way", OWN)
+def test_a_zero_of_an_identity_of_its_own_arms_at_once_right_behind_its_speeds(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    speaker.hold(0.4, 1.0)
+    assert world.state.mode == "ready"
+    speaker.hold(0.0, 0.05)
+    speaker.hold(0.4, 0.1)
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("way", SHARED)
+def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_second(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    speaker.hold(0.4, 1.0)
+    for quiet_s, mode in ((0.9, "ready"), (1.0, "driving")):
+        speaker.send(0.0)
+        world.run(quiet_s)
+        speaker.hold(0.4, 0.2)
+        assert world.state.mode == mode
+
+
+@pytest.mark.parametrize("way", SHARED)
+@pytest.mark.parametrize("hz", [1.5, 5.0, 20.0])
+def test_more_zeros_of_a_shared_identity_neither_help_nor_harm(way: Way, hz: float) -> None:
+    world, (speaker,) = cleared(way, "a")
+    since_ns = world.now_ns
+    speaker.hold(0.4, 0.5)
+    speaker.hold(0.0, 0.8, hz)
+    speaker.hold(0.4, 0.5)
+    assert not moved(world, since_ns)
+    speaker.hold(0.0, 1.4, hz)
+    speaker.hold(0.4, 0.2)
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("way", get_args(Way))
+def test_an_armed_sender_stays_armed_and_just_drives_again(way: Way) -> None:
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    for pause in (0.3, 1.0, 3.0, 60.0):
+        world.run(pause)
+        speaker.hold(0.4, 0.2)
+        assert world.state.mode == "driving", world.state.reason
+
+
+@pytest.mark.parametrize("way", get_args(Way))
+def test_a_first_command_without_a_zero_is_answered_in_plain_words(way: Way) -> None:
+    world = quiet()
+    speaker = Speaker(world, way, "b")
+    for _ in range(20):
+        speaker.hold(0.4, 0.05)
+        assert "send a zero first" in world.state.reason
+    waits = {source.name: source.waits_for for source in world.state.sources}["app"]
+    assert "send a zero first" in waits
+    assert ("no speed for 1 s" in waits) == (way in SHARED)
+
+
+@pytest.mark.parametrize("way", STAMPED)
+def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    since_ns = world.now_ns
+    speaker.hold(0.4, 5.0)
+    assert not moved(world, since_ns)
+    assert "it has sent speeds for over 3 s" in world.state.reason
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(60, marks=pytest.mark.slow)])
+def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) -> None:
+    """One program sends one plain zero, the other 0.5 m/s with a header through heavy jitter."""
+    for seed in range(count):
+        dice = random.Random(seed)
+        world = quiet()
+        zeros, speeds = Speaker(world, "plain"), Speaker(world, "header")
+        zeros.send(0.0)
+        start_ns, arrival = world.now_ns, 0.0
+        for number in range(160):
+            sent = number / 20 + (2.5 if number > 80 else 0.0)
+            held, arrival = arrival, max(arrival, sent + dice.expovariate(1 / 0.06))
+            world.run(max(0.0, sent - (world.now_ns - start_ns) / 1e9))
+            message = speeds.message(0.5)
+            world.run(max(0.0, arrival - max(sent, held)))
+            speeds.deliver(message)
+        assert not moved(world, start_ns), seed

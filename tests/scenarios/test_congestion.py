@@ -1,0 +1,220 @@
+"""A network that delays commands more and more, or by a constant time: old ones do not count."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+
+from acsard.config.settings import CommandsConfig, Config, Source
+from acsard.drive.freshness import FORGIVE_NS, FORGIVE_RATE
+from acsard.values import NS_PER_S
+from tests.scenarios.speakers import FOREIGN, STAMPED, Speaker, Way, moved, over
+from tests.scenarios.world import World
+
+BASE_S = 0.005
+TIMEOUT_S = 0.25
+MARGIN_S = 0.1
+
+
+def quiet() -> World:
+    world = World()
+    world.bus.wanted = set()
+    world.run(0.3)
+    return world
+
+
+def bound(way: Way, seconds: float) -> float:
+    """The age of the oldest speed that may be obeyed of one who is congested for so long, s."""
+    forgiven = FORGIVE_NS / NS_PER_S + seconds / FORGIVE_RATE if way in FOREIGN else 0.0
+    return BASE_S + TIMEOUT_S + forgiven + MARGIN_S
+
+
+def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tuple[float, int]:
+    """A sender opens on a good link and drives, letting go for 0.5 s in every 5 s."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    oldest, obeyed = over(
+        world,
+        speaker,
+        lambda t: BASE_S + delay(t),
+        lambda t: 0.0 if t % 5.0 > 4.5 else 0.4,
+        seconds,
+    )
+    return oldest, obeyed
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("share", [0.02, 0.01, 0.05, 0.095])
+@pytest.mark.parametrize("way", STAMPED)
+def test_delays_that_grow_slowly_are_not_taken_for_a_clock(way: Way, share: float) -> None:
+    seconds = 60.0
+    oldest, obeyed = driven_over(way, lambda t: share * t, seconds)
+    assert obeyed > 20
+    assert oldest <= bound(way, seconds)
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("plateau", [3.0, 0.5, 8.0, 30.0])
+@pytest.mark.parametrize("way", STAMPED)
+def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
+    way: Way, plateau: float
+) -> None:
+    seconds = 20.0
+    oldest, obeyed = driven_over(way, lambda t: plateau if t > 3.0 else 0.0, seconds)
+    assert obeyed > 20
+    assert oldest <= bound(way, seconds)
+    if way in FOREIGN and plateau > 1.0:
+        assert oldest <= TIMEOUT_S + MARGIN_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", STAMPED)
+def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
+    """Growth of 1 to 10 % and plateaus of 0.5 to 30 s, after one another, with jitter."""
+    for seed in range(6):
+        dice = random.Random(seed)
+        share, plateau = dice.uniform(0.01, 0.1), dice.choice((0.5, 1.0, 3.0, 10.0, 30.0))
+        begin, length = dice.uniform(1.0, 10.0), dice.uniform(5.0, 40.0)
+        flat = dice.uniform(begin, begin + length)
+
+        def jittery(
+            t: float,
+            share: float = share,
+            plateau: float = plateau,
+            begin: float = begin,
+            flat: float = flat,
+            length: float = length,
+            dice: random.Random = dice,
+        ) -> float:
+            jitter = BASE_S + min(0.1, dice.expovariate(100.0))
+            if not begin < t < begin + length:
+                return jitter
+            return jitter + share * (t - begin) + (plateau if t > flat else 0.0)
+
+        seconds = begin + length + 5.0
+        world = quiet()
+        speaker = Speaker(world, way)
+        speaker.open()
+        oldest, obeyed = over(
+            world,
+            speaker,
+            jittery,
+            lambda t: 0.0 if t % 5.0 > 4.5 else 0.4,
+            seconds,
+            dice.choice((10.0, 20.0, 50.0)),
+        )
+        assert obeyed > 5
+        assert oldest <= bound(way, seconds) + 0.1, seed
+
+
+def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() -> None:
+    world = quiet()
+    speaker = Speaker(world, "client")
+    speaker.open()
+    held = [speaker.message(0.4) for _ in range(3)]
+    world.run(8.0)
+    for message in held:
+        speaker.deliver(message)
+    world.run(0.02)
+    assert world.state.mode == "ready"
+    assert "too late" in world.state.reason
+    speaker.hold(0.4, 1.0)
+    assert world.state.mode == "driving"
+
+
+def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
+    world = quiet()
+    speaker = Speaker(world, "rmw")
+    speaker.open()
+    assert "clocks_forgiven_ms" not in world.state.counters
+    over(world, speaker, lambda t: BASE_S + (0.6 if t > 1.0 else 0.0), lambda t: 0.0, 6.0)
+    assert 550 <= world.state.counters["clocks_forgiven_ms"] <= 650
+
+
+@pytest.mark.parametrize("way", ["rmw", "header", "zenoh"])
+def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: Way) -> None:
+    """Zenoh's clock never goes back: after its wall clock was set back by 3 s it nearly stands."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    for _ in range(60):
+        speaker.ahead -= 0.05
+        speaker.hold(0.4, 0.05)
+    speaker.hold(0.4, 1.6)
+    speaker.hold(0.0, 1.2)
+    speaker.hold(0.4, 0.5)
+    assert world.state.mode == "driving", world.state.reason
+
+
+# order
+
+
+@pytest.mark.parametrize("timeout", [0.25, 5.0])
+@pytest.mark.parametrize("way", STAMPED)
+def test_an_older_command_behind_a_newer_one_is_not_obeyed(way: Way, timeout: float) -> None:
+    """It moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
+    world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, timeout),))))
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    speaker.hold(0.0, 3.0)
+    speaker.hold(0.4, 1.0)
+    assert world.state.mode == "driving"
+    older = speaker.message(0.9)
+    world.run(0.02)
+    speaker.send(0.0)
+    world.run(2.0 if timeout > 1.0 else 0.1)
+    before = world.lines()[-1]
+    speaker.deliver(older)
+    world.run(0.1)
+    assert world.lines()[-1] <= before
+    assert world.state.counters["command_stale"] >= 1
+
+
+@pytest.mark.parametrize("way", ["client", "signed", "rmw"])
+def test_a_numbered_command_that_comes_twice_is_obeyed_once(way: Way) -> None:
+    """Without numbers, equal stamps may be two commands of a coarse clock."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    again = speaker.message(0.4)
+    for _ in range(40):
+        speaker.deliver(again)
+        world.run(0.05)
+    assert world.state.mode == "ready"
+
+
+def test_numbers_alone_keep_the_order_too() -> None:
+    world = quiet()
+    sent = []
+    for number in range(60):
+        sent.append(number)
+        payload = b'{"linear": {"x": %f}, "angular": {}}' % (0.4 if number > 30 else 0.0)
+        world.put("cmd/app", payload, attachment=b'{"sender": "a", "sequence": %d}' % number)
+        world.run(0.05)
+    assert world.state.mode == "driving"
+    world.run(1.5)
+    since_ns = world.now_ns
+    payload = b'{"linear": {"x": 0.4}, "angular": {}}'
+    world.put("cmd/app", payload, attachment=b'{"sender": "a", "sequence": 40}')
+    world.run(0.3)
+    assert not moved(world, since_ns)
+    assert world.state.counters["command_stale"] == 1
+
+
+@pytest.mark.parametrize("way", ["signed", "rmw"])
+def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
+    """Behind a loss of 2.2 s any constant delay was believed: commands 5 s old were obeyed."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    for _ in range(44):
+        speaker.message(0.4)  # lost
+        world.run(0.05)
+    oldest, obeyed = over(
+        world, speaker, lambda t: 5.0, lambda t: 0.0 if t % 2.0 < 0.3 else 0.4, 10.0
+    )
+    assert oldest <= TIMEOUT_S + MARGIN_S
+    assert obeyed == 0

@@ -1,0 +1,149 @@
+"""Nothing that the daemon publishes lets another program pass for the one that drives."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+
+from acsard.messages.encodings import encode
+from acsard.messages.topics import TOPICS
+from acsard.record.state import freeze
+from acsard.values import NS_PER_S
+from tests.scenarios.speakers import Speaker
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+SECRET = "5f0c9d31a7e24b68b1d2c3e4"
+VICTIM = f"here/{SECRET}"
+AHEAD_NS = NS_PER_S // 50
+"""How much later than the victim the attacker stamps, so that its command is the newest."""
+
+WORD = re.compile(r"[^\s\"',:=()\[\]{}]+")
+
+
+def turn_rate(world: World) -> float:
+    """The measured turn rate, rad/s, which is known while the link is up."""
+    angular = world.state.angular
+    assert angular is not None
+    return angular
+
+
+def published(world: World, tape: Tape) -> Iterator[bytes]:
+    """Everything that the daemon shows: messages, answers, the log and the recording."""
+    for messages in world.bus.published.values():
+        yield from {encode(message, "json") for message in messages}
+    for replies in world.bus.replies.values():
+        yield from (reply.payload for reply in replies)
+    for event in world.events:
+        yield msgspec.json.encode(event)
+    for step in tape.steps():
+        yield repr(step).encode()
+    yield freeze(world.loop.robot, world.loop._guard.memory)
+
+
+def asked_everything(world: World) -> None:
+    """Ask each key that answers, in the victim's name too."""
+    victim = msgspec.msgpack.encode({"sender": VICTIM})
+    for topic in TOPICS:
+        if topic.direction in ("out", "query") and "<" not in topic.key and topic.key != "alive":
+            world.ask(topic.key, fmt="json")
+    world.ask("whoami/<role>", "whoami/viewer", attachment=victim)
+    world.ask("schema/<Type>", "schema/RobotState")
+    world.ask("srv/reset_odometry", attachment=victim)
+
+
+def names(texts: list[bytes]) -> list[str]:
+    """Every word, and every run of characters between quotes, that may be a sender's id."""
+    found: dict[str, None] = {}
+    for text in texts:
+        decoded = text.decode("utf-8", "replace")
+        for one in (*WORD.findall(decoded), *re.findall(r"[\"'(]([^\"'()]*)[\"')]", decoded)):
+            if 0 < len(one) <= 64 and any(part in one for part in ("here", "/")):
+                found[one] = None
+    return list(found)
+
+
+def driven() -> tuple[World, Speaker, list[bytes]]:
+    """A robot that its operator drives straight on, and everything that its daemon has shown."""
+    tape = Tape()
+    world = World(recorder=tape)
+    victim = Speaker(world, "signed", VICTIM)
+    victim.open(0.4)
+    asked_everything(world)
+    victim.open(0.4)
+    return world, victim, list(published(world, tape))
+
+
+def test_the_secret_of_a_sender_is_published_nowhere() -> None:
+    world, _, texts = driven()
+    assert re.fullmatch(r"here/[0-9a-f]{16}", world.state.sender)
+    assert not [text for text in texts if SECRET.encode() in text]
+
+
+def test_an_attacker_who_knows_all_that_is_published_cannot_drive_as_the_operator() -> None:
+    world, victim, texts = driven()
+    shown = world.state.sender
+    candidates = list(dict.fromkeys([shown, *names(texts)]))
+    assert len(candidates) > 3
+    for name in candidates:
+        attacker = Speaker(world, "signed", name)
+        attacker.ahead = AHEAD_NS / NS_PER_S
+        for _ in range(3):
+            victim.send(0.4)
+            attacker.deliver(attacker.message(0.0), angular=1.0)
+            world.run(0.02)
+        assert abs(turn_rate(world)) < 0.01, name
+        assert (world.state.mode, world.state.sender) == ("driving", shown), name
+
+
+def test_the_session_that_stamps_a_command_is_not_published() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    speaker = Speaker(world, "zenoh", SECRET)
+    speaker.open(0.4)
+    shown = world.state.sender
+    world.put("stop", b"", stamp_ns=1, session=speaker.session)
+    world.run(0.1)
+    assert not [text for text in published(world, tape) if SECRET.encode() in text]
+    (stop,) = (event for event in world.events if event.name == "stop")
+    assert re.fullmatch(r"unnamed \(native, session ([0-9a-f]{16})\)", stop.by)
+    assert shown in stop.by
+
+
+@pytest.mark.parametrize("certificate", ["", "anna"])
+def test_a_stolen_secret_counts_under_no_other_certificate(certificate: str) -> None:
+    world = World()
+    victim = Speaker(world, "signed", VICTIM)
+    thief = Speaker(world, "signed", VICTIM, ahead=AHEAD_NS / NS_PER_S)
+    victim.key += f"/{certificate}" if certificate else ""
+    thief.key += "/mallory"
+    victim.open(0.4)
+    shown = world.state.sender
+    assert shown.endswith(" [anna]") == bool(certificate)
+    for _ in range(50):
+        victim.send(0.4)
+        thief.deliver(thief.message(0.0), angular=1.0)
+        world.run(0.02)
+        assert abs(turn_rate(world)) < 0.01
+    assert (world.state.mode, world.state.sender) == ("driving", shown)
+    assert world.state.counters["command_other_certificate"] == 50
+    assert "its sender id was first seen under" in world.state.refused
+    world.run(1.0)
+    refused = [event for event in world.events if event.name == "command_refused"]
+    assert {event.by for event in refused} == {f"{shown.partition(' [')[0]} [mallory]"}
+
+
+def test_a_stolen_secret_counts_on_no_key_of_ros() -> None:
+    world = World()
+    victim = Speaker(world, "signed", VICTIM)
+    thief = Speaker(world, "signed", VICTIM, ahead=AHEAD_NS / NS_PER_S)
+    thief.via = "bridge"
+    victim.open(0.4)
+    for _ in range(50):
+        victim.send(0.4)
+        thief.deliver(thief.message(0.0), angular=1.0)
+        world.run(0.02)
+        assert abs(turn_rate(world)) < 0.01

@@ -1,0 +1,236 @@
+"""Stops and faults against clears that a network delays: no clear releases a stop it did not know.
+
+The clients here read `state`, and their clear names the latch that they read there.
+"""
+
+from __future__ import annotations
+
+import random
+
+import msgspec
+import pytest
+
+from acsard.incoming.commands import Via
+from acsard.incoming.queries import Query
+from acsard.messages.cdr import Cdr
+from acsard.messages.schema import ServiceReply
+from acsard.messages.signature import public_name
+from acsard.ros.attachments import Attachment
+from acsard.values import NS_PER_S, Latches
+from tests.scenarios.speakers import Speaker, moved
+from tests.scenarios.world import World
+
+JOE = public_name("joe")
+"""The name that the daemon shows for the client "joe"."""
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def call(
+    world: World, service: str, name: str, latch: int | None = None, via: Via = "native"
+) -> ServiceReply:
+    """Return the answer to a call by the client of this name, delivered now."""
+    payload = b"" if latch is None else msgspec.json.encode({"latch": latch})
+    attachment = msgspec.json.encode({"sender": name})
+    if via == "rmw":
+        attachment = Attachment(1, 1_800_000_000 * NS_PER_S, bytes(range(16))).pack()
+    if via == "bridge":
+        attachment = b""
+    ticket = 1000 + world.now_ns % 1_000_000_000
+    key = f"srv/{service}"
+    world.bus.queries.append(
+        Query(ticket, key, key, "", payload, "", world.now_ns, via, attachment)
+    )
+    world.run(0.02)
+    (reply,) = world.bus.replies[ticket]
+    if via == "native":
+        return msgspec.json.decode(reply.payload, type=ServiceReply)
+    return Cdr(ServiceReply).decode(reply.payload)
+
+
+def runaway(world: World) -> None:
+    """Latch a fault: the wheels of a robot that should brake go on turning."""
+    with world.mcu.pushed(0.5):
+        world.run(2.5)
+
+
+# a clear and a later stop
+
+
+def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(world: World) -> None:
+    call(world, "stop", "ann")
+    seen = world.state.latch
+    world.run(10.0)
+    call(world, "stop", "joe")
+    world.run(10.0)
+    reply = call(world, "clear", "ann", seen)
+    assert (reply.success, world.state.mode) == (False, "stopped")
+    assert f"is not in force; the robot is still stopped by {JOE} (native)" in reply.message
+    assert call(world, "clear", "ann", world.state.latch).success
+    assert world.state.mode == "ready"
+
+
+def test_a_clear_read_before_any_stop_releases_none(world: World) -> None:
+    assert world.state.latch == 0
+    call(world, "stop", "joe")
+    world.run(10.0)
+    assert not call(world, "clear", "ann", 0).success
+    assert world.state.mode == "stopped"
+
+
+@pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
+def test_a_plain_clear_is_refused_for_two_seconds_after_a_stop(world: World, via: Via) -> None:
+    call(world, "stop", "joe")
+    world.run(1.0)
+    reply = call(world, "clear", "ann", via=via)
+    assert (reply.success, world.state.mode) == (False, "stopped")
+    assert reply.message.startswith(f"a stop by {JOE} (native) came 1.0 s ago: look at the robot")
+    world.run(1.0)
+    assert call(world, "clear", "ann", via=via).success
+    assert world.state.mode == "ready"
+
+
+def test_every_stop_is_a_new_latch_also_while_one_holds(world: World) -> None:
+    seen = []
+    for name in ("ann", "joe", "joe"):
+        call(world, "stop", name)
+        seen.append(world.state.latch)
+        assert f"stopped by {public_name(name)} (native) at 2027-01-15 08:00" in world.state.reason
+        world.run(1.0)
+    assert seen == sorted(set(seen))
+    assert msgspec.json.decode(msgspec.json.encode(float(seen[-1]))) == seen[-1]
+
+
+def test_a_stop_that_arrives_ahead_of_its_query_is_one_latch(world: World) -> None:
+    world.put("stop", b"", attachment=msgspec.json.encode({"sender": "joe"}))
+    arrived_ns, ahead = world.now_ns, world.state.latch
+    world.run(0.3)
+    key = "srv/stop"
+    attachment = msgspec.json.encode({"sender": "joe"})
+    world.bus.queries.append(Query(1, key, key, "", b"", "", arrived_ns, "native", attachment))
+    world.run(0.02)
+    assert world.bus.replies[1]
+    assert world.state.latch == ahead > 0
+
+
+@pytest.mark.variations(20)
+@pytest.mark.parametrize("seed", range(100))
+def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int) -> None:
+    """Three operators stop and clear over links that hold calls and states back for up to 5 s."""
+    dice, world = random.Random(seed), World()
+    world.run(0.2)
+    moving = Speaker(world, "signed")
+    stops: list[tuple[int, int]] = []
+    """When each stop was obeyed, and its latch."""
+    states: list[tuple[int, int]] = [(world.now_ns, 0)]
+    """When each state was published, and its latch."""
+    pending: list[tuple[int, int]] = []
+    """When each clear is delivered, and the state that its sender had read then."""
+    for _ in range(150):
+        moving.send(dice.choice((0.0, 0.5)))
+        world.run(dice.uniform(0.02, 0.2))
+        states.append((world.now_ns, world.state.latch))
+        roll = dice.random()
+        if roll < 0.1:
+            assert call(world, "stop", dice.choice(("ann", "joe"))).success
+            stops.append((world.now_ns, world.state.latch))
+        elif roll < 0.4:
+            read = max(0, len(states) - 1 - dice.randrange(20))
+            pending.append((world.now_ns + dice.randrange(5 * NS_PER_S), read))
+        for clear in [one for one in pending if one[0] <= world.now_ns]:
+            pending.remove(clear)
+            read_ns, latch = states[clear[1]]
+            was = world.state.mode
+            done = call(world, "clear", "eve", latch).success
+            if was == "stopped" and done:
+                assert stops[-1][0] <= read_ns
+                assert stops[-1][1] == latch
+            elif was == "stopped":
+                assert world.state.mode == "stopped"
+    assert len(stops) > 3
+    assert call(world, "clear", "eve", world.state.latch).success
+    assert world.state.mode in ("ready", "driving")
+
+
+# a stop and a fault
+
+
+def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    call(world, "stop", "joe")
+    runaway(world)
+    assert world.state.mode == "fault"
+    assert f"; also stopped by {JOE} (native) at 2027-01-15 08:00" in world.state.reason
+    reply = call(world, "clear", "ann", world.state.latch)
+    assert (reply.success, reply.message) == (
+        True,
+        f"fault cleared; still stopped by {JOE} (native): call srv/clear again",
+    )
+    assert world.state.mode == "stopped"
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "stopped"
+    assert call(world, "clear", "ann", world.state.latch).success
+    assert world.state.mode == "ready"
+
+
+def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    runaway(world)
+    fault = world.state.latch
+    reply = call(world, "stop", "joe")
+    assert reply.message == "stopped and latched; srv/clear releases the fault first, then the stop"
+    assert world.state.latch == fault
+    assert call(world, "clear", "ann", fault).success
+    assert world.state.mode == "stopped"
+    assert world.state.latch > fault
+
+
+def test_two_clears_of_one_fault_do_not_release_the_stop_under_it(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    call(world, "stop", "joe")
+    runaway(world)
+    fault = world.state.latch
+    assert call(world, "clear", "ann", fault).success
+    reply = call(world, "clear", "eve", fault)
+    assert (reply.success, world.state.mode) == (False, "stopped")
+    assert f"is not in force; the robot is still stopped by {JOE} (native)" in reply.message
+
+
+# a restart
+
+
+def test_a_restarted_robot_stays_stopped_until_clear() -> None:
+    first = World()
+    first.run(0.2)
+    first.drive(0.5, seconds=1.0)
+    call(first, "stop", "joe")
+    assert first.loop.outputs is not None
+    latches = first.loop.outputs.latches.after_restart()
+    world = World(latches=latches)
+    world.run(0.2)
+    assert f"was stopped by {JOE} (native) at 2027-01-15 08:00:01 UTC, before the restart" in (
+        world.state.reason
+    )
+    (event,) = [event for event in world.events if "before the restart" in event.text]
+    assert (event.name, event.level) == ("mode", "warning")
+    world.drive(0.5, seconds=3.0)
+    assert (moved(world, 0), world.state.mode) == (False, "stopped")
+    world.now_ns += 5 * NS_PER_S
+    assert call(world, "clear", "ann", world.state.latch).success
+    world.drive(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_a_limit_lowered_before_the_restart_holds_for_the_line_and_is_published() -> None:
+    world = World(latches=Latches(lowered={"limits.linear_speed": 0.3}))
+    world.run(0.2)
+    world.drive(0.9, seconds=2.0)
+    assert world.loop.outputs is not None
+    assert world.loop.outputs.applied.linear == 0.3
+    (reply,) = world.ask("config")
+    assert msgspec.json.decode(reply.payload)["limits"]["linear_speed"] == 0.3

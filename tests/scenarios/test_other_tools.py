@@ -1,0 +1,559 @@
+"""Other people's tools against the neutral-first rule: the table in deploy/ros2/README.md.
+
+Each class publishes at the rates and with the zeros of the tool it is named after. Each test stops
+and clears the robot while the tool commands it, then does what the table tells a person to do. It
+shows that this is enough, and that less than this leaves the robot standing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import pytest
+
+from acsard.foxglove.hand import Hand, Wish
+from acsard.messages.encodings import encode
+from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
+from acsard.values import NS_PER_S
+from acsard.values import Twist as BodyTwist
+from tests.scenarios.speakers import Speaker, moved
+from tests.scenarios.world import World
+
+Road = Literal["rmw", "bridge"]
+ROADS: tuple[Road, ...] = ("rmw", "bridge")
+FAST = 0.4
+CLEAR_S = 2.5
+"""A plain `clear` is refused within 2 s of a stop."""
+
+ROS2 = Path(__file__).parents[2] / "deploy/ros2"
+
+TOOLS = {
+    "`teleop_twist_keyboard`",
+    "`teleop_twist_joy`",
+    "`joy_teleop`",
+    "`rqt_robot_steering`",
+    "`ros2 topic pub`",
+    "`drive.py`",
+    "Nav2",
+    "ros2_control",
+    "Foxglove's Teleop panel",
+}
+"""The tools that are played here."""
+
+by_each_road = pytest.mark.parametrize("road", ROADS)
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.3)
+    return world
+
+
+def stop_and_clear(world: World, meanwhile: Callable[[], None]) -> None:
+    """Stop the robot and clear the stop. The tool publishes as in `meanwhile` between the two."""
+    assert world.call("stop").success
+    since_ns = world.now_ns
+    meanwhile()
+    world.run(max(0.0, CLEAR_S - (world.now_ns - since_ns) / NS_PER_S))
+    assert world.call("clear").success
+
+
+def stands(world: World, act: Callable[[], None]) -> None:
+    """Check that the robot stands while the tool does this, and says that it wants a zero."""
+    since_ns = world.now_ns
+    act()
+    assert not moved(world, since_ns)
+    assert "send a zero first" in world.state.reason
+
+
+def drives(world: World, act: Callable[[], None]) -> None:
+    """Check that the robot drives at the end of this."""
+    act()
+    assert world.state.mode == "driving", world.state.reason
+
+
+def test_the_table_of_the_page_has_the_tools_that_are_played_here() -> None:
+    table = (ROS2 / "README.md").read_text().partition("\n### After a clear\n")[2]
+    rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| [^|]+ \|$", table.partition("\n## ")[0], re.M)
+    assert set(rows) - {"tool"} == TOOLS
+
+
+# teleop_twist_keyboard
+
+
+class Keyboard(Speaker):
+    """It publishes once for each key that the terminal reads: `i` is a speed, `k` is a zero."""
+
+    def press(self, linear: float, seconds: float, delay: float = 0.5, hz: float = 30.0) -> None:
+        """Hold a key down: the terminal repeats it after `delay`."""
+        self.send(linear)
+        self.world.run(delay)
+        self.hold(linear, seconds - delay, hz)
+
+
+@by_each_road
+def test_keyboard_drives_after_k_was_held_for_a_second(world: World, road: Road) -> None:
+    keyboard = Keyboard(world, road)
+    keyboard.press(0.0, 1.1)
+    drives(world, lambda: keyboard.press(FAST, 1.5))
+    stop_and_clear(world, lambda: keyboard.press(FAST, 2.0))
+    stands(world, lambda: keyboard.press(FAST, 2.0))
+    keyboard.press(0.0, 1.1)
+    drives(world, lambda: keyboard.press(FAST, 1.5))
+    world.run(10.0)
+    drives(world, lambda: keyboard.press(FAST, 1.5))
+
+
+def test_keyboard_by_rmw_drives_at_once_after_one_k(world: World) -> None:
+    keyboard = Keyboard(world, "rmw")
+    keyboard.press(0.0, 1.1)
+    keyboard.press(FAST, 1.5)
+    stop_and_clear(world, lambda: keyboard.press(FAST, 2.0))
+    keyboard.send(0.0)
+    drives(world, lambda: keyboard.hold(FAST, 0.2, 30.0))
+
+
+def test_one_zero_of_a_new_publisher_by_rmw_is_enough_once_its_delays_are_known(
+    world: World,
+) -> None:
+    keyboard = Keyboard(world, "rmw")
+    keyboard.send(0.0)
+    world.run(3.0)
+    stands(world, lambda: keyboard.press(FAST, 1.5))
+    keyboard.send(0.0)
+    drives(world, lambda: keyboard.press(FAST, 1.0))
+
+
+def test_keyboard_by_the_bridge_waits_for_a_second_after_k(world: World) -> None:
+    keyboard = Keyboard(world, "bridge")
+    keyboard.send(0.0)
+    world.run(0.9)
+    stands(world, lambda: keyboard.press(FAST, 1.0))
+    keyboard.send(0.0)
+    world.run(1.1)
+    drives(world, lambda: keyboard.hold(FAST, 0.2, 30.0))
+
+
+# teleop_twist_joy and joy_teleop
+
+
+class Joystick(Speaker):
+    """teleop_twist_joy follows the stick while the button is held, and sends one zero after it."""
+
+    JOY_HZ = 20.0
+    zero_on_release = True
+    _released = False
+
+    def joy(self, button: bool, stick: float, seconds: float) -> None:
+        """Hold button and stick like this: joy_node repeats them at 20 Hz."""
+        for _ in range(round(seconds * self.JOY_HZ)):
+            if button:
+                self.send(stick)
+            elif self.zero_on_release and not self._released:
+                self.send(0.0)
+            self._released = not button
+            self.world.run(1 / self.JOY_HZ)
+
+
+class JoyTeleop(Joystick):
+    """joy_teleop publishes nothing when its button is released."""
+
+    zero_on_release = False
+
+
+@by_each_road
+@pytest.mark.parametrize("kind", [Joystick, JoyTeleop])
+def test_joystick_drives_after_the_button_was_held_for_a_second_with_the_stick_at_rest(
+    world: World, kind: type[Joystick], road: Road
+) -> None:
+    joystick = kind(world, road)
+    stands(world, lambda: joystick.joy(True, FAST, 1.0))
+    joystick.joy(True, 0.0, 1.1)
+    drives(world, lambda: joystick.joy(True, FAST, 1.0))
+    stop_and_clear(world, lambda: joystick.joy(True, FAST, CLEAR_S))
+    stands(world, lambda: joystick.joy(True, FAST, 2.0))
+    joystick.joy(True, 0.0, 1.1)
+    drives(world, lambda: joystick.joy(True, FAST, 0.5))
+    joystick.joy(False, 0.0, 10.0)
+    drives(world, lambda: joystick.joy(True, FAST, 0.5))
+
+
+@pytest.mark.parametrize(("road", "released"), [("rmw", 0.1), ("bridge", 1.1)])
+def test_teleop_twist_joy_drives_after_its_button_was_released(
+    world: World, road: Road, released: float
+) -> None:
+    joystick = Joystick(world, road)
+    joystick.joy(True, 0.0, 1.1)
+    joystick.joy(True, FAST, 1.0)
+    stop_and_clear(world, lambda: joystick.joy(True, FAST, CLEAR_S))
+    joystick.joy(True, FAST, 0.5)
+    joystick.joy(False, 0.0, released)
+    drives(world, lambda: joystick.joy(True, FAST, 0.5))
+
+
+@by_each_road
+def test_joy_teleop_is_not_armed_by_releasing_its_button(world: World, road: Road) -> None:
+    joystick = JoyTeleop(world, road)
+    joystick.joy(True, 0.0, 1.1)
+    joystick.joy(True, FAST, 1.0)
+    stop_and_clear(world, lambda: joystick.joy(True, FAST, CLEAR_S))
+    joystick.joy(False, 0.0, 10.0)
+    stands(world, lambda: joystick.joy(True, FAST, 2.0))
+
+
+# rqt_robot_steering
+
+
+class Steering(Speaker):
+    """It publishes its sliders at 10 Hz, but a zero only once until they are moved again."""
+
+    slider = 0.0
+    _zero_sent = False
+
+    def wait(self, seconds: float) -> None:
+        """Leave the sliders where they are."""
+        for _ in range(round(seconds * 10.0)):
+            self._publish()
+            self.world.run(0.1)
+
+    def stop(self) -> None:
+        """Click Stop."""
+        self.slider, self._zero_sent = 0.0, False
+        self._publish()
+
+    def _publish(self) -> None:
+        if self.slider or not self._zero_sent:
+            self.send(self.slider)
+        self._zero_sent = not self.slider
+
+
+def slide(steering: Steering, linear: float, seconds: float) -> None:
+    """Move a slider, and leave it there."""
+    steering.slider = linear
+    steering.wait(seconds)
+
+
+@pytest.mark.parametrize(("road", "pause"), [("rmw", 0.1), ("bridge", 1.1)])
+def test_rqt_robot_steering_drives_after_stop_was_clicked(
+    world: World, road: Road, pause: float
+) -> None:
+    steering = Steering(world, road)
+    steering.wait(5.0)
+    slide(steering, FAST, 1.0)
+    steering.stop()
+    steering.wait(pause)
+    drives(world, lambda: slide(steering, FAST, 1.0))
+    stop_and_clear(world, lambda: steering.wait(CLEAR_S))
+    stands(world, lambda: steering.wait(2.0))
+    steering.stop()
+    steering.wait(pause)
+    drives(world, lambda: slide(steering, FAST, 0.5))
+
+
+# ros2 topic pub
+
+
+def topic_pub(world: World, road: Road, name: str, linear: float, seconds: float) -> None:
+    """Run `ros2 topic pub -r 10` and end it by Ctrl-C: it sends the same until its end."""
+    Speaker(world, road, name).hold(linear, seconds, 10.0)
+
+
+@by_each_road
+def test_topic_pub_of_a_speed_never_drives_however_often_it_is_started(
+    world: World, road: Road
+) -> None:
+    for pause in (0.5, 2.0, 10.0):
+        name = f"before a pause of {pause} s"
+        stands(world, partial(topic_pub, world, road, name, FAST, 3.0))
+        world.run(pause)
+
+
+def test_topic_pub_of_a_zero_by_rmw_arms_nobody_else(world: World) -> None:
+    topic_pub(world, "rmw", "zero", 0.0, 2.0)
+    stands(world, lambda: topic_pub(world, "rmw", "speed", FAST, 3.0))
+
+
+def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World) -> None:
+    topic_pub(world, "bridge", "zero", 0.0, 0.1)
+    world.run(1.0)
+    drives(world, lambda: topic_pub(world, "bridge", "speed", FAST, 1.0))
+
+
+# drive.py
+
+
+@by_each_road
+def test_drive_py_drives_at_once_after_a_clear(world: World, road: Road) -> None:
+    """Its zeros are as long as its file says."""
+    text = (ROS2 / "drive.py").read_text()
+    (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
+    for number in range(2):
+        script = Speaker(world, road, f"drive {number}")
+        script.hold(0.0, float(zeros))
+        drives(world, partial(script.hold, FAST, 0.5))
+        script.hold(0.0, 0.1)
+        stop_and_clear(world, lambda: None)
+
+
+# Nav2
+
+Stamps = Literal["none", "kept", "continued"]
+
+
+class Nav2(Speaker):
+    """controller_server, velocity_smoother and collision_monitor at 20 Hz, by nav2_params.yaml.
+
+    The controller sends speeds while it has a goal, and one zero at its end. The smoother ramps to
+    the last speed that it received. After `TIMEOUT_S` without one it ramps to zero, publishes that
+    zero and falls silent. The monitor passes on what it receives, but zeros only for 2 s.
+    """
+
+    TIMEOUT_S, STEP, MONITOR_S = 0.25, 1.0 / 20.0, 2.0
+
+    def __init__(
+        self, world: World, road: Road, *, smoother: bool = True, stamps: Stamps = "none"
+    ) -> None:
+        super().__init__(world, road)
+        self._smoother, self._stamps = smoother, stamps
+        self._wanted: float | None = None
+        self._wanted_ns = self._stamp_ns = 0
+        self._last = 0.0
+        self._zeros_ns: int | None = None
+
+    def goal(self, linear: float, seconds: float) -> None:
+        """Follow a path for a while, without reaching the goal."""
+        for _ in range(round(seconds * 20.0)):
+            self._tick(linear)
+
+    def cancel(self) -> None:
+        """Cancel the goal, or let it abort: the controller sends one zero."""
+        self._tick(0.0)
+
+    def idle(self, seconds: float) -> None:
+        """Have no goal."""
+        for _ in range(round(seconds * 20.0)):
+            self._tick(None)
+
+    def _tick(self, command: float | None) -> None:
+        now_ns = self.world.now_ns
+        if command is not None:
+            self._wanted, self._wanted_ns = command, now_ns
+            self._stamp_ns = self.world.instant.wall_ns
+        if not self._smoother:
+            if command is not None:
+                self._monitor(command, self._stamp_ns)
+        elif self._wanted is not None:
+            self._smooth(now_ns - self._wanted_ns)
+        self.world.run(0.05)
+
+    def _smooth(self, since_ns: int) -> None:
+        assert self._wanted is not None
+        stamp_ns = self._stamp_ns + (since_ns if self._stamps == "continued" else 0)
+        if since_ns > self.TIMEOUT_S * NS_PER_S:
+            if self._last == 0.0:
+                return
+            self._wanted, self._stamp_ns = 0.0, self.world.instant.wall_ns
+        change = max(-self.STEP, min(self.STEP, self._wanted - self._last))
+        self._last = self._wanted if abs(change) < self.STEP else self._last + change
+        self._monitor(self._last, stamp_ns)
+
+    def _monitor(self, linear: float, stamp_ns: int) -> None:
+        now_ns = self.world.now_ns
+        if linear:
+            self._zeros_ns = None
+        elif self._zeros_ns is None:
+            self._zeros_ns = now_ns
+        elif now_ns - self._zeros_ns > self.MONITOR_S * NS_PER_S:
+            return
+        self.send(linear)
+        if self._stamps != "none":
+            twist = Twist(Vector3(linear), Vector3())
+            payload = encode(TwistStamped(Header(Time.from_ns(stamp_ns)), twist), "cdr")
+            arrivals = self.world.bus.arrivals
+            arrivals[-1] = msgspec.structs.replace(
+                arrivals[-1],
+                payload=payload,
+                encoding="application/cdr;geometry_msgs/msg/TwistStamped",
+            )
+
+
+@by_each_road
+@pytest.mark.parametrize("smoother", [True, False])
+@pytest.mark.parametrize("cancelled_at", [0.1, FAST])
+def test_nav2_drives_a_goal_that_was_cancelled_and_sent_again_a_good_second_later(
+    world: World, road: Road, smoother: bool, cancelled_at: float
+) -> None:
+    nav2 = Nav2(world, road, smoother=smoother)
+    stands(world, lambda: nav2.goal(FAST, 3.0))
+    nav2.cancel()
+    nav2.idle(2.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+    stop_and_clear(world, lambda: nav2.goal(FAST, CLEAR_S))
+    stands(world, lambda: nav2.goal(cancelled_at, 3.0))
+    nav2.cancel()
+    nav2.idle(cancelled_at + 1.1)
+    drives(world, lambda: nav2.goal(FAST, 0.5))
+    nav2.cancel()
+    nav2.idle(10.0)
+    drives(world, lambda: nav2.goal(FAST, 0.5))
+
+
+@pytest.mark.parametrize("smoother", [True, False])
+def test_nav2_by_rmw_drives_a_goal_that_was_sent_again_right_after_the_zero(
+    world: World, smoother: bool
+) -> None:
+    nav2 = Nav2(world, "rmw", smoother=smoother)
+    nav2.goal(FAST, 3.0)
+    nav2.cancel()
+    nav2.idle(0.5)
+    drives(world, lambda: nav2.goal(FAST, 0.5))
+
+
+@by_each_road
+def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
+    world: World, road: Road
+) -> None:
+    """Nav2 is silent while it has no goal, and its zeros from before the clear do not count."""
+    nav2 = Nav2(world, road)
+    nav2.goal(FAST, 3.0)
+    nav2.cancel()
+    nav2.idle(2.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+    nav2.cancel()
+    nav2.idle(3.0)
+    stop_and_clear(world, lambda: nav2.idle(CLEAR_S))
+    nav2.idle(10.0)
+    stands(world, lambda: nav2.goal(FAST, 3.0))
+
+
+@by_each_road
+def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
+    world: World, road: Road
+) -> None:
+    """The behavior tree retries a goal that made no progress for 10 s, after a wait of some s."""
+    nav2 = Nav2(world, road)
+    nav2.goal(FAST, 10.0)
+    nav2.cancel()
+    nav2.idle(5.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+
+
+@by_each_road
+@pytest.mark.parametrize(("stamps", "moves"), [("kept", True), ("continued", False)])
+def test_nav2_with_stamps_moves_again_only_if_its_last_zero_is_stamped_right(
+    world: World, road: Road, stamps: Stamps, moves: bool
+) -> None:
+    """The smoother of 2026 stamps the end of a ramp ahead of time, so stamps are off by default."""
+    nav2 = Nav2(world, road, stamps=stamps)
+    nav2.goal(FAST, 3.0)
+    nav2.cancel()
+    nav2.idle(2.0)
+    (drives if moves else stands)(world, lambda: nav2.goal(FAST, 1.0))
+    assert "enable_stamped_cmd_vel: true" not in (ROS2 / "nav2_params.yaml").read_text()
+
+
+# ros2_control
+
+
+class DiffDrive(Speaker):
+    """diff_drive_controller at 50 Hz, which never stops sending, and JointStateTopicSystem.
+
+    It ramps by its limits, and to zero when its own cmd_vel is silent for 0.25 s.
+    """
+
+    RADIUS, STEP, TIMEOUT_S = 0.05, 1.0 / 50.0, 0.25
+    _last, _heard_ns, _wanted = 0.0, 0, 0.0
+
+    def cycle(self, seconds: float, cmd_vel: float | None = None) -> None:
+        """Run for a while. Somebody sends `cmd_vel` at 50 Hz, or nobody does."""
+        for _ in range(round(seconds * 50.0)):
+            now_ns = self.world.now_ns
+            if cmd_vel is not None:
+                self._wanted, self._heard_ns = cmd_vel, now_ns
+            elif now_ns - self._heard_ns > self.TIMEOUT_S * NS_PER_S:
+                self._wanted = 0.0
+            change = max(-self.STEP, min(self.STEP, self._wanted - self._last))
+            self._last = self._wanted if abs(change) < self.STEP else self._last + change
+            self.send(self._last)
+            joints = list(self.world.config.joints.as_tuple())
+            stamp = Time.from_ns(self.world.instant.wall_ns)
+            message = JointState(Header(stamp), joints, [], [self._last / self.RADIUS] * 4, [])
+            arrivals = self.world.bus.arrivals
+            arrivals[-1] = msgspec.structs.replace(
+                arrivals[-1],
+                key="wheel_cmd/app",
+                payload=encode(message, "cdr"),
+                encoding="application/cdr;sensor_msgs/msg/JointState",
+            )
+            self.world.run(0.02)
+
+
+@pytest.mark.parametrize(("road", "silence"), [("rmw", 1.0), ("bridge", 2.0)])
+def test_ros2_control_drives_after_nobody_sent_cmd_vel_for_a_while(
+    world: World, road: Road, silence: float
+) -> None:
+    control = DiffDrive(world, road)
+    control.cycle(2.0)
+    drives(world, lambda: control.cycle(1.0, FAST))
+    stop_and_clear(world, lambda: control.cycle(CLEAR_S, FAST))
+    stands(world, lambda: control.cycle(2.0, FAST))
+    control.cycle(silence)
+    drives(world, lambda: control.cycle(0.5, FAST))
+
+
+@by_each_road
+def test_ros2_control_that_sends_zeros_through_a_clear_is_armed_by_them(
+    world: World, road: Road
+) -> None:
+    control = DiffDrive(world, road)
+    control.cycle(2.0)
+    stop_and_clear(world, lambda: control.cycle(CLEAR_S))
+    control.cycle(1.1)
+    drives(world, lambda: control.cycle(0.5, FAST))
+
+
+# Foxglove's Teleop panel, by `acsard foxglove --drive`
+
+
+class Panel(Speaker):
+    """The panel publishes a speed at 10 Hz while a button is held, and nothing when it is released.
+
+    `acsard foxglove` sends a zero of its own before the first speed after a silence of 0.3 s.
+    """
+
+    def __init__(self, world: World) -> None:
+        super().__init__(world, "signed")
+        self._server = Hand()
+
+    def button(self, linear: float, seconds: float) -> None:
+        """Hold a button."""
+        for _ in range(round(seconds * 10.0)):
+            self._server.take(Wish(BodyTwist(linear, 0.0)), self.world.now_ns)
+            self.release(0.1)
+
+    def release(self, seconds: float) -> None:
+        """Hold no button."""
+        for _ in range(round(seconds * 100.0)):
+            due_ns = self._server.due_ns()
+            if due_ns is not None and due_ns <= self.world.now_ns:
+                wish = self._server.send(self.world.now_ns)
+                if wish is not None:
+                    self.send(wish.twist.linear)
+            self.world.run(0.01)
+
+
+def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again(
+    world: World,
+) -> None:
+    panel = Panel(world)
+    drives(world, lambda: panel.button(FAST, 1.0))
+    stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
+    stands(world, lambda: panel.button(FAST, 2.0))
+    panel.release(0.4)
+    drives(world, lambda: panel.button(FAST, 0.5))

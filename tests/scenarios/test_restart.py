@@ -1,0 +1,384 @@
+"""The daemon ends in any way and starts again: a robot that stood latched stands latched.
+
+A commander keeps sending all the time: zeros for 0.3 s every 2 s, and a speed in between. So it
+arms itself after every start, and only the latch holds the robot.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.config.settings import Config, RecordConfig
+from acsard.incoming.commands import Arrival
+from acsard.messages.signature import public_name
+from acsard.record.directory import listed
+from acsard.record.file import Recording
+from acsard.record.recorder import Recorder
+from acsard.record.replayed import live
+from acsard.robot import Robot
+from acsard.runtime.control_loop import ControlLoop
+from acsard.runtime.kept_latches import LatchFileError, decode, encode, stopped, unreadable
+from acsard.values import NS_PER_S, Event, Inputs, Instant, Latch, Latches, Outputs
+from tests.scenarios.speakers import Speaker, moved
+from tests.scenarios.test_diagnostics import row
+from tests.scenarios.world import SIGNED, START, World
+
+Kind = Literal["stop", "fault", "inactive"]
+KINDS: tuple[Kind, ...] = ("stop", "fault", "inactive")
+
+MODES = {"stop": "stopped", "fault": "fault", "inactive": "inactive"}
+
+ZEROS_S, CYCLE_S = 0.3, 2.0
+
+
+class MemoryFile:
+    """The latch file without a disk: it has the newest latches at once, as after the rename."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.trouble = ""
+        self.told: list[Event] = []
+        self.slow = False
+        """True while the disk has not taken the latches that were handed over last."""
+        self.hangs = False
+        """True if waiting for the disk does not help."""
+        self.waited: list[float] = []
+
+    def keep(self, latches: Latches) -> None:
+        self.data = encode("acsar", latches)
+
+    def holds(self, latches: Latches) -> bool:
+        return not self.slow
+
+    def wait(self, latches: Latches, seconds: float) -> None:
+        self.waited.append(seconds)
+        self.slow = self.slow and self.hangs
+
+    def news(self) -> list[Event]:
+        return [self.told.pop() for _ in range(len(self.told))]
+
+    def read(self, now: Instant) -> Latches:
+        """Return the latches that the next start finds here."""
+        try:
+            return decode("acsar", self.data)
+        except LatchFileError as error:
+            return stopped(Latches(), unreadable("FILE", str(error)), now)
+
+
+class Host:
+    """A computer with a daemon, a board that nobody switches off, and one stop-and-go commander."""
+
+    def __init__(self, dice: random.Random) -> None:
+        self.file, self.dice = MemoryFile(), dice
+        self.file.keep(Latches())
+        self.world = self._started(Latches())
+        self._speaker()
+
+    def _started(self, latches: Latches) -> World:
+        return World(Config(), latches=latches, keeper=self.file)
+
+    def _speaker(self) -> None:
+        self.patrol = Speaker(self.world, "signed", "patrol")
+        self._phase = self.dice.uniform(0.0, CYCLE_S)
+
+    def restart(self) -> None:
+        """End the process by a kill and start it with the latches in the file."""
+        end = self.world
+        pause_ns = self.dice.randrange(int(0.2 * NS_PER_S), 3 * NS_PER_S)
+        latches = self.file.read(Instant(end.now_ns + pause_ns, end.instant.wall_ns + pause_ns))
+        self.world = self._started(latches)
+        self.world.wall_offset_ns += end.now_ns + pause_ns
+        self._speaker()
+
+    def patrols(self, seconds: float) -> None:
+        """Let the commander send at 20 Hz for this time."""
+        for _ in range(round(seconds * 20)):
+            self._phase = (self._phase + 0.05) % CYCLE_S
+            self.patrol.send(0.0 if self._phase < ZEROS_S else 0.5)
+            self.world.run(0.05)
+
+    def latch(self, kind: Kind) -> None:
+        """Stop the robot, let it fault, or switch it off."""
+        match kind:
+            case "stop":
+                assert self.world.call("stop").success
+            case "inactive":
+                assert self.world.call("deactivate").success
+            case "fault":
+                with self.world.mcu.dead_motor(self.dice.randrange(4)):
+                    self.patrols(2 * CYCLE_S)
+        assert self.world.state.mode == MODES[kind]
+
+    def release(self, kind: Kind) -> None:
+        """Release the latch by its own call."""
+        answer = self.world.call("activate" if kind == "inactive" else "clear")
+        assert answer.success, answer.message
+
+
+def stands_until_released(host: Host, kind: Kind, spoil: Callable[[bytes], bytes]) -> None:
+    """Latch, end, start and release; the robot moves before and after, and never in between."""
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "driving"
+    host.latch(kind)
+    whole = host.file.data
+    host.file.data = spoil(whole)
+    host.restart()
+    start_ns = host.world.now_ns
+    host.patrols(2.5 * CYCLE_S)
+    assert not moved(host.world, start_ns)
+    state = host.world.state
+    if host.file.data == whole or spoil is not cut:
+        assert state.mode == MODES[kind]
+        assert "before the restart" in state.reason
+        released: Kind = kind
+    else:
+        assert state.mode == "stopped"
+        assert "a stop may have been lost" in state.reason
+        released = "stop"
+    host.release(released)
+    host.patrols(2 * CYCLE_S)
+    assert moved(host.world, start_ns), host.world.state.reason
+    host.restart()
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "driving", "it is released once and for all"
+
+
+def whole(data: bytes) -> bytes:
+    return data
+
+
+def cut(data: bytes) -> bytes:
+    """Cut the content as a power cut may."""
+    return data[: random.Random(len(data)).randrange(len(data) - 1)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_latched_robot_stands_after_a_restart_until_it_is_released(kind: Kind) -> None:
+    stands_until_released(Host(random.Random(1)), kind, whole)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_robot_whose_latch_file_is_cut_stands_until_it_is_cleared(kind: Kind) -> None:
+    stands_until_released(Host(random.Random(2)), kind, cut)
+
+
+@pytest.mark.parametrize(
+    "count", [pytest.param(10, id="10"), pytest.param(200, id="200", marks=pytest.mark.soak)]
+)
+@pytest.mark.timeout(1200)
+def test_no_restart_moves_a_latched_robot(count: int) -> None:
+    dice = random.Random(27)
+    for _ in range(count):
+        stands_until_released(Host(dice), dice.choice(KINDS), dice.choice((whole, cut)))
+
+
+def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
+    host = Host(random.Random(10))
+    host.world.run(1.5)
+    assert host.world.state.latch_file == ""
+    assert row(host.world, "latch file").level == 0
+    host.file.trouble = "a stop cannot be kept over a restart: FILE: No space left on device"
+    host.world.run(1.5)
+    assert host.world.state.latch_file == host.file.trouble
+    assert row(host.world, "latch file").level == 1
+    assert row(host.world, "latch file").message == host.file.trouble
+
+
+def test_an_event_of_the_latch_file_reaches_the_log() -> None:
+    host = Host(random.Random(11))
+    event = Event("latch_file", "a stop cannot be kept over a restart: FILE: full", "warning")
+    host.file.told.append(event)
+    host.world.run(0.1)
+    assert event in host.world.events
+
+
+def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None:
+    host = Host(random.Random(3))
+    host.patrols(2 * CYCLE_S)
+    host.latch("fault")
+    assert host.world.call("stop").success
+    host.restart()
+    host.patrols(CYCLE_S)
+    assert host.world.state.mode == "fault"
+    host.release("fault")
+    assert host.world.state.mode == "stopped"
+    host.restart()
+    host.patrols(CYCLE_S)
+    assert host.world.state.mode == "stopped"
+    host.release("stop")
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "driving"
+
+
+def test_a_limit_that_was_lowered_stays_lowered_until_it_is_raised() -> None:
+    host = Host(random.Random(4))
+    for speed in (0.2, 1.0):
+        payload = msgspec.json.encode({"settings": {"limits.linear_speed": speed}})
+        assert host.world.call("set", payload).success
+        host.restart()
+        applied: list[float] = []
+        host.world.watch = lambda outputs: applied.append(outputs.applied.linear)  # noqa: B023
+        host.patrols(2 * CYCLE_S)
+        assert max(applied) == min(speed, 0.5)
+
+
+def test_a_stop_is_obeyed_at_once_and_answered_when_the_file_has_it() -> None:
+    host = Host(random.Random(8))
+    host.world.run(0.5)
+    host.file.slow = True
+    assert not host.world.ask("srv/stop")
+    assert host.world.state.mode == "stopped"
+    host.file.slow = False
+    host.world.run(0.02)
+    (replies,) = host.world.bus.replies.values()
+    assert len(replies) == 1
+
+
+def test_a_stop_is_answered_within_a_fifth_of_a_second_however_slow_the_disk_is() -> None:
+    host = Host(random.Random(9))
+    host.world.run(0.5)
+    host.file.slow = True
+    assert not host.world.ask("srv/stop")
+    host.world.run(0.2)
+    (replies,) = host.world.bus.replies.values()
+    assert len(replies) == 1
+
+
+def test_a_stream_of_stops_withholds_no_other_answer() -> None:
+    host = Host(random.Random(12))
+    host.world.run(0.5)
+    host.file.slow = True
+    assert not host.world.ask("srv/reset_odometry")
+    for _ in range(25):
+        host.world.put("stop", b"")
+        host.world.run(0.01)
+    (replies,) = host.world.bus.replies.values()
+    assert len(replies) == 1
+
+
+def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
+    host = Host(random.Random(13))
+    host.world.run(0.5)
+    host.file.slow = True
+    host.file.trouble = "a stop cannot be kept over a restart: FILE: No space left on device"
+    assert not host.world.ask("srv/stop")
+    host.world.run(0.25)
+    ((reply,),) = host.world.bus.replies.values()
+    assert host.file.trouble in reply.payload.decode()
+    host.file.slow = False
+    assert "cannot be kept" not in host.world.call("stop").message
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_the_last_answers_wait_for_the_file_but_not_for_ever(hangs: bool) -> None:
+    host = Host(random.Random(14))
+    host.world.run(0.5)
+    host.file.slow, host.file.hangs = True, hangs
+    assert not host.world.ask("srv/stop")
+    host.world.loop.finish(host.world.instant)
+    assert host.file.waited == [0.2]
+    (replies,) = host.world.bus.replies.values()
+    assert len(replies) == 1
+
+
+def test_a_stop_while_the_bus_closes_is_there_at_the_next_start() -> None:
+    host = Host(random.Random(15))
+    host.world.loop.finish(host.world.instant)
+    host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
+    host.world.loop.keep_last_stops(host.world.instant)
+    host.restart()
+    host.patrols(CYCLE_S)
+    assert host.world.state.mode == "stopped"
+
+
+@pytest.mark.parametrize("by", ["put", "call"])
+@pytest.mark.parametrize("where", ["_note", "_publish"])
+def test_a_stop_beside_a_bug_outside_of_the_robot_is_there_at_the_next_start(
+    monkeypatch: pytest.MonkeyPatch, where: str, by: str
+) -> None:
+    host = Host(random.Random(16))
+    host.patrols(2 * CYCLE_S)
+
+    def broken(*words: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ControlLoop, where, broken)
+        with pytest.raises(ZeroDivisionError):
+            host.world.put("stop", b"") if by == "put" else host.world.ask("srv/stop")
+    host.restart()
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "stopped"
+    assert "stopped by unnamed (native)" in host.world.state.reason
+
+
+def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
+    host = Host(random.Random(5))
+    host.patrols(2 * CYCLE_S)
+    host.world.loop.leaving = True
+    host.patrols(0.1)
+    host.world.put("stop", b"")
+    assert host.world.state.mode == "leaving"
+    host.restart()
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "stopped"
+
+
+def test_a_stop_after_the_last_step_is_there_at_the_next_start() -> None:
+    host = Host(random.Random(6))
+    host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
+    host.world.loop.finish(host.world.instant)
+    host.restart()
+    host.patrols(CYCLE_S)
+    assert host.world.state.mode == "stopped"
+
+
+@pytest.mark.parametrize("obeyed", [False, True])
+def test_a_stop_in_the_step_that_a_bug_ends_is_there_at_the_next_start(
+    monkeypatch: pytest.MonkeyPatch, obeyed: bool
+) -> None:
+    host = Host(random.Random(7))
+    host.patrols(2 * CYCLE_S)
+    usual = Robot.step
+
+    def broken(robot: Robot, inputs: Inputs) -> Outputs:
+        if obeyed:
+            usual(robot, inputs)
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Robot, "step", broken)
+        with pytest.raises(ZeroDivisionError):
+            host.world.put("stop", b"", attachment=SIGNED)
+    host.restart()
+    host.patrols(2 * CYCLE_S)
+    assert host.world.state.mode == "stopped"
+    assert f"stopped by {public_name('somebody')}" in host.world.state.reason
+
+
+def test_a_drive_that_begins_stopped_is_replayed_to_the_last_bit(tmp_path: Path) -> None:
+    latches = Latches(stop=Latch(7, START.wall_ns, "joe", "stopped by joe", kept=True))
+    config = replace(Config(), record=RecordConfig(str(tmp_path)))
+    recorder = Recorder(config, lambda event: None)
+    world = World(config, recorder=recorder, latches=latches)
+    patrol = Speaker(world, "signed", "patrol")
+    patrol.hold(0.0, 1.0)
+    patrol.hold(0.5, 1.0)
+    assert world.call("clear").success
+    patrol.hold(0.0, 1.0)
+    patrol.hold(0.5, 1.0)
+    assert world.state.mode == "driving"
+    recorder.close()
+    (path,) = listed(tmp_path)
+    lived = live(Recording(path))
+    assert lived.trouble == ""
+    assert lived.tally.same
+    assert lived.tally.exact
+    assert lived.tally.steps == world.steps

@@ -1,0 +1,174 @@
+"""Over TLS an operator cannot drive as another sender by any attachment that it knows."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from acsard.client import Client, connect
+from acsard.values import NS_PER_S
+from tests.system.browser import Page, hands, run
+from tests.system.harness import Bus, Daemon, free_endpoint, twist, until
+from tests.system.identities import Certificates, free_tls_endpoint
+
+pytestmark = pytest.mark.network
+
+AHEAD_NS = NS_PER_S // 50
+ATTACK_S = 1.5
+
+
+class Robot:
+    """A daemon at a plain and a TLS endpoint."""
+
+    def __init__(self, where: Path) -> None:
+        self.certificates = Certificates(where)
+        self.plain, self.tls = free_endpoint(), free_tls_endpoint()
+        bus: dict[str, object] = {
+            "listen": [self.plain, self.tls],
+            "tls": str(self.certificates.robot),
+        }
+        tables: dict[str, dict[str, object]] = {"bus": bus, "rates": {"state": 100.0}}
+        self.daemon = Daemon(where, config=tables, endpoint=self.plain)
+
+    @contextmanager
+    def operator(self) -> Iterator[zenoh.Session]:
+        """A plain Zenoh session that shows the operator's certificate."""
+        shown = self.certificates.shown(self.tls, self.certificates.own("operator"))
+        with zenoh.open(shown) as session:
+            until(
+                lambda: list(session.get("acsard/acsar/info", timeout=1.0)), 10.0, "the TLS gateway"
+            )
+            yield session
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    robot = Robot(tmp_path_factory.mktemp("identity"))
+    with robot.daemon, Bus(robot.plain) as bus:
+        bus.linked()
+        yield robot
+
+
+@contextmanager
+def driving(client: Client, seconds: float) -> Iterator[None]:
+    """The client drives straight on at 0.2 m/s in a thread of its own."""
+    failed: list[BaseException] = []
+
+    def drive() -> None:
+        try:
+            client.drive(0.2, seconds=seconds)
+        except BaseException as error:  # noqa: BLE001 - raised again in the test's thread
+            failed.append(error)
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()
+    if failed:
+        raise failed[0]
+
+
+def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
+    """Turn the robot by commands that claim to be `sender`'s and the newest of all."""
+    end_s, sequence = time.monotonic() + ATTACK_S, 1_000_000
+    while time.monotonic() < end_s:
+        sequence += 1
+        signature = {"sender": sender, "stamp": time.time_ns() + AHEAD_NS, "sequence": sequence}
+        for key in keys:
+            payload = json.dumps(twist(0.0, 1.0))
+            session.put(key, payload, attachment=msgspec.json.encode(signature))
+        time.sleep(0.02)
+
+
+def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
+    """The states while an operator attacks the victim with this sender, else the published one."""
+    keys = tuple(f"acsard/acsar/cmd/teleop{end}" for end in ("", "/operator", "/maintainer"))
+    with (
+        Bus(robot.plain) as bus,
+        robot.operator() as session,
+        bus.follow("state") as states,
+        driving(victim, ATTACK_S + 3.0),
+    ):
+        until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "the victim drives")
+        begun = len(states.seen)
+        attack(session, keys, sender or bus.state()["sender"])
+        return [seen.value for seen in states.seen[begun:]]
+
+
+def test_the_published_sender_does_not_take_the_robot_from_another_program(robot: Robot) -> None:
+    with connect(robot.plain, source="teleop") as victim:
+        states = attacked(robot, victim)
+    assert len(states) > 20
+    turned = [state for state in states if abs(state["angular"] or 0.0) > 0.05]
+    assert not turned, f"turned in {len(turned)} of {len(states)} states"
+    assert {state["sender"] for state in states if state["mode"] == "driving"} == {victim.sender}
+
+
+def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Robot) -> None:
+    with connect(robot.plain, source="teleop") as victim, Bus(robot.plain) as bus:
+        refused = bus.count("command_other_certificate")
+        states = attacked(robot, victim, victim._sender_id)
+        assert bus.count("command_other_certificate") > refused
+        assert (
+            "its sender id was first seen under the robot's own machine" in bus.state()["refused"]
+        )
+    assert not [state for state in states if abs(state["angular"] or 0.0) > 0.05]
+    assert {state["sender"] for state in states if state["mode"] == "driving"} == {victim.sender}
+    events = robot.daemon.events("command_refused")
+    assert any(event["by"] == f"{victim.sender} [operator]" for event in events)
+
+
+def test_the_sender_of_a_client_by_tls_has_the_name_of_its_certificate(robot: Robot) -> None:
+    tls = str(robot.certificates.own("operator"))
+    with connect(robot.tls, tls=tls) as client, Bus(robot.plain) as bus:
+        with bus.follow("state") as states:
+            client.drive(0.2, seconds=0.5)
+        senders = {one.value["sender"] for one in states.seen if (one.value["linear"] or 0.0) > 0.1}
+    assert senders == {client.sender}
+    assert client.sender.endswith(" [operator]")
+
+
+def test_a_page_whose_server_comes_by_tls_drives_under_the_name_of_its_certificate(
+    robot: Robot, tmp_path: Path
+) -> None:
+    async def story() -> None:
+        async with hands(page) as ours:
+            hello = await ours.find(
+                lambda said: said.get("hello", {}).get("sender", "").endswith(" [operator]")
+            )
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.2)
+            state = await ours.state(lambda state: (state["linear"] or 0.0) > 0.1)
+            assert state["sender"] == hello["hello"]["sender"]
+
+    by_tls = ["--connect", robot.tls, "--tls", str(robot.certificates.own("operator"))]
+    with Page(robot.daemon, tmp_path, *by_tls) as page, Bus(robot.plain) as bus:
+        run(story)
+        bus.at_rest()
+
+
+def test_a_certificate_commands_on_no_key_but_its_own(robot: Robot) -> None:
+    def commands(bus: Bus) -> int:
+        counters = bus.state()["counters"]
+        return sum(n for name, n in counters.items() if name.startswith("command"))
+
+    with robot.operator() as session, Bus(robot.plain) as bus:
+        before = commands(bus)
+        for certificate in ("", "/maintainer", "/viewer", "/*", "/operator/more", "/operato$*"):
+            for kind, payload in (("cmd", twist(0.1)), ("wheel_cmd", {})):
+                session.put(f"acsard/acsar/{kind}/app{certificate}", json.dumps(payload))
+        assert list(session.get("acsard/acsar/info", timeout=5.0))
+        assert commands(bus) == before
+        session.put("acsard/acsar/cmd/app/operator", json.dumps(twist(0.0)))
+        until(lambda: commands(bus) > before, 5.0, "the command on its own key")

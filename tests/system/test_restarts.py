@@ -1,0 +1,266 @@
+"""A real daemon ends in every way and starts again under a commander that never stops sending.
+
+The commander sends zeros for 0.3 s every 2 s and a speed in between, so it arms itself after every
+start: only the latch holds the robot. The ways that need systemd are in `tests/systemd`.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import pytest
+
+from tests.system.harness import (
+    PLAIN,
+    ROOT,
+    ZERO_LINE,
+    Bus,
+    Daemon,
+    Peer,
+    Program,
+    acsard,
+    environment,
+    finish,
+    free_endpoint,
+    until,
+    write_config,
+)
+from tests.system.strangers import STOP_AND_GO, words
+
+Kind = Literal["stop", "fault", "inactive"]
+Way = Literal["kill", "crash", "abort", "term"]
+
+MODES = {"stop": "stopped", "fault": "fault", "inactive": "inactive"}
+
+CYCLE_S = 2.0
+"""Time in which the commander sends its zeros once and then a speed."""
+
+CRASH = """\
+import os, signal
+from acsard.robot import Robot
+whole, crashes = Robot.step, []
+signal.signal(signal.SIGUSR2, lambda *_: crashes.append(1))
+def step(robot, inputs):
+    outputs = whole(robot, inputs)
+    if crashes:
+        raise ZeroDivisionError("a bug")
+    return outputs
+Robot.step = step
+"""
+"""Put into the daemon: SIGUSR2 makes the next control step raise an exception."""
+
+SIGNALS = {
+    "kill": signal.SIGKILL,
+    "crash": signal.SIGUSR2,
+    "abort": signal.SIGABRT,
+    "term": signal.SIGTERM,
+}
+
+
+class Robot(NamedTuple):
+    """A board, a commander and where the daemon is to be started."""
+
+    where: Path
+    peer: Peer
+    endpoint: str
+    env: dict[str, str]
+
+    def daemon(self) -> Daemon:
+        return Daemon(self.where, self.peer.path, endpoint=self.endpoint, env=self.env)
+
+    @property
+    def file(self) -> Path:
+        return self.where / "daemon.states" / "acsar.latches.json"
+
+    def moved(self, since: float) -> bool:
+        """Whether a line since then turns a wheel."""
+        lines = (heard for session in self.peer.sessions for heard in list(session.lines))
+        return any(heard.at > since and heard.line.strip(b"\r\n") not in STILL for heard in lines)
+
+
+STILL = (ZERO_LINE.strip(b"\r\n"), b"")
+
+
+@pytest.fixture
+def robot(tmp_path: Path, peer: Peer) -> Iterator[Robot]:
+    """A board and a stop-and-go commander that outlive every daemon."""
+    (bug := tmp_path / "bug").mkdir()
+    (bug / "sitecustomize.py").write_text(CRASH)
+    endpoint = free_endpoint()
+    with Program(words(STOP_AND_GO, endpoint), tmp_path):
+        yield Robot(tmp_path, peer, endpoint, environment(PYTHONPATH=f"{bug}:{ROOT}"))
+
+
+def drives(robot: Robot, bus: Bus) -> None:
+    """Wait until the commander drives the robot: nothing but a latch could hold it."""
+    since = time.monotonic()
+    until(lambda: robot.moved(since), 2 * CYCLE_S, "the commander drives")
+
+
+def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
+    match kind:
+        case "stop":
+            assert bus.get("srv/stop")["success"]
+        case "inactive":
+            assert bus.get("srv/deactivate")["success"]
+        case "fault":
+            robot.peer.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+            until(lambda: bus.state()["mode"] == "fault", 5.0, "a fault")
+            robot.peer.reply = PLAIN
+
+
+def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
+    """The state after the commander had every chance to drive."""
+    bus.linked()
+    linked = time.monotonic()
+    until(lambda: time.monotonic() > linked + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
+    assert not robot.moved(since)
+    state = bus.state()
+    assert state["mode"] == mode, state
+    return state
+
+
+def release(bus: Bus, kind: Kind) -> None:
+    """Release the latch; the same call once more has nothing to release."""
+    if kind == "inactive":
+        assert bus.get("srv/activate")["success"]
+        return
+    number = bus.state()["latch"]
+    assert bus.get("srv/clear", {"latch": number})["success"]
+    assert "nothing to clear" in bus.get("srv/clear")["message"]
+
+
+def restarted(robot: Robot, kind: Kind, way: Way, spoil: Callable[[Path], None]) -> None:
+    """One latch, one end, one start, one release."""
+    with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
+        bus.linked()
+        drives(robot, bus)
+        latch(robot, bus, kind)
+        daemon.signal(SIGNALS[way])
+        assert (daemon.ended(5.0) == 0) is (way == "term")
+    spoil(robot.file)
+    started = time.monotonic()
+    with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
+        spoiled = spoil is not whole
+        state = stands(robot, bus, "stopped" if spoiled else MODES[kind], started)
+        words = "may have been lost" if spoiled else "before the restart"
+        assert words in state["reason"]
+        release(bus, "stop" if spoiled else kind)
+        drives(robot, bus)
+        daemon.signal(SIGNALS[way])
+        daemon.ended(5.0)
+    with robot.daemon(), Bus(robot.endpoint) as bus:
+        bus.linked()
+        drives(robot, bus)
+
+
+def whole(file: Path) -> None: ...
+
+
+def cut(file: Path) -> None:
+    """Cut the file anywhere, as a power cut may."""
+    data = file.read_bytes()
+    file.write_bytes(data[: random.randrange(len(data) - 1)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "way", "spoil"),
+    [
+        ("stop", "kill", whole),
+        ("fault", "crash", whole),
+        ("inactive", "abort", whole),
+        pytest.param("stop", "term", whole, marks=pytest.mark.slow),
+        pytest.param("stop", "kill", cut, marks=pytest.mark.slow),
+    ],
+)
+def test_a_latched_robot_stands_after_the_restart_until_it_is_released(
+    robot: Robot, kind: Kind, way: Way, spoil: Callable[[Path], None]
+) -> None:
+    restarted(robot, kind, way, spoil)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_no_end_of_the_process_moves_a_latched_robot(robot: Robot) -> None:
+    ways: tuple[Way, ...] = ("kill", "crash", "abort", "term")
+    kinds: tuple[Kind, ...] = ("stop", "fault", "inactive")
+    done = 0
+    for _ in range(5):
+        for kind in kinds:
+            for way in ways:
+                restarted(robot, kind, way, random.choice((whole, whole, cut)))
+                done += 1
+    print(f"{done} ends of the process, 0 moved the robot")
+
+
+def kills_after_a_stop(robot: Robot, times: int, longest_s: float) -> list[float]:
+    """Kill the daemon soon after a stop was answered; return the delays, s, that lost the stop."""
+    lost = []
+    for _ in range(times):
+        delay = random.uniform(0.0, longest_s)
+        with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
+            state = bus.state()
+            if state["mode"] == "stopped":
+                bus.get("srv/clear", {"latch": state["latch"]})
+            assert bus.get("srv/stop")["success"]
+            answered = time.monotonic()
+            while time.monotonic() < answered + delay:
+                pass
+            daemon.signal(signal.SIGKILL)
+            daemon.ended(5.0)
+        if json.loads(robot.file.read_text())["latches"]["stop"] is None:
+            lost.append(delay)
+    return lost
+
+
+@pytest.mark.parametrize("times", [5, pytest.param(200, marks=pytest.mark.soak)])
+@pytest.mark.timeout(1200)
+def test_a_stop_that_was_answered_survives_a_kill_at_any_moment(robot: Robot, times: int) -> None:
+    lost = kills_after_a_stop(robot, times, 0.05)
+    print(f"{len(lost)} of {times} stops lost, at ms after the answer: {[1e3 * s for s in lost]}")
+    assert not lost
+
+
+def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_so(
+    tmp_path: Path, peer: Peer
+) -> None:
+    config = {"control": {"state_directory": "/sys/acsard"}}
+    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        state = bus.state()
+        assert state["mode"] == "stopped"
+        assert "a stop cannot be kept over a restart: /sys/acsard/" in state["reason"]
+        assert state["latch_file"].startswith("a stop cannot be kept")
+        until(lambda: daemon.events("latch_file"), 5.0, "the log says so")
+        release(bus, "stop")
+        bus.comes_to("ready")
+
+
+def test_a_second_daemon_of_the_same_robot_on_another_bus_ends_with_75(
+    tmp_path: Path, peer: Peer
+) -> None:
+    with Daemon(tmp_path, peer.path) as daemon, Peer(tmp_path / "other") as other:
+        tables: dict[str, dict[str, object]] = {
+            "mcu": {"port": str(other.path)},
+            "bus": {"listen": [free_endpoint()]},
+            "control": {"state_directory": str(daemon.states)},
+        }
+        path = write_config(tmp_path / "second.toml", tables)
+        second = finish(acsard("run", "--config", str(path)), tmp_path)
+    assert second.code == 75
+    assert "another daemon keeps the stop of robot acsar" in second.err
+
+
+def test_the_built_in_simulator_keeps_nothing(tmp_path: Path) -> None:
+    states = {"control": {"state_directory": str(tmp_path / "states")}}
+    with Daemon(tmp_path, config=states) as daemon, Bus(daemon.endpoint) as bus:
+        assert bus.get("srv/stop")["success"]
+    with Daemon(tmp_path, config=states) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["mode"] == "ready", 5.0, "ready")
+    assert not (tmp_path / "states").exists()
