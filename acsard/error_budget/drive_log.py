@@ -1,5 +1,4 @@
-"""A drive reconstructed from feedback lines, with its measured errors: the input of the error
-budget."""
+"""A drive and its measured errors, reconstructed from feedback lines for the error budget."""
 
 from __future__ import annotations
 
@@ -61,8 +60,10 @@ class Stood(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """Motion between consecutive lines and its errors. The arrays have one entry per line but the
-    first."""
+    """Motion between consecutive lines and its errors.
+
+    The arrays have one entry per line but the first.
+    """
 
     seconds: float
     """Duration of the drive, s."""

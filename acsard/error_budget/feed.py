@@ -72,8 +72,10 @@ class Feed:
         )
 
     def _join(self, stamp_ns: int) -> None:
-        """Combine the two messages of a line, matched by stamp. Messages with the same stamp pair
-        in order."""
+        """Combine the two messages of a line, matched by stamp.
+
+        Messages with the same stamp pair in order.
+        """
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
@@ -108,8 +110,11 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return the gyro's track relative to the configured one, its relative deviation, and its
-    use."""
+    """Return the track implied by the gyro, its deviation, and whether it is used.
+
+    The track is relative to the configured one, and its standard deviation is relative to itself.
+    The track is None if unknown.
+    """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

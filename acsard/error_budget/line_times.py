@@ -32,8 +32,11 @@ within this relative tolerance."""
 
 
 class Places(Struct, frozen=True):
-    """Estimate for each line: `late` is its delay in s relative to the median, `missing` the lines
-    before it."""
+    """Estimates for each line.
+
+    `late` is its delay in s relative to the median, and `missing` the number of lines missing
+    before it.
+    """
 
     late: Floats
     missing: Counts
@@ -72,8 +75,7 @@ def _even(t: Floats) -> Places:
 
 
 def _asked(t: Floats, sent: Floats) -> Places | None:
-    """Estimate the delays of lines that answer the host's lines; None if those lines are not
-    known."""
+    """Estimate the delays of lines that answer the host's lines; None if those are unknown."""
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
     at = np.interp(t, sent, np.arange(len(sent)))
@@ -88,8 +90,10 @@ def _asked(t: Floats, sent: Floats) -> Places | None:
 
 
 def _missing(at: Floats) -> Counts:
-    """Return the missing lines before each line; `at` is the place on the grid that its stamp
-    suggests."""
+    """Return the number of missing lines before each line.
+
+    `at` is the place on the grid that each line's stamp suggests.
+    """
     count = len(at)
     ahead = at - np.arange(count)
     padded = np.concatenate([ahead, np.full(AHEAD, np.inf)])

@@ -64,8 +64,10 @@ class Driving:
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> list[Step]:
-        """Return the steps with the errors of late lines. Correlated errors are summed before they
-        are squared."""
+        """Return the steps with the errors of late lines.
+
+        Correlated errors are summed before they are squared.
+        """
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
         squares = np.zeros_like(late)
@@ -79,8 +81,10 @@ class Driving:
         return [] if seen else self._steps(moved.bridged, moved.stood)
 
     def rounded(self) -> list[Step]:
-        """Return the steps with the rounding errors of lines. An encoder's own resolution is not
-        included."""
+        """Return the steps with the rounding errors of lines.
+
+        An encoder's own resolution is not included.
+        """
         found = self._rounding
         if found.count:
             return self._steps(stood=_biased(found.offset[1:] @ self._weights.T))

@@ -51,8 +51,7 @@ def text(budget: Budget) -> str:
 
 
 def advice(budget: Budget) -> str:
-    """Return one sentence of advice on the largest measured share, and on a declared one that is
-    larger."""
+    """Return advice on the largest measured share, and on a declared one that is larger."""
     if budget.still:
         return "drive it, also around curves, while this looks: most causes show only then"
     seen, all_ = budget.largest("measured"), budget.largest("measured", "settings")

@@ -11,8 +11,10 @@ DEFAULT = "127.0.0.1:8765"
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return host and port. Raises `UsageError` for a malformed address and for one that other
-    machines can reach."""
+    """Return host and port.
+
+    Raises `UsageError` for a malformed address and for one that other machines can reach.
+    """
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

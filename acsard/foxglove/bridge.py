@@ -157,8 +157,7 @@ class Bridge:
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Report to each viewer why its commands do not drive, once, and withdraw the report
-        afterwards."""
+        """Report to each viewer once why its commands do not drive. Withdraw the report later."""
         now_ns = clock.mono_ns()
         if driving and now_ns - self._state_ns > ASK_NS:
             self._state_ns = now_ns

@@ -52,7 +52,9 @@ class Reader:
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """Return the twist of a command that arrived at `wall_ns` (wall clock). Raises
-        `DecodeError`."""
+        """Return the twist of a command that arrived at `wall_ns` (wall clock).
+
+        Raises `DecodeError`.
+        """
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)

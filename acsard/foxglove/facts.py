@@ -1,5 +1,4 @@
-"""The facts of a robot that the bridge reads at the start and again after a restart of the
-daemon."""
+"""Facts of a robot, read at the start and again after each restart of its daemon."""
 
 from __future__ import annotations
 
@@ -21,8 +20,10 @@ DEAF = (
 
 
 class Facts(Struct, frozen=True):
-    """The configuration, sources and permissions. `config` holds defaults if we may not read the
-    robot's."""
+    """The configuration, sources and permissions.
+
+    `config` holds defaults if we may not read the robot's.
+    """
 
     config: Config
     tables: object
@@ -48,8 +49,10 @@ def key_of(row: Channel, source: str) -> str:
 
 
 def learn(robot: Client, tls: str) -> Facts:
-    """Query the robot. Raises the errors of `Client.get`, and `ReplyError` if its version
-    differs."""
+    """Query the robot.
+
+    Raises the errors of `Client.get`, and `ReplyError` if its version differs.
+    """
     forbidden, role, deaf = "", "maintainer", ""
     if tls:
         deaf = DEAF

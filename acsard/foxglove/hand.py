@@ -110,8 +110,10 @@ class Hand:
         return self._zero(now_ns)
 
     def _zero(self, now_ns: int) -> Wish:
-        """Return a zero stamped by the viewer's clock. A stamp of another clock would look like a
-        clock change."""
+        """Return a zero stamped by the viewer's clock.
+
+        A stamp of another clock would look like a clock change.
+        """
         if self._stamp_ns is None:
             return Wish(REST)
         return Wish(REST, self._stamp_ns + now_ns - self._came_ns)
@@ -121,6 +123,5 @@ class Hand:
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS
 
     def is_slow(self) -> bool:
-        """Return whether the robot stops between the viewer's messages, because they come too
-        seldom."""
+        """Return whether the messages come so seldom that the robot stops in between."""
         return self._slow >= SLOW_TIMES

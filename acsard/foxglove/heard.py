@@ -1,5 +1,4 @@
-"""Subscriptions to the commands of the sources that viewers look at, on every key of each
-source."""
+"""Subscriptions to the commands of the shown sources, on every key of each source."""
 
 from __future__ import annotations
 
@@ -24,8 +23,10 @@ oldest are dropped."""
 
 
 class Commanders:
-    """The commands of all sources, by topic. One thread uses this class; Zenoh's threads call
-    `wake`."""
+    """The commands of all sources, by topic.
+
+    One thread uses this class; Zenoh's threads call `wake`.
+    """
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:
         self._robot, self._wake = robot, wake
@@ -56,8 +57,10 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """Yield each received command with its topic. A command that cannot be decoded is
-        skipped."""
+        """Yield each received command with its topic.
+
+        A command that cannot be decoded is skipped.
+        """
         for topic, heard in self._heard.items():
             for arrival, wall_ns in heard.take():
                 try:
@@ -67,8 +70,10 @@ class Commanders:
 
 
 class _Heard:
-    """The subscriptions of one source. Zenoh's threads append each command with its arrival
-    time."""
+    """The subscriptions of one source.
+
+    Zenoh's threads append each command with its arrival time.
+    """
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]

@@ -14,8 +14,10 @@ class News:
         self._told: list[Happening] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the new events as log lines; after a restart of the daemon, all events that it
-        still knows."""
+        """Return the new events as log lines.
+
+        After a restart of the daemon, return all events that it still knows.
+        """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:

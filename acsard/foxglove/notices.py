@@ -29,8 +29,10 @@ WAITING = 100
 
 
 class Notice(Struct, frozen=True):
-    """A message. `stays` is the id of a lasting status, or "" for a single message; an empty `text`
-    ends it."""
+    """A message.
+
+    `stays` is the id of a lasting status, or "" for a single message; an empty `text` ends it.
+    """
 
     level: Level
     name: str
@@ -50,8 +52,10 @@ class Notices:
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
-        """Queue a message to all viewers. A repeated text is dropped unless it is a lasting
-        status."""
+        """Queue a message to all viewers.
+
+        A repeated text is dropped unless it is a lasting status.
+        """
         now_ns = clock.mono_ns()
         with self._lock:
             recent = {t: ns for t, ns in self._said.items() if now_ns - ns < AGAIN_NS}
@@ -68,8 +72,7 @@ class Notices:
         self._wake()
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
-        """Send the waiting notices; `newcomers` says whether a viewer needs all lasting statuses
-        again."""
+        """Send the waiting notices. With `newcomers`, send all lasting statuses again first."""
         if newcomers:
             for one in self._staying.values():
                 server.publish_status(one.text, STATUS[one.level], one.stays)

@@ -9,8 +9,7 @@ from acsard.config.live import flat, live
 
 
 def values(config: object) -> dict[str, Any]:
-    """Return the settings that can be changed at run time, by key, with lists in place of
-    tuples."""
+    """Return the settings that can be changed at run time, by key, tuples as lists."""
     found = ((key, value) for key, value in flat(config) if live(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
 

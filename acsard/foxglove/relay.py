@@ -137,8 +137,10 @@ class Relay:
         return newest
 
     def ask_state(self) -> None:
-        """Query the state, because the next one may be late. The answer is treated like a published
-        state."""
+        """Query the state, because the next one may be late.
+
+        The answer is treated like a published state.
+        """
         samples = self._followed.get(STATE)
         if samples is not None:
             self._robot.ask(STATE, samples.add)

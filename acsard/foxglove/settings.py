@@ -53,8 +53,10 @@ class Settings:
             self._followed = followed
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Change settings, all or none, and return their values afterwards. A refusal is reported
-        to the viewers."""
+        """Change settings, all or none, and return their values afterwards.
+
+        A refusal is reported to the viewers.
+        """
         try:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")

@@ -207,8 +207,10 @@ class Course:
             )
 
     def _asked(self, curve: Curve, step: Step, t: float, speed: float) -> None:
-        """Record a commanded speed. A sent line is valid until the microcontroller's watchdog
-        expires."""
+        """Record a commanded speed.
+
+        A sent line is valid until the microcontroller's watchdog expires.
+        """
         if step.said.left is not None:
             curve.add(t, speed)
         elif t - self._left > WATCHDOG_S:

@@ -67,8 +67,7 @@ def path(course: Course) -> Figure:
 
 
 def _noted(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
-    """Draw the events of one name at their places, or return None if there are none with a
-    place."""
+    """Draw the events of one name at their places, or return None without any."""
     marks_here = [mark for mark in marks.all() if mark.name == name]
     here = [(mark, mark.place) for mark in marks_here if mark.place is not None]
     if not here:
@@ -112,8 +111,7 @@ def _spread(places: list[Place]) -> list[Place]:
 
 
 def _arrows(places: list[Place]) -> dict[str, Any]:
-    """Return markers that point along the heading; plotly's angles are in degrees clockwise from
-    up."""
+    """Return markers along the heading. Plotly's angles are in degrees clockwise from up."""
     angles = [round(90 - math.degrees(place.yaw), 2) for place in places]
     return {"symbol": "arrow", "size": 13, "color": LIMITED, "angle": angles}
 

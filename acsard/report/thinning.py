@@ -104,12 +104,13 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time; when there are too many spans, the shortest are merged with their
-    neighbours."""
+    """A state over time.
+
+    If there are too many spans, short ones are merged with their neighbours.
+    """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """Create an empty band; `ranks` lists the kinds, and earlier ones win when spans are
-        merged."""
+        """Create an empty band. `ranks` lists the kinds; earlier ones win when spans are merged."""
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
@@ -148,8 +149,10 @@ class Band:
 
 
 class Place(NamedTuple):
-    """A pose in the odom frame, m and rad; `new` is True if the robot did not drive here from the
-    last place."""
+    """A pose in the odom frame, m and rad.
+
+    `new` is True if the robot did not drive here from the previous place.
+    """
 
     t: float
     x: float

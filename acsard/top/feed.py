@@ -55,8 +55,10 @@ class Feed:
         self._undecodable = 0
 
     def ask(self) -> None:
-        """Query the present state instead of waiting for the next published one. Raises
-        `ReplyError`."""
+        """Query the present state instead of waiting for the next published one.
+
+        Raises `ReplyError`.
+        """
         try:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:
@@ -138,13 +140,14 @@ class Feed:
 
 
 def anew(before: RobotState, state: RobotState) -> bool:
-    """Return whether a restarted daemon sent `state`: one of its counters is smaller than
-    before."""
+    """Return whether a counter decreased, which means that the daemon was restarted."""
     return any(state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY)
 
 
 def silence(gaps: Collection[float]) -> float:
-    """Return the time without a state that counts as silence, from the last intervals between
-    states, s."""
+    """Return the time in s without a state that counts as silence.
+
+    `gaps` are the last intervals between states, s.
+    """
     longest = min(SLOWEST_S, max(gaps, default=SLOWEST_S))
     return max(SILENT_S, MISSING * longest)

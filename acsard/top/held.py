@@ -1,5 +1,4 @@
-"""A terminal screen that ends with a key or a signal; ^Z gives the terminal back, and `fg`
-resumes."""
+"""A terminal screen that ends with a key or a signal. ^Z suspends it, and `fg` resumes."""
 
 from __future__ import annotations
 
@@ -41,8 +40,10 @@ def steer(
     screen: AbstractContextManager[Callable[[Teleop], None]],
     suspend: list[bool],
 ) -> bool:
-    """Pass the typed keys to `step`, "" if none, and show the screen; return True at ^Z, False at
-    the end."""
+    """Pass the typed keys to `step`, "" if none, and show the screen.
+
+    Return True at ^Z and False when the input ends.
+    """
     with keys() as read, screen as show:
         due = 0.0
         while not suspend:

@@ -1,5 +1,4 @@
-"""Reads the keys of a terminal one by one, without echo, until a signal; then restores the
-terminal."""
+"""Reads a terminal's keys one by one without echo, and restores the terminal at the end."""
 
 from __future__ import annotations
 

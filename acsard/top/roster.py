@@ -47,8 +47,10 @@ class Row(Struct, frozen=True):
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Return a header and a line for each robot, at most `width` wide and `height` lines, urgent
-    ones first."""
+    """Return a header and a line for each robot, the urgent ones first.
+
+    There are at most `height` lines of at most `width` characters.
+    """
     shown = range(len(HEADS)) if width >= WIDE else NARROW
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]

@@ -53,8 +53,7 @@ FIGURES = {
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return pose and twist on the left, and on the right the wheels in their positions on the
-    robot."""
+    """Return pose and twist on the left, and the wheels in their places on the right."""
     (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))

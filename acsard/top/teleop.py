@@ -50,8 +50,10 @@ class Teleop(Struct, frozen=True):
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[tuple[Look, str]]:
-    """Return the screen as lines of at most `width` characters. The first "mode" line starts with
-    the mode."""
+    """Return the screen as lines of at most `width` characters.
+
+    The first "mode" line starts with the mode.
+    """
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown: list[tuple[Look, str]] = [

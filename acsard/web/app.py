@@ -188,8 +188,10 @@ class Page:
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     def _hurries(self, request: web.Request, who: Who) -> bool:
-        """Return whether the client exceeds its request rate. Clients on the robot itself are
-        exempt."""
+        """Return whether the client exceeds its request rate.
+
+        Clients on the robot itself are exempt.
+        """
         if not who.token or request.path in UNHURRIED:
             return False
         return not self._paces.take(who.token, clock.mono_ns())

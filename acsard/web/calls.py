@@ -65,8 +65,7 @@ class Calls:
     """The requests that are under way, within the limits above."""
 
     def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
-        """Store the robots and `ends`, which ends a check or calibration that the page's server
-        runs."""
+        """Store the robots, and `ends`, which ends the server's check or calibration."""
         self._robots, self._ends = robots, ends
         self._running, self._stops, self._elsewhere = 0, Stops(), 0
 
@@ -125,8 +124,10 @@ class Calls:
     async def _stop(
         self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
-        """Stop another robot. Slots are limited, so a robot id that does not exist cannot block
-        other callers."""
+        """Stop another robot.
+
+        Slots are limited, so a robot id that does not exist cannot block other callers.
+        """
         if self._elsewhere < ELSEWHERE_AT_ONCE:
             self._elsewhere += 1
             try:
@@ -149,16 +150,21 @@ class Calls:
 
 
 class Stops:
-    """Stop requests: `STOPS_AT_ONCE` run at the same time, and all further callers share one later
-    request."""
+    """Stop requests, of which at most `STOPS_AT_ONCE` run at the same time.
+
+    All further callers share one request that is sent later.
+    """
 
     def __init__(self) -> None:
         self._room = asyncio.Semaphore(STOPS_AT_ONCE)
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Return the robot's reply to this request, or to a shared request that is sent after this
-        call began."""
+        """Return the robot's reply to this request.
+
+        If too many stops are under way, return the reply to a shared request that is sent after
+        this call began.
+        """
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_S)

@@ -20,8 +20,10 @@ KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 
 class Reach(Struct, frozen=True):
-    """The options that let a command reach the same daemon as this server. An empty value omits its
-    option."""
+    """The options that let a command reach the same daemon as this server.
+
+    An empty value omits its option.
+    """
 
     config: str
     endpoint: str

@@ -50,8 +50,10 @@ LONG = 40
 
 
 class _Known:
-    """The state of one robot. Each value is replaced as a whole because Zenoh's threads write
-    them."""
+    """The state of one robot.
+
+    Each value is replaced as a whole because Zenoh's threads write them.
+    """
 
     def __init__(self, now_ns: int) -> None:
         self.newest: tuple[zenoh.Sample | None, int] = None, now_ns

@@ -31,8 +31,7 @@ Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
-    """A message that is not a valid frame; `about` names the kind it was meant to be, or
-    "message"."""
+    """A message that is not a valid frame. `about` names its intended kind, or is "message"."""
 
     def __init__(self, about: str, text: str) -> None:
         super().__init__(text)
@@ -66,8 +65,10 @@ class Wish(_Frame, frozen=True):
 
 
 class Command(_Frame, frozen=True):
-    """Drive at this velocity; `stamp` is the time of the command in ms by the sender's own
-    clock."""
+    """Drive at this velocity.
+
+    `stamp` is the time of the command in ms by the sender's own clock.
+    """
 
     cmd: Wish
     stamp: float

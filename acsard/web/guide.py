@@ -86,8 +86,10 @@ class Guide:
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
-        """Return the options that the page may start now; `simulated` says whether the robot is
-        simulated."""
+        """Return the options that the page may start now.
+
+        `simulated` says whether the robot is simulated.
+        """
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
@@ -123,8 +125,10 @@ class Guide:
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """Pass on a key press, or interrupt the child. The child may already have ended, so this
-        never fails."""
+        """Pass on a key press, or interrupt the child.
+
+        The child may already have ended, so this never fails.
+        """
         if (errand := self._of(viewer)) is None:
             return
         if press.press == "key":
@@ -208,8 +212,10 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child and return its exit code and the end of its standard error. Raises
-        `OSError`."""
+        """Run the child and return its exit code and the end of its standard error.
+
+        Raises `OSError`.
+        """
         if self.left:
             return int(Exit.FAILURE), ""
         # The child gets a session of its own, so a Ctrl-C at this server's terminal reaches it
@@ -237,8 +243,10 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """End the current leg like a key press at a terminal. Only the first press of a leg
-        counts."""
+        """End the current leg like a key press at a terminal.
+
+        Only the first press of a leg counts.
+        """
         if self._rides:
             self._rides = False
             self._write({"key": True})

@@ -109,8 +109,10 @@ class Keys:
         self._out.wake()
 
     async def _found(self, one: Following) -> Stream | None:
-        """Return the stream of a key. Return None after a delay if the bus is not ready; the caller
-        retries."""
+        """Return the stream of a key.
+
+        Return None after a delay if the bus is not ready; the caller retries.
+        """
         client = self._robots.client
         if client is None:
             await asyncio.sleep(CLIENT_S)

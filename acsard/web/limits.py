@@ -1,5 +1,7 @@
-"""Limits per client: message rates, token guesses, connections, subscriptions. This module is
-pure."""
+"""Limits per client: message rates, token guesses, connections, subscriptions.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -80,8 +82,7 @@ class Tries:
         self._count: Counter[str] = Counter()
 
     def spent(self, address: str, now_ns: int) -> bool:
-        """Return whether this address, or all addresses together, used up the guesses of this
-        minute."""
+        """Return whether this address or all together used up this minute's guesses."""
         if self._since_ns is None or now_ns - self._since_ns > MINUTE_NS:
             self._since_ns = now_ns
             self._count.clear()
@@ -124,8 +125,7 @@ class Places:
 
 
 class Seats:
-    """WebSocket connections, limited separately for the robot itself (no token) and for other
-    machines."""
+    """Limits on WebSocket connections. Local ones (without a token) have a limit of their own."""
 
     def __init__(self) -> None:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
@@ -154,8 +154,7 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that a connection counts against, the name under each, and the refusal
-        text."""
+        """Return each limit for a connection, the name it counts under, and the refusal text."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open at the machine itself: close some"
             return [(self._here, address, here)]
@@ -176,8 +175,10 @@ class Seats:
 
 
 class Shares:
-    """Shared resources with a limit in all and a limit per holder. A resource that several holders
-    share counts once against the limit in all."""
+    """Shared resources with a limit in all and a limit per holder.
+
+    A resource that several holders share counts once against the limit in all.
+    """
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one

@@ -111,8 +111,10 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address, or at a later free port if `next_port`. Raises
-    `InUseError`."""
+    """Open a socket at each address, or at a later free port if `next_port`.
+
+    Raises `InUseError`.
+    """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
 
@@ -123,8 +125,10 @@ def _older_ports(listen: Sequence[Listen]) -> set[int]:
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open one socket; `both` lets `::` accept IPv4 too, when no other address here has this
-    port."""
+    """Open one socket.
+
+    `both` lets `::` accept IPv4 too, when no other address here has this port.
+    """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None

@@ -32,8 +32,10 @@ def text(
     counts: Mapping[str, int],
     refused: Mapping[str, int],
 ) -> str:
-    """Return the whole exposition. Robot metrics come from the last state, and only while `heard`
-    is true."""
+    """Return the whole exposition.
+
+    Robot metrics come from the last state, and only while `heard` is true.
+    """
     lines: list[str] = []
 
     def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:

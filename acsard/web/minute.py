@@ -38,8 +38,10 @@ Column = Sequence[float | None]
 
 
 class Plotted(Struct, frozen=True):
-    """A column for each line of the plots, all as long as `age`, thinned to about five rows a
-    second."""
+    """A column for each line of the plots, thinned to about five rows a second.
+
+    All columns are as long as `age`.
+    """
 
     age: Sequence[int]
     """Age of each row, ms."""

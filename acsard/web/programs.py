@@ -1,5 +1,4 @@
-"""The HTTP interface for programs: values, services, recordings, metrics and its own
-description."""
+"""The HTTP interface for programs: values, services, recordings, metrics, OpenAPI document."""
 
 from __future__ import annotations
 
@@ -131,8 +130,7 @@ class Programs:
         return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
 
     async def draw(self, who: Who, name: str) -> web.Response:
-        """Return the progress of the report of a recording, and start drawing it if it does not
-        exist."""
+        """Return the progress of a recording's report, and start drawing it if needed."""
         told = self._reports.ask(*await self._recorded(who, name))
         body = msgspec.json.encode(told)
         return web.Response(body=body, content_type="application/json", status=DRAWN[told.report])

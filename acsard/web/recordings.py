@@ -33,8 +33,7 @@ def rows(directory: Path) -> list[Listed]:
 
 
 def named(directory: Path, name: str) -> Path | None:
-    """Return the file with this name if it is a listed recording, otherwise None; raises
-    `OSError`."""
+    """Return the recording with this name, or None if it is not listed; raises `OSError`."""
     return next((path for path in listed(directory) if path.name == name), None)
 
 

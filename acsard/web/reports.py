@@ -151,8 +151,10 @@ class Reports:
         return one.packed or None if one is not None and one.path.name == name else None
 
     def tidy(self) -> None:
-        """Give up a drawing that no client waits for, and drop an old report. The server calls this
-        regularly."""
+        """Give up a drawing that no client waits for, and drop an old report.
+
+        The server calls this regularly.
+        """
         one = self._one
         if one is None:
             return
@@ -231,8 +233,10 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output: lines of digits are percents, other lines explain a
-    failure."""
+    """Read the child's error output.
+
+    Lines of digits are percents, other lines explain a failure.
+    """
     assert child.stderr is not None
     said = ""
     while part := await child.stderr.read(1 << 12):

@@ -74,8 +74,10 @@ def problem(status: int, text: str) -> web.Response:
 
 
 def own_address(request: web.Request) -> str:
-    """Return the local address that the client connected to. Unlike a host name, it cannot be
-    forged."""
+    """Return the local address that the client connected to.
+
+    Unlike a host name, it cannot be forged.
+    """
     return unmapped(_reached(request)[0].lower())
 
 
@@ -90,8 +92,7 @@ def _reached(request: web.Request) -> tuple[str, int]:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the bearer token of a program, or the cookie tokens of a browser, the likeliest
-    first."""
+    """Return a program's bearer token, or a browser's cookie tokens, the likeliest first."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]
@@ -122,8 +123,7 @@ async def token_posted(request: web.Request) -> str:
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """Return a page file, compressed if the client supports it, or 304 if the browser has it
-    cached."""
+    """Return a page file, or 304 if the browser has it. Compress it if the client supports gzip."""
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)

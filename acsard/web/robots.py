@@ -64,8 +64,10 @@ class Robots:
     """Keeps the connection to the daemon, and the data that a newly opened page needs at once."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Prepare the connection; `about` comes from the local configuration until the daemon
-        answers."""
+        """Prepare the connection.
+
+        `about` comes from the local configuration until the daemon answers.
+        """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
         """Common name of this server's certificate, under which the viewers' commands are sent; ""
@@ -97,8 +99,7 @@ class Robots:
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the recent path of the robot, and its true path if a simulator publishes it (m,
-        odom)."""
+        """Return the robot's recent path in m, odom, and the true path of a simulator."""
         return {name: trail.points() for name, trail in self._trails.items()}
 
     def minute(self) -> Plotted:
@@ -156,8 +157,7 @@ class Robots:
             self._minute.add(states.at_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the current commanded twist, if a viewer of this server follows it and it is
-        recent."""
+        """Return the commanded twist if it is recent and a viewer of this server follows it."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         if stream is None or raw is None or now_ns - stream.at_ns > WISHED_NS:

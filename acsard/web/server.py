@@ -1,5 +1,4 @@
-"""The page's server from start to shutdown: addresses, connection to the daemon, background
-tasks."""
+"""The page's server from start to shutdown: addresses, connection, background tasks."""
 
 from __future__ import annotations
 

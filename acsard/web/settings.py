@@ -24,8 +24,7 @@ class Row(Struct, frozen=True, omit_defaults=True):
 
 
 def rows(config: Mapping[str, Any]) -> list[Row]:
-    """Return the changeable settings of a configuration (as the key `config` reports it), in its
-    order."""
+    """Return the changeable settings in the order of `config`, a value of the key `config`."""
     return [_row(key, value) for key, value in flat(config) if live(key) is not None]
 
 

@@ -66,8 +66,7 @@ class Stream:
             self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """Store the answer to a query, unless a published message, which is newer, has already
-        arrived."""
+        """Store the answer to a query, unless a published (newer) message has arrived."""
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.mono_ns())
@@ -95,8 +94,10 @@ class Streams:
         `leave`."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the stream of a key, subscribed; raises an error of `UNREADY` if the bus is not
-        ready."""
+        """Return the subscribed stream of a key.
+
+        Raises an error of `UNREADY` if the bus is not ready.
+        """
         name = robot, key
         stream = self._streams.get(name)
         if stream is None:

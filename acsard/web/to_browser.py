@@ -85,8 +85,10 @@ class Outgoing:
             self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
-        """Send until cancelled or until the connection closes; `look_around(now)` returns its next
-        due time."""
+        """Send until cancelled or until the connection closes.
+
+        `look_around(now)` is called in each round and returns the time of its next call.
+        """
         loop = asyncio.get_running_loop()
         try:
             while True:
@@ -127,8 +129,10 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the value if it is due and new; return its next due time by the event loop's
-        clock."""
+        """Send the value if it is due and new.
+
+        Return its next due time by the event loop's clock.
+        """
         stream = one.stream
         if stream is None:
             return now + one.period  # `Keys._join` wakes us when it exists

@@ -147,8 +147,7 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Yield the tokens under an exclusive lock, and write them back unless an exception
-        occurs."""
+        """Yield the tokens under an exclusive lock. Write them back unless an exception occurs."""
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -164,8 +163,7 @@ class Vault:
             raise NotPermittedError(f"no permission to write {self.path}: use sudo") from None
 
     def _kept(self) -> list[Token]:
-        """Return the tokens in the file, or none if the file does not exist; raises
-        `UsageError`."""
+        """Return the tokens in the file, none if it does not exist; raises `UsageError`."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except FileNotFoundError:
@@ -195,8 +193,7 @@ class Vault:
 
 
 def place() -> Path:
-    """Return the directory of the token file: the service's state directory, or else the user's
-    own."""
+    """Return the token file's directory: the service's state directory or the user's own."""
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE.is_dir():

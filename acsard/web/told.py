@@ -112,8 +112,10 @@ class Gone(Struct, frozen=True):
 
 
 class Running(Struct, frozen=True, omit_defaults=True):
-    """The running check or calibration ("" if none), who started it, and whether that was this
-    viewer."""
+    """The running check or calibration, or "".
+
+    `by` started it, and `yours` is true for this viewer.
+    """
 
     running: str
     by: str = ""

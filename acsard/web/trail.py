@@ -1,5 +1,7 @@
-"""The path of the robot in the last minutes, thinned, for a newly opened page. This module is
-pure."""
+"""The path of the robot in the last minutes, thinned, for a newly opened page.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 

@@ -27,8 +27,7 @@ class Reader(RequestHandler):
     """Protocol handler of one connection."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
-        """Take the arguments of aiohttp's own handler; `server` is the server of the application's
-        runner."""
+        """Create a handler for `server`, which is the server of the application's runner."""
         super().__init__(server, loop=server._loop, **server._kwargs)
         self._counted = counts
 
@@ -39,8 +38,10 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Answer unreadable bytes. Errors of the application (status 500 and above) stay with
-        aiohttp."""
+        """Answer unreadable bytes.
+
+        Errors of the application (status 500 and above) stay with aiohttp.
+        """
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith(MISSING)

@@ -217,8 +217,10 @@ class Viewer:
         )
 
     def _begin(self, frame: Begin) -> None:
-        """Start a check or calibration for a maintainer; both turn wheels and write configuration
-        files."""
+        """Start a check or calibration for a maintainer.
+
+        The role is required because both turn wheels and write configuration files.
+        """
         if not self.who.may("maintainer"):
             self._out.refuse("begin", "role", f"it is for maintainers; you are {self.who.role}")
         elif why := self._guide.begin(self, self.who.name, frame):

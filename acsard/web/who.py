@@ -86,8 +86,10 @@ class Asked(Struct, frozen=True):
 
 
 def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
-    """Classify a request as local or remote; `names` are the robot's names and addresses, in lower
-    case."""
+    """Classify a request as local or remote, or refuse it.
+
+    `names` are the robot's names and addresses in lower case.
+    """
     if asked.proxied:
         return Refusal(
             "proxy",
@@ -145,8 +147,10 @@ def host_name(host: str) -> str:
 
 
 def unmapped(address: str) -> str:
-    """Return an IPv4 address in its plain form, even if it arrived on a dual-stack socket as
-    `::ffff:...`."""
+    """Return an address with the IPv4-mapped prefix `::ffff:` removed.
+
+    A dual-stack socket reports IPv4 clients with this prefix.
+    """
     return address.removeprefix("::ffff:") if "." in address else address
 
 
