@@ -22,17 +22,18 @@ DEAF = (
 class Facts(Struct, frozen=True):
     """The configuration, sources and permissions.
 
-    `config` holds defaults if we may not read the robot's.
+    `config` holds defaults if this program may not read the robot's.
     """
 
     config: Config
     tables: object
-    """The configuration as plain tables; None if we may not read it."""
+    """The configuration as plain tables; None if this program may not read it."""
     sources: tuple[str, ...]
     forbidden: str
-    """Reason why we may not drive, in words; "" if we may."""
+    """Reason why this program may not drive, in words; "" if it may."""
     deaf: str = ""
-    """Reason why the sources' commands are invisible to us, in words; "" if they are visible."""
+    """Reason why the sources' commands are invisible to this program, in words; "" if they are
+    visible."""
 
     def rows(self) -> list[tuple[Channel, str]]:
         """Return each channel with its source; a commander channel appears once for each source."""

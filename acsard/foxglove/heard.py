@@ -49,7 +49,7 @@ class Commanders:
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Subscribe to these topics only, and to none if we cannot receive commands."""
+        """Subscribe to these topics only, and to none if this program cannot receive commands."""
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()

@@ -33,7 +33,10 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store a configuration (None if we may not read it); return the settings that changed."""
+        """Store the configuration and return the settings that changed.
+
+        `tables` is None if this program may not read the configuration.
+        """
         now = {} if tables is None else parameters.values(tables)
         with self._lock:
             news = parameters.news(self._known, now)

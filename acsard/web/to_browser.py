@@ -135,7 +135,7 @@ class Outgoing:
         """
         stream = one.stream
         if stream is None:
-            return now + one.period  # `Keys._join` wakes us when it exists
+            return now + one.period  # `Keys._join` wakes the task when the stream exists
         if one.due > now:
             return one.due
         # All keys share one time grid, so they wake the task together.
