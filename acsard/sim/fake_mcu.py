@@ -135,8 +135,9 @@ class FakeMcu(Faults):
 
     def _pass(self, now_ns: int) -> None:
         """Move the vehicle; the watchdog trips at its own time on the way."""
-        deadline = max(self._fed_ns + self.watchdog_ns, self._now_ns)
-        if self.watchdog and deadline <= now_ns and any(self.vehicle.set_points):
+        deadline = self._fed_ns + self.watchdog_ns
+        if deadline <= now_ns and self.watchdog and any(self.vehicle.set_points):
+            deadline = max(deadline, self._now_ns)
             self.vehicle.advance((deadline - self._now_ns) / NS_PER_S, self.push)
             self._now_ns = deadline
             self.watchdog_trips += 1
@@ -208,12 +209,15 @@ class FakeMcu(Faults):
 
     def _encoders(self) -> list[int]:
         """Counts of motors a to d."""
-        angles = self.vehicle.angles
-        return [math.floor(f * angles[w] / math.tau * self._counts + 0.5) for w, f in self._wiring]
+        angles, tau, per_turn = self.vehicle.angles, math.tau, self._counts
+        return [math.floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
 
     def _speeds(self, now_ns: int) -> list[float]:
         """What the encoders say: whole counts over the time since they were last read."""
         since, before = self._window
+        gains = self.gains
+        if self.stuck is not None:
+            gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
@@ -227,12 +231,10 @@ class FakeMcu(Faults):
             if self.frozen is not None:
                 said[self.frozen] = self._measured[self.frozen]
             self._measured = said
-            for motor, (count, gain) in enumerate(zip(moved, self.gains, strict=True)):
-                self._counted[motor] += 0.0 if motor == self.stuck else count * gain
+            rows = zip(self._counted, moved, gains, strict=True)
+            self._counted = [total + count * gain for total, count, gain in rows]
             self._window = (now_ns, counts)
-        seen = [speed * gain for speed, gain in zip(self._measured, self.gains, strict=True)]
-        if self.stuck is not None:
-            seen[self.stuck] = 0.0
+        seen = [speed * gain for speed, gain in zip(self._measured, gains, strict=True)]
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
