@@ -14,6 +14,7 @@ keeps its `Memory` beside the robot.
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 from msgspec import Struct
@@ -26,6 +27,7 @@ Wheels = tuple[int, int, int, int]
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _HEX = b"0123456789ABCDEF"
+_COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 
 HALTED = ("stopped", "fault", "leaving")
 """Modes in which the robot brakes at the stop deceleration."""
@@ -176,15 +178,14 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
 @lru_cache(4)  # the line that went last was new a period ago
 def _wheels(line: bytes) -> Wheels | None:
     """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
-    found = []
-    for motor, start in zip(b"abcd", (0, 8, 16, 24), strict=True):
-        token = line[start : start + 7]
-        digits = token[2:4] + token[5:7]
-        right = len(token) == 7 and token[0] == motor and token[1] in b"pn" and token[4] == 0x2E
-        if not right or not digits.isdigit() or (start and line[start - 1] != 0x2C):
-            return None
-        found.append(int(digits) if token[1] == 0x70 else -int(digits))
-    return found[0], found[1], found[2], found[3]
+    match = _COLUMNS.match(line)
+    if match is None:
+        return None
+    a, b, c, d = [
+        int(word[1:3] + word[4:]) if word[0] == 0x70 else -int(word[1:3] + word[4:])
+        for word in match.groups()
+    ]
+    return a, b, c, d
 
 
 def _crc(data: bytes) -> int:

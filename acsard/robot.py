@@ -189,24 +189,22 @@ class Robot:
         another, self._status = status != self._status, status
         if another or news:  # else neither the mode nor the commander is another
             events += self._told.changes(self._life.mode, self._choice, status[1])
+        # By position: a struct takes three times as long by seventeen names.
         return Outputs(
-            now=inputs.now,
-            due=due,
-            line=line,
-            speeds=self._speeds,
-            applied=applied,
-            linked=self.session.link == "up",
-            estimates=estimates,
-            mode=status[0],
-            reason=status[1],
-            link=status[2],
-            source=status[3],
-            command_ns=self._choice.arrived_ns,
-            status_changed=another,
-            events=self._tally.lines(events, inputs.now.mono_ns),
-            answers=answers,
-            news=news,
-            latches=self._life.latches,
+            inputs.now,
+            due,
+            line,
+            self._speeds,
+            applied,
+            status[2] == "up",
+            estimates,
+            *status,
+            self._choice.arrived_ns,
+            another,
+            self._tally.lines(events, inputs.now.mono_ns),
+            answers,
+            news,
+            self._life.latches,
         )
 
     def _news(self) -> bool:

@@ -188,7 +188,7 @@ class Arbiter:
         live = [(source, found[0]) for source in heard if (found := source.live(now_ns))]
         if not live:
             self._holder = None
-            doubted = (source.doubted(now_ns) for source in self._ranking)
+            doubted = (source.doubted(now_ns) for source in heard)
             return Choice(wait=next(filter(None, doubted), COMMAND))
         source, sender = live[0]
         if len(live) > 1:
