@@ -168,6 +168,7 @@ class Robot:
     def step(self, inputs: Inputs) -> Outputs:
         """Take all that happened since the last step; decide what happens now."""
         events = list(inputs.events)
+        self._life.begin(inputs.now)
         if self._first_events:
             events += self._first_events
             self._first_events = []

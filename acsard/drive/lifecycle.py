@@ -5,8 +5,8 @@ time, and only `activate` releases `inactive`. A clear must not release a stop t
 not seen, however late the network delivers it:
 
 - A clear that names a number releases the latch with exactly this number.
-- A clear without a number is refused until `LOOK_FIRST_S` after the last stop. It may release a
-  fault that its sender has not seen, because a fault that persists latches again.
+- A clear without a number is refused until `LOOK_FIRST_S` after the last stop, and after the start.
+  It may release a fault that its sender has not seen, because a fault that persists latches again.
 - A clear that arrived before the latch was set never releases it.
 
 `modes.py` derives the mode. `robot.py` decides how the wheels follow it.
@@ -47,9 +47,16 @@ class Lifecycle:
         """Monotonic time at which a fault over a stop was last cleared."""
         self._stop_asked_ns = LONG_AGO_NS
         """Monotonic time at which the last stop arrived."""
+        self._began_ns: int | None = None
+        """Monotonic time of the first step, None before it."""
         self._derive()
 
     # facts
+
+    def begin(self, now: Instant) -> None:
+        """Note that a step begins; only the first one counts."""
+        if self._began_ns is None:
+            self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
         """Note whether the link to the board is up."""
@@ -192,14 +199,18 @@ class Lifecycle:
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
                 f"{stop.why}: look at it, then call srv/clear again"
             )
-        # The monotonic clock says nothing of a stop before the restart.
-        since = (now.wall_ns - stop.at_ns) if stop.kept else asked_ns - self._stopped_ns
-        if 0 <= since < LOOK_FIRST_S * NS_PER_S:
+        began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
+        since = asked_ns - max(self._stopped_ns, began_ns)
+        if since < LOOK_FIRST_S * NS_PER_S:
             age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
+            # The monotonic clock does not cover a stop before the start, and the wall clock may
+            # have been set since.
+            came = f"a stop by {stop.by or 'request'} came {age_s:.1f} s ago"
+            if self._stopped_ns < began_ns:
+                came = f"the daemon started {age_s:.1f} s ago and the robot is still {stop.why}"
             raise RefusedError(
-                f"a stop by {stop.by or 'request'} came {age_s:.1f} s ago: look at the robot, then "
-                f"call srv/clear again {LOOK_FIRST_S:g} s after it, or with the latch of the state "
-                "that you have looked at"
+                f"{came}: look at the robot, then call srv/clear again {LOOK_FIRST_S:g} s after "
+                "it, or with the latch of the state that you have looked at"
             )
 
     def _unseen(self, number: int, latch: Latch) -> str:
