@@ -99,7 +99,7 @@ class Robot:
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate, latches)
         self._life.lower(lowered(self._file_limits, config.limits))
-        if latches.next or latches.inactive:
+        if latches.in_force:
             mode, why = self._life.mode, self._life.why
             self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
         self._choice = Choice()
@@ -343,7 +343,7 @@ class Robot:
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":
-                if life.activate():
+                if life.activate(request.latch, asked_ns, now):
                     self._arbiter.require_neutral(asked_ns)
                 return "active"
             case "deactivate":

@@ -679,14 +679,14 @@ class Bus:
         self.session.put(f"{self.root}/{key}", json.dumps(value), attachment=attachment)
 
     def payload(self, key: str, payload: object) -> str | None:
-        """Return the payload of a query as JSON; that of a clear without one names the latch."""
-        if key == "srv/clear" and payload is None:
+        """Return the payload of a query as JSON; a release without one names the latch."""
+        if key in ("srv/clear", "srv/activate") and payload is None:
             states = self.ask("state")
             payload = {"latch": json.loads(states[0].payload)["latch"]} if states else None
         return None if payload is None else json.dumps(payload)
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """All replies to a query; `srv/clear` names the latch of `state`, as our tools do."""
+        """All replies to a query; a release names the latch of `state`, as our tools do."""
         data = self.payload(key, payload)
         found = []
         for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
