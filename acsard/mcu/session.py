@@ -65,7 +65,7 @@ class McuSession:
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
-        self._echo = EchoDetector(mcu.baud_rate)
+        self._echo = EchoDetector()
         self.snapping = Snapping()
         self._hearing = Hearing()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
@@ -190,7 +190,7 @@ class McuSession:
         self._held_up = not went
         if went:
             line, made_ns = made
-            self._echo.left(line, made_ns)
+            self._echo.left(line)
             self._timeline.left(made_ns)
             self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = made_ns
@@ -316,7 +316,7 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-                if not asking and self._echo.report(line, speeds, read_at.mono_ns):
+                if not asking and self._echo.report(line, speeds):
                     check.found_echo()
                     self._link.sign("echo")
                     self._reject("echo")
