@@ -24,7 +24,7 @@ PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
 NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
 """Topics without a value that this interface can return."""
 
-PAYLOADS = {"set": "Settings", "set_pose": "SetPose", "clear": "Clear"}
+PAYLOADS = {"set": "Settings", "set_pose": "SetPose", "clear": "Release", "activate": "Release"}
 
 
 def asked(topic: Topic) -> bool:
@@ -128,7 +128,7 @@ def _service(verb: Any) -> Described:
     }
     if verb in PAYLOADS:
         body = {"application/json": {"schema": _ref(PAYLOADS[verb])}}
-        told["requestBody"] = {"required": verb != "clear", "content": body}
+        told["requestBody"] = {"required": PAYLOADS[verb] != "Release", "content": body}
     elif verb == "stop":
         told["requestBody"] = {"content": {"application/json": {"schema": _WHICH}}}
     return told

@@ -277,10 +277,10 @@ addEventListener("keydown", (event) => {
   if (!event.repeat) stop();
 }, true);
 addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
-// Send the latch that this page shows. The daemon refuses if a newer stop came after it.
+// The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
 addEventListener("pagehide", () => stopping.over());
-$("activate").addEventListener("click", () => asked("activate"));
+$("activate").addEventListener("click", () => asked("activate", { latch: state?.latch }));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
 $("nearer").addEventListener("click", () => map.zoom(1.4));
