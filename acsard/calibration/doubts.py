@@ -16,13 +16,13 @@ from acsard.calibration.table import Floats
 from acsard.values import AcsardError
 
 UNLIKE = 0.5
-"""Share of a sensor's motion that the wheels may leave unexplained."""
+"""Fraction of a sensor's motion that the wheels may leave unexplained."""
 
 UNITS = 8.0
 """Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
 
 LEAST_TURN = 0.2
-"""Smallest turn that is credible, over the turn that the configured wheels predict.
+"""Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
 A robot that skids turns further than this. If it turns less, its wheel speeds are probably in rpm.
 """
@@ -37,7 +37,7 @@ A higher rate is in degrees, since no robot turns twice a second.
 """
 
 LEAST_CHI = 0.4
-"""Smallest effective track over the wheel separation.
+"""Smallest ratio of effective track to wheel separation.
 
 Wheels that skid make the effective track larger, and nothing makes it this much smaller.
 """
@@ -50,18 +50,18 @@ NOTABLE_S, FAR_S = 0.005, 0.5
 LARGE_BIAS = 0.05
 """Gyro bias above which a remark is made, rad/s."""
 ONE_SIDED = 0.1
-"""Share of the turns below which the less frequent side is reported as missing."""
+"""Fraction of the turns below which the less frequent side is reported as missing."""
 ODD_SIZE = 1.25
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Effective track over the configured one; values outside this range are reported."""
+"""Ratio of effective to configured track; values outside this range are reported."""
 
 
 class RefusedError(AcsardError):
-    """The log cannot be used for a calibration. The text says why and what to do."""
+    """Refusal of a log that cannot be used for a calibration. The text says why and what to do."""
 
 
 class UnlikeError(RefusedError):
-    """The positions do not follow the wheels over blocks of the length that was tried."""
+    """Refusal because positions do not follow the wheels over blocks of the length tried."""
 
 
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
@@ -152,8 +152,8 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
     Args:
         source: the name of the sensor of turns.
-        turn: the measured turn over the turn by the configured multipliers.
-        bare: the measured turn over the turn by wheel radius and separation alone.
+        turn: the ratio of the measured turn to the turn by the configured multipliers.
+        bare: the ratio of the measured turn to the turn by wheel radius and separation alone.
         base: the configured geometry.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
@@ -174,7 +174,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 def way_units(size: float, base: Base) -> None:
     """Raise `RefusedError` if the way is so much too long or too short that a unit is wrong.
 
-    `size` is the radius found over the configured one.
+    `size` is the ratio of the radius found to the configured one.
     """
     if 1 / UNITS < size < UNITS:
         return

@@ -2,12 +2,13 @@
 
 The nine parameters, by their index:
 
-- LEFT, RIGHT: radius of the left and right wheels over the wheel radius, about 1.
-- TURN: wheel separation over the effective track, about 1. Turns are linear in this inverse.
+- LEFT, RIGHT: ratio of the left and right wheels' radius to the configured wheel radius, about 1.
+- TURN: ratio of the wheel separation to the effective track, about 1. It is an inverse because
+  turns are linear in it.
 - RATE: growth of the track with the turn rate.
 - LATE, AHEAD, ASIDE: only for positions: their delay in s and where on the robot they are measured,
   m ahead and m to the left.
-- DRIFT, STRETCH: only for a gyro: the error of its bias, rad/s, and of its scale, a share.
+- DRIFT, STRETCH: only for a gyro: the error of its bias, rad/s, and of its scale, a fraction.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Base(Struct, frozen=True):
 
     @property
     def gain(self) -> float:
-        """Return R / L, wheel radius over wheel separation: the gain if all parameters are 1."""
+        """Ratio R / L of wheel radius to wheel separation: the gain if all parameters are 1."""
         return self.radius / self.separation
 
 

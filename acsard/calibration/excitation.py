@@ -23,7 +23,7 @@ ALIKE = 0.98
 """Squared correlation of both rolls above which they count as a single movement."""
 
 WORST_TRACK, WORST_RATIO = 0.2, 0.03
-"""Largest useful standard deviations, as shares: the track's by chance, and the radii ratio's."""
+"""Largest useful standard deviations, as fractions: of the track by chance, of the radii ratio."""
 
 WORST_CONDITION = 1e4
 """Largest condition number of the scaled normal equations at which parameters can be told apart."""
@@ -72,7 +72,8 @@ def turns_enough(turned: Floats) -> None:
 def sure_enough(found: Multipliers, chance: float) -> None:
     """Raise `RefusedError` if the result is too uncertain to be useful.
 
-    `chance` is the standard deviation of the track as a share, without the track's own variation.
+    `chance` is the standard deviation of the track as a fraction, without the track's own
+    variation.
     """
     size = np.outer(found.values, found.values)
     share = found.covariance / size

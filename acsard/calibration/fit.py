@@ -43,11 +43,11 @@ SMALL, SETTLED = 1e-5, 0.02
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
 """Prior standard deviations of parameters that a log may not determine.
 
-They are the growth of the track, as a share per rad/s, the delay in s, and two lengths in m.
+They are the growth of the track, as a fraction per rad/s, the delay in s, and two lengths in m.
 """
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a gyro's scale, a share, for a usual MEMS gyro.
+"""Prior standard deviation of a gyro's scale, a fraction, for a usual MEMS gyro.
 
 A log of a gyro alone cannot show this error.
 """
@@ -77,7 +77,7 @@ class Fit(Struct, frozen=True):
     """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[int, ...]
     varies: float
-    """Share by which the effective track differs from block to block."""
+    """Fraction by which the effective track differs from block to block."""
     converged: bool
     usual: Mapping[int, float]
     """Prior standard deviation of each parameter that has one."""
@@ -222,7 +222,7 @@ def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
 
 
 def _varies(found: Sequence[Evidence], parameters: Floats) -> float:
-    """Return the share by which the track differs between blocks, beyond the noise within them.
+    """Return the fraction by which the track differs between blocks, beyond the noise within them.
 
     This is the moment estimator for random effects (DerSimonian & Laird 1986).
     """

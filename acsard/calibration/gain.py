@@ -29,7 +29,7 @@ STRAIGHT = 0.1
 """Largest curvature of a straight by the wheels, rad/m, however slowly the robot turns."""
 
 TOLD = 0.1
-"""Largest standard deviation, as a share, of a block's own track by positions that is used."""
+"""Largest standard deviation, as a fraction, of a block's own track by positions that is used."""
 
 
 class Error(Struct, frozen=True):

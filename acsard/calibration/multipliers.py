@@ -17,7 +17,7 @@ TURNING = 0.05
 """Turn rate below which a row counts as straight, rad/s."""
 
 FASTEST = 0.95
-"""Share of all turning that is slower than the rate called the fastest."""
+"""Fraction of all turning that is slower than the rate called the fastest."""
 
 
 class Rates(Struct, frozen=True):
@@ -38,7 +38,7 @@ class Multipliers(Struct, frozen=True):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def own(self) -> tuple[Floats, float]:
-        """Return the standard deviations without the common part, and the common part's, a share.
+        """Return each multiplier's own standard deviation, and the common one as a fraction.
 
         A tape measures the common scale, and comparing turns measures the ratios of the three
         multipliers. The odometry treats all four deviations as independent. Let d be the variance
@@ -87,7 +87,7 @@ def constant(parameters: Floats, every: Floats, rate: Rates, varies: float) -> M
 
     The variance of the track includes how far the true track differs from this constant: at the
     slowest or fastest turn rate or, if that is more, from block to block. `varies` is the latter,
-    as a share.
+    as a fraction.
     """
     turn, slope = parameters[TURN], parameters[RATE]
     left = 1.0 - slope * rate.mean

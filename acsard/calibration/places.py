@@ -35,9 +35,10 @@ FINE_S = 0.02
 """Time step in which the path is summed, s. Finer steps would only make long logs slower."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Distance of a position from its predicted place that counts as a jump: standard deviations and m.
+"""Excess of a step over the wheels' motion that counts as a jump.
 
-The position is an outlier, or the first one after the source has relocalized.
+It is the sum of `JUMP` standard deviations and `JUMP_M` m. The position is an outlier, or the first
+one after the source has relocalized.
 """
 
 SLOPE_S = 0.05

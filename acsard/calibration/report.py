@@ -62,7 +62,7 @@ class Report(Struct, frozen=True):
     """Effective track, m."""
     effective_track_std: float
     effective_track_growth: float
-    """Share by which the track grows with each rad/s of turn rate."""
+    """Fraction by which the track grows with each rad/s of turn rate."""
     effective_track_growth_std: float
     left_wheel_radius: float
     """Radius of the left wheels, m."""

@@ -40,7 +40,7 @@ ROLLING, AGAIN = 0.2, 0.5
 """Evidence for a logger that repeats a position until the next one arrives.
 
 `ROLLING` is the speed of both sides together, rad/s, at which no true position stays the same.
-`AGAIN` is the share of such rows that repeat the row before.
+`AGAIN` is the fraction of such rows that repeat the row before.
 """
 
 MOST_RUNS = 1000
@@ -49,7 +49,7 @@ MOST_RUNS = 1000
 TOGETHER, TOLD, APART = 50, 0.15, 0.8
 """Thresholds for the comparison of the front and rear wheels of a side.
 
-`TOGETHER` is the number of rows that are summed first. The others are the shares of their way by
+`TOGETHER` is the number of rows that are summed first. The others are the fractions of their way by
 which both may differ without a note, and at all.
 """
 
@@ -141,7 +141,7 @@ def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the share of their way by which both wheels of a side differ.
+    """Return the fraction of their way by which both wheels of a side differ.
 
     Both roll over the same floor. Raises `LogError` if they differ impossibly far.
     """

@@ -25,9 +25,9 @@ from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Configured over true track, for wheels of the configured radius.
+"""Ratios of configured to true track that are tried. They are finer in the usual range.
 
-It is finer in the usual range.
+They apply to wheels of the configured radius.
 """
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
@@ -46,10 +46,10 @@ MOST_BEGUN, FAR_WORSE = 4, 20.0
 """Number of starting points that are refined, and how much worse than the best they may be."""
 
 USUAL_TURN, NEAR_HEADING = (0.31, 1.25), (0.8, 1.25)
-"""Usual range of the robot's turn over that of another source.
+"""Usual ratios of the robot's turn to that of another source: lowest and highest.
 
-The first is relative to the wheels and the wheel separation, from skid-steer to no skidding. The
-second is relative to a heading sensor.
+`USUAL_TURN` is relative to the wheels and the wheel separation, from skid-steer to no skidding.
+`NEAR_HEADING` is relative to a heading sensor.
 """
 
 WRONG_WAY = 4.0
@@ -59,7 +59,7 @@ A correct robot must leave this many times more unexplained before the reversed 
 """
 
 NOTHING = 1e-3
-"""Share of the positions' spread that cannot distinguish starting points.
+"""Fraction of the positions' spread that cannot distinguish starting points.
 
 Any starting point explains short straights except for their noise.
 """
@@ -72,7 +72,7 @@ COARSE_S = 0.1
 
 
 class Begin(Struct, frozen=True):
-    """A starting point; `unexplained` is the share of the positions' spread that it leaves."""
+    """A starting point; `unexplained` is the fraction of the positions' spread that it leaves."""
 
     parameters: Floats
     unexplained: float
@@ -84,7 +84,7 @@ def search(
 ) -> Begin:  # fmt: skip
     """Return the best starting point.
 
-    `sides` is g_l and g_r over the gain, by a heading sensor, or None.
+    `sides` are g_l and g_r by a heading sensor, divided by the gain, or None.
     """
     kept = _furthest(found, MOST_SPOTS)
     needed = sorted({spot.run for spot in kept})
@@ -121,7 +121,7 @@ def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
 
 
 def _neighbours(tried: Sequence[Begin]) -> list[tuple[Begin, float, float]]:
-    """Return each starting point with the unexplained shares of its neighbours."""
+    """Return each starting point with the unexplained fractions of its neighbours."""
     left = [np.inf, *(one.unexplained for one in tried), np.inf]
     return [(one, left[at], left[at + 2]) for at, one in enumerate(tried)]
 

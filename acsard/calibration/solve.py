@@ -42,7 +42,7 @@ Longer blocks are better if positions are coarse. More blocks are better if posi
 
 
 PERFECT = 1e-3
-"""Share of the motion by which a true sensor differs from the wheels at least."""
+"""Fraction of the motion by which a true sensor differs from the wheels at least."""
 
 PLENTY = 100
 """Number of blocks from which on other lengths are not tried, to save time."""
@@ -71,7 +71,7 @@ class Calibration(Struct, frozen=True):
     scale: str
     """Sensors that measured the distance: "positions", "distance", both, or "" for none."""
     growth: float
-    """Share by which the effective track grows with each rad/s of turn rate."""
+    """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     gain: Gain
     late: dict[str, float]

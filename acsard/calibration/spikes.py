@@ -23,9 +23,9 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a misread number.
 
-It is `SPIKE` times above each neighbour, and above the speed that all but `FEW` of the rates over
-`SLOW` rad/s stay below. A robot that stands for nearly the whole log exceeds that speed in true
-turns too, but not for a single sample.
+It is more than `SPIKE` times as large as each neighbour and as the usual speed. Of the rates over
+`SLOW` rad/s, all but the fraction `FEW` stay below the usual speed. A robot that stands for nearly
+the whole log also turns much faster than that, but never for a single sample.
 """
 
 

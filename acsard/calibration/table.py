@@ -39,7 +39,7 @@ BEHIND = re.compile(r"(?:^|\s)#")
 """Pattern of a comment after a number; "1.#QNAN" does not contain one."""
 
 FEW, SHARE = 3, 0.01
-"""Number of rows that may be unreadable, and share of all rows; the larger one counts."""
+"""Number of rows that may be unreadable, and fraction of all rows; the larger one counts."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -48,7 +48,7 @@ AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
-    """The file cannot be used. The text says where, what is wrong and what to do."""
+    """Refusal of a file that cannot be used. The text names the place, the fault and the remedy."""
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
@@ -197,7 +197,7 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Reads line by line. It must be fast for a million lines."""
+    """Parser of the lines below the header. It must be fast for a million lines."""
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors

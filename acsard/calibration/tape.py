@@ -21,7 +21,7 @@ LEAST_M = 0.5
 """Shortest distance of a run's end from its start by odometry that can be used, m."""
 
 STRAIGHT = 0.8
-"""Smallest distance from start to end, as a share of the way between them."""
+"""Smallest distance from start to end, as a fraction of the way between them."""
 
 
 class Tape(Struct, frozen=True):
@@ -47,7 +47,7 @@ class Way(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Way]
-"""Returns the way of run number n for multipliers in the order of `Multipliers.values`."""
+"""Function from multipliers (as in `Multipliers.values`) and a run's number to its way."""
 
 
 def scaled(

@@ -23,7 +23,7 @@ from acsard.calibration.table import Floats
 NOISE = 0.01
 """Residuals that are usual when outliers are sought.
 
-They are `NOISE` rad per second and, in addition, `SHARE` of the turn.
+They are `NOISE` rad per second and the fraction `SHARE` of the turn, added as squares.
 """
 SHARE = 0.03
 

@@ -77,7 +77,7 @@ class Board:
         self.paced = False
         """Whether `own_clock` and `gap_s` were measured."""
         self.lost = 0.0
-        """Share of the lines that are lost or damaged in either direction."""
+        """Fraction of the lines that are lost or damaged in either direction."""
         # The recording
         self.replies: list[Reply] = []
         self.others: list[bytes] = []

@@ -12,13 +12,13 @@ from acsard.checkup.limits import GLANCE_S
 from acsard.checkup.motion import Reply, steps
 
 LEAST_ANGLE = 2.0
-"""Smallest angle to measure counts over, rad.
+"""Smallest angle for a measurement of the counts, rad.
 
 Below it, the speeds' own rounding spoils the result.
 """
 
 AGREES = 0.02
-"""Share by which the measured counts may differ from the stated ones."""
+"""Fraction by which the measured counts may differ from the stated ones."""
 
 MOST_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""

@@ -33,7 +33,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """The check must end here; `finding` is the reason."""
+    """Early end of the check; `finding` is the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -41,7 +41,7 @@ class StoppedError(AcsardError):
 
 
 class WireLostError(AcsardError):
-    """The serial line is gone: unplugged, or its driver hangs."""
+    """Loss of the serial line: it was unplugged, or its driver hangs."""
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:

@@ -21,7 +21,7 @@ from acsard.mcu.hearing import printable
 from acsard.mcu.session import IDENTITY
 
 MOST = 0.02
-"""Largest share of lines that may be lost. A sound link loses none."""
+"""Largest fraction of lines that may be lost. A sound link loses none."""
 
 FEW = 2
 """Number of lost lines from which on the loss is not a coincidence."""
@@ -48,7 +48,7 @@ class Count(Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Share of lost lines; 0 if the loss may be a coincidence."""
+        """Fraction of lost lines; 0 if the loss may be a coincidence."""
         return self.lost / self.lines if self.lost >= FEW else 0.0
 
 

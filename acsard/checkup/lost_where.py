@@ -40,7 +40,7 @@ With equal pauses, losses at regular intervals could miss every pulse.
 """
 
 OBEYED = 0.5
-"""Share of the usual angle of a pulse above which the motors obeyed it."""
+"""Fraction of the usual angle of a pulse above which the motors obeyed it."""
 
 SEEN, GRAINS = 0.02, 4
 """Smallest usable angle of a pulse, in rad and in smallest steps of the encoders."""

@@ -16,7 +16,7 @@ ENOUGH = 10
 """Number of replies that is enough for a rate."""
 
 ANSWERED = 0.8
-"""Share of answered lines below which lines are lost or remain unanswered."""
+"""Fraction of answered lines below which lines are lost or remain unanswered."""
 
 SLOW_S = 0.008
 """Round trip in addition to the lines' time on the wire that delays the control loop, s.

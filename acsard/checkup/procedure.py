@@ -113,7 +113,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
 
 
 class _Steps:
-    """Runs one step after the other, and repeats a step in which the board restarted."""
+    """Runner of the steps. It repeats a step in which the board restarted."""
 
     def __init__(
         self,
@@ -241,9 +241,7 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """Send zeros to a board that was silent for `silent_s` until it answers or had time to
-        boot.
-        """
+        """Send zeros to a board silent for `silent_s` until it answers or had time to boot."""
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
             board.wakes(BOOT_S)

@@ -41,7 +41,10 @@ SILENT_S = 0.25
 """Silence of this host that a watchdog may take for the host's end, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Outcome for each cause that our firmware names after booting. "unknown" is not among them."""
+"""Outcome for each cause that the reference firmware names after booting.
+
+"unknown" is not among them.
+"""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
 """Pattern of a printed text. It occurs in no reply, whether whole or damaged."""
@@ -63,7 +66,7 @@ class Restart(Struct, frozen=True):
 
 
 class RestartedError(AcsardError):
-    """The board has restarted, so the present measurement is worthless."""
+    """Restart of the board, which makes the present measurement worthless."""
 
     def __init__(self, restart: Restart) -> None:
         super().__init__(restart.sign)
@@ -71,7 +74,7 @@ class RestartedError(AcsardError):
 
 
 class Restarts:
-    """Watches the lines since the port was opened. Times are in s."""
+    """Detector of restarts since the port was opened. Times are in s."""
 
     def __init__(self) -> None:
         self.watched = True
@@ -138,14 +141,17 @@ class Restarts:
         if before is None:
             return ""
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # More than half a minute without a reply, the clock may have wrapped round.
+        # If more than half a minute passed without a reply, the clock may have wrapped round.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
             return "its clock and its counts began again"
         return ""
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that these lines name, or "". Our own firmware names it."""
+    """Return the cause of a restart that these lines name, or "".
+
+    The reference firmware names it.
+    """
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 

@@ -17,7 +17,10 @@ from acsard.checkup.wheels import OFF, TOLERANCE, Channel
 from acsard.mcu.codec import LETTERS, Motors
 
 NEAR = 0.8
-"""Share of `OFF` above which a speed is measured again. A first measurement is no more accurate."""
+"""Fraction of `OFF` above which a speed is measured again.
+
+A first measurement is no more accurate.
+"""
 
 LOOK_S = 0.75 * limits.MOTOR_S
 """Time over which the speed is measured again, s."""
@@ -38,8 +41,8 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to speed.
 
-    Returns each encoder's speed, rad/s, and the share by which the measured speed may err because
-    encoder counts are whole numbers.
+    Returns each encoder's speed, rad/s, and the fraction by which the measured speed may err
+    because encoder counts are whole numbers.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -142,7 +145,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return the angles over the probe's time, less the angle that a wheel may have coasted."""
+        """Return each angle, less the possible coasting, divided by the probe's time, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -164,7 +167,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Try a last motor that does nothing with the other form of the comma at the line's end."""
+    """Try the other form of the comma at the line's end on a last motor that does nothing."""
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):

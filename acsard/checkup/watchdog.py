@@ -27,9 +27,9 @@ from acsard.config.wire_time import FIELD
 from acsard.mcu.codec import LETTERS, Motors
 
 FED = 0.75
-"""Share of the travel at full speed from which on damaged lines feed the watchdog.
+"""Fraction of the travel at full speed from which on damaged lines feed the watchdog.
 
-A correct watchdog leaves less over the whole time.
+With a correct watchdog, the motors travel less in the same time.
 """
 
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
@@ -42,7 +42,7 @@ MOST_ASKED = 8
 """Largest number of questions. Each one halves the interval, unless the host pauses."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Shares of full speed.
+"""Fractions of full speed.
 
 From `TURNING` on the motors have not slowed down, and below `STOPPED` they stand.
 """
@@ -56,7 +56,7 @@ Between = tuple[float, float]
 class Run(Struct, frozen=True):
     """The motors' behaviour after the last line that turned them, or after a plain stop.
 
-    Distances are in s at full speed, and speeds are shares of full speed.
+    Distances are in s at full speed, and speeds are fractions of full speed.
     """
 
     silent_s: float
@@ -65,13 +65,13 @@ class Run(Struct, frozen=True):
     slow_s: float
     """Time until the motors had nearly stopped, s."""
     first: float
-    """Speed in the first reply after the silence, as a share.
+    """Speed in the first reply after the silence, as a fraction.
 
     It is the mean over the silence if the firmware computes speeds from line to line, and the
     momentary speed if it measures by its own clock.
     """
     second: float
-    """Speed in the reply after that, as a share.
+    """Speed in the reply after that, as a fraction.
 
     A quick motor has obeyed the first zero by then.
     """
@@ -203,5 +203,5 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
-    """Return the speed of the fastest of these motors as a share of the commanded speed."""
+    """Return the speed of the fastest of these motors as a fraction of the commanded speed."""
     return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED

@@ -19,10 +19,10 @@ from acsard.mcu.codec import LETTERS, Motors
 from acsard.values import WHEELS
 
 TOLERANCE = 0.25
-"""Share by which an encoder's speed may differ from the command and still belong to the motor."""
+"""Largest relative error of an encoder's speed that still belongs to the motor."""
 
 OFF = 0.05
-"""Share by which the speed may differ on a sound robot."""
+"""Largest relative error of the speed on a sound robot."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
@@ -43,7 +43,7 @@ class Channel(Struct, frozen=True):
     The motor was then not turned further.
     """
     unsure: float = 0.0
-    """Share by which the speeds may err because of a coarse encoder."""
+    """Fraction by which the speeds may err because of a coarse encoder."""
     judged: bool = True
     """Whether this computer was in time.
 
@@ -79,7 +79,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Share by which its own encoder's speed is off the command, in the worse direction."""
+        """Fraction by which its own encoder's speed is off the command, in the worse direction."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -89,8 +89,8 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # The error that would result if the motor had seemed to stand for half of the measurements
-    # because this computer was late.
+    # Lateness that would explain the error: the motor would have seemed to stand meanwhile, in half
+    # of the measurements.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     return manual.find(
         f"motor: {channel.kind}{_whose(mcu, channel)}",

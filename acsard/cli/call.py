@@ -34,7 +34,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument(
         "service",
-        type=lambda word: word.removeprefix("srv/"),  # `state` and the key table write `srv/stop`
+        # Accept `srv/stop` too, as `state` and the key table write it.
+        type=lambda word: word.removeprefix("srv/"),
         choices=CALLED,
         metavar="SERVICE",
         help=", ".join(CALLED),

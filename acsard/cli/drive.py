@@ -201,7 +201,7 @@ def _height() -> int:
 
 
 class News:
-    """Decides when to print a report on a terminal without a screen. The class is pure."""
+    """Throttle for reports on a terminal that cannot show a screen. The class is pure."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
@@ -223,7 +223,7 @@ class News:
 
 
 class Page:
-    """Repeats the help before it scrolls out of sight on a plain terminal. The class is pure."""
+    """Reports with the help, repeated before it scrolls out of sight. The class is pure."""
 
     def __init__(self) -> None:
         self._shown = NO_END

@@ -123,7 +123,7 @@ def _bracketed(text: str) -> str:
 
 
 def _state(recording: Recording) -> str:
-    """Return what is missing from the recording. Valid only after the recording has been read."""
+    """Describe the missing parts of a recording, once it has been read completely."""
     damaged = f"{recording.damaged} damaged chunks are left out" if recording.damaged else ""
     return _bracketed("; ".join(filter(None, [damaged, _ending(recording)])))
 

@@ -31,7 +31,7 @@ class Words(NamedTuple):
 
     clock: Callable[[float, bool], str]
     state: Callable[[Recording], str]
-    """Returns what is missing from a recording that has been read."""
+    """Function that returns the missing parts of a recording that has been read."""
 
 
 def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:

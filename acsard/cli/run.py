@@ -133,7 +133,8 @@ def main(args: argparse.Namespace) -> int:
 def page(config: Config, where: str) -> list[str] | None:
     """Return the arguments of `acsard web`, or None if the page is not to be started.
 
-    The page is started if a person looks at the terminal and the extra `web` is installed.
+    The page is started if `web.page` is set, standard output is a terminal, and the extra `web` is
+    installed.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")

@@ -86,7 +86,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Print the state of files and units. Return 0 if a unit is active."""
+    """Print the state of files and units. Return 0 if the daemon's unit is active."""
     from acsard.host import service
 
     for file in service.files():

@@ -1,4 +1,4 @@
-"""Explains why a tool waits, because a silent tool looks like a dead robot."""
+"""Explanations of why a tool waits: without one, a silent tool looks like a dead robot."""
 
 from __future__ import annotations
 

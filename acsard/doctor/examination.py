@@ -64,7 +64,7 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     # The service has copies of the certificates from its start. A file that has since been deleted
-    # is missed where it was.
+    # is reported at its original place.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

@@ -10,12 +10,12 @@ from acsard.doctor.running import Running
 from acsard.mcu.whose_silence import BUSY, is_ours
 
 LOST = 0.02
-"""Largest share of lines that may be lost. A sound link loses none."""
+"""Largest fraction of lines that may be lost. A sound link loses none."""
 
 DAY_S = 86400.0
 
 ENOUGH = 40
-"""Number of lines sent between both states from which on the share of losses is meaningful."""
+"""Number of lines sent between both states from which on the fraction of losses is meaningful."""
 
 
 def link(running: Running) -> Iterator[Finding]:

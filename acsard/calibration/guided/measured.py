@@ -28,7 +28,7 @@ from acsard.config.settings import DriveConfig
 BLOCK_S = 4.0
 
 WORST_TRACK, WORST_RATIO = 0.1, 0.02
-"""Largest useful standard deviations, as shares: of the track, and of the ratio of radii."""
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
 
 TURNED, STRAIGHT = np.pi, 0.5
 """Turns that classify a reading, rad.

@@ -3,7 +3,7 @@
 Each reading says where the robot ended relative to the last place where it was positioned: how far,
 how much turned, or where in x and y. The fit is Gauss-Newton on all readings, as for positions
 (`calibration/places.py` sums the path). A reading is off by the error of tape and eye and by
-skidding on the way. If there are enough readings, they show themselves how much the robot skidded.
+skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ It grows with the square root of the distance.
 """
 
 STRETCH = 0.002
-"""Error of a distance by skidding, as a share of it."""
+"""Error of a distance by skidding, as a fraction of it."""
 
 UNKNOWN = 1.0
-"""Prior standard deviation of the mean radius, as a share."""
+"""Prior standard deviation of the mean radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Number of readings that the assumed noise (`SKIDDING`, `STRETCH`) counts as."""
+"""Weight of the assumed noise (`SKIDDING`, `STRETCH`), as a number of readings."""
 
 LEAST_FREE = 3.0
 MOST_STEPS = 50
@@ -51,7 +51,7 @@ SMALL = 1e-9
 ACTIVE = [LEFT, RIGHT, TURN, RATE]
 
 TELLS = 0.2
-"""Largest standard deviation, as a share of the turn, of a reading that shows the robot's turn."""
+"""Largest standard deviation of a usable turn reading, as a fraction of the turn."""
 
 
 class Reading(Struct, frozen=True):

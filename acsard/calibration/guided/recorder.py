@@ -36,7 +36,7 @@ class Sample(Struct, frozen=True):
 
 
 class Recorder:
-    """Collects the samples of one leg."""
+    """Recorder of the samples of one leg."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._right = joints[0], joints[3]

@@ -28,7 +28,7 @@ DOUBT_S = 1.0
 """Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Deviation that is allowed: m/s, rad/s, and a share of the command in addition."""
+"""Deviation that is allowed: m/s, rad/s, and a fraction of the command in addition."""
 
 STILL = 0.02
 """Speed below which a wheel stands, rad/s."""
@@ -79,7 +79,7 @@ class Riding:
         return self.phase in (Phase.DONE, Phase.HALTED)
 
     def progress(self, now: float) -> float:
-        """Return the share of the leg that is done; 1 when it is over."""
+        """Return the fraction of the leg that is done; 1 when it is over."""
         if self.over:
             return 1.0
         if self._number < 0:

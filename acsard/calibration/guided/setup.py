@@ -1,8 +1,8 @@
 """Speeds and distances of the drive, so that the robot stays on 3 m x 3 m and within its limits.
 
 The true turns are unknown, since they are what the calibration measures. The plan allows for an
-effective track of 1 to 2.5 times the geometric one. Every way is therefore driven there and back,
-along a line that the robot was set on, or after turns that were measured.
+effective track of 1 to 2.5 times the geometric one. Each drive therefore goes there and back,
+follows a line that the robot was set on, or comes after turns that were measured.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ STOPS_IN = 0.1
 """Distance that the robot may roll on when a leg ends, m."""
 
 WIDEST = 2.5
-"""Largest effective over geometric track that the plan allows for. The smallest is 1."""
+"""Largest ratio of effective to geometric track that the plan allows for. The smallest is 1."""
 
 
 class Setup(Struct, frozen=True):
@@ -90,7 +90,7 @@ class Setup(Struct, frozen=True):
         Args:
             angle: the true angle in rad, positive to the left.
             rate: the wanted true rate in rad/s; the limits may reduce it.
-            track: effective over geometric track.
+            track: the ratio of effective to geometric track.
         """
         told = abs(self.command(rate * track))
         return Move(abs(angle) * track / (told * self._believed), 0.0, math.copysign(told, angle))

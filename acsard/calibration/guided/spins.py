@@ -30,7 +30,7 @@ MOST_SPIN_S = 24.0
 """Longest time for several turns on the spot, s."""
 
 BELIEVABLE = 0.85, 3.0
-"""Credible effective track over the geometric one. Outside this range, a reading must be wrong."""
+"""Credible ratios of effective to geometric track. Outside them, a reading must be wrong."""
 
 
 def once_round(setup: Setup, words: str) -> Leg:
@@ -47,7 +47,7 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
 
 
 def effective(reading: Reading, drive: DriveConfig) -> float:
-    """Return the approximate effective over geometric track that one reading of turns shows.
+    """Return the approximate ratio of effective to geometric track by one reading of turns.
 
     Raises `GuideError` if it is not credible.
     """

@@ -15,9 +15,9 @@ T = TypeVar("T")
 
 
 class GuideError(AcsardError):
-    """The guided drive cannot continue.
+    """End of a guided drive that cannot continue. The text says why and what to do.
 
-    The text says why and what to do; nothing has been written.
+    Nothing has been written.
     """
 
 

@@ -65,7 +65,7 @@ def spin(setup: Setup, number: int, track: float) -> Leg:
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Return the driving time in s for an effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = (straight(setup), back(setup), first_turn(setup))
     return sum(leg.seconds for leg in legs) + sum(
         spin(setup, number, track).seconds for number in (0, 1)

@@ -82,7 +82,7 @@ def length(setup: Setup) -> float:
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Return the driving time in s for an effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = (straight(setup), first_turn(setup), *(square(setup, side, track) for side in (1, -1)))
     return sum(leg.seconds for leg in legs)
 

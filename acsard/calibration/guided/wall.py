@@ -88,7 +88,7 @@ def spun(setup: Setup, track: float) -> Leg:
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Return the driving time in s for an effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = [out(setup), first_turn(setup), home(setup), spun(setup, track)]
     legs += [there_and_back(setup, side, track) for side in (1, -1)]
     return sum(leg.seconds for leg in legs)
@@ -124,8 +124,8 @@ def way(setup: Setup) -> Way:
 def _off(apart: float, end: str) -> Part[float]:
     """Ask for the distances of two corners from the wall and return the heading error.
 
-    The result is in rad, positive to the left of the right angle to the wall. `end` is the end of
-    the robot that faces the wall.
+    The result is in rad, positive to the left, and 0 if the robot is square to the wall. `end` is
+    the end of the robot that faces the wall.
     """
     left = yield from millimetres(f"From the wall to the robot's {end} left corner?", 0, 2500)
     right = yield from millimetres(f"And to its {end} right corner?", 0, 2500)

@@ -12,7 +12,7 @@ from acsard.calibration.guided.setup import WIDEST, Setup
 from acsard.calibration.guided.steps import Way
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
-"""Effective over geometric tracks for which the driving time is computed.
+"""Ratios of effective to geometric track for which the driving time is computed.
 
 The time is not monotonic: a smaller track lets more whole turns fit into the time allowed.
 """
@@ -24,7 +24,7 @@ class Kind(Struct, frozen=True):
     needs: str
     begin: Callable[[Setup], Way]
     longest_s: Callable[[Setup, float], float]
-    """Returns the driving time in s for a setup and an effective over geometric track."""
+    """Driving time in s by the setup and the ratio of effective to geometric track."""
     person: bool
     """Whether a person has to read off numbers."""
 
