@@ -1,1 +1,3 @@
-"""Shell: the machine beneath us: clock, timers, threads, scheduling, systemd, journal, logs."""
+"""Access to the machine: clock, timers, threads, scheduling, processes, systemd, journal and
+logs.
+"""
