@@ -63,8 +63,7 @@ class _Rate:
 
     def due(self, now_ns: int, at_once: bool = False) -> bool:
         # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
-        # would
-        # wait for the next period.
+        # would wait for the next period.
         if not at_once and now_ns < self._next_ns - self._period_ns // 20:
             return False
         behind = at_once or now_ns - self._next_ns > self._period_ns

@@ -101,8 +101,7 @@ class Course:
         self.robot, self.memory = self._state or (begins, Memory())
         if self._state is not None:
             # A state recorded by other code may lack parts that this version has, so adopt them
-            # from a new
-            # robot.
+            # from a new robot.
             begun = Robot(config_of(recording))
             with self.living():
                 adopt(self.robot, begun, begins)
