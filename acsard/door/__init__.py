@@ -1,1 +1,3 @@
-"""Shell: the door, a process of its own that ends the network's connections (`acsard door`)."""
+"""The TLS gateway (`acsard door`): a separate process that terminates connections from the
+network.
+"""
