@@ -33,9 +33,8 @@ class Attendant(Protocol):
     def start(self, text: str, by_key: bool = False) -> None:
         """Return when the leg may begin.
 
-        Raises `KeyboardInterrupt` if the person leaves.
-
-        `by_key` says that a key press is the intended end of the leg.
+        Raises `KeyboardInterrupt` if the person leaves. `by_key` says that a key press is the
+        intended end of the leg.
         """
 
     def number(self, ask: Ask) -> float:
@@ -145,8 +144,8 @@ def attending() -> Iterator[Person]:
 def interrupted_by(numbers: Sequence[signal.Signals]) -> Iterator[None]:
     """End the block on these signals as on Ctrl-C, so that zeros are sent.
 
-    Ctrl-Z is included because a suspended program would leave the robot driving. A second signal
-    does not disturb the zeros.
+    The caller passes SIGTSTP (Ctrl-Z) too, because a suspended program would leave the robot
+    driving. A second signal does not disturb the zeros.
     """
 
     def end(number: int, frame: FrameType | None) -> None:

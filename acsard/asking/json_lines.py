@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 HEARD_S = 0.9
-"""Longest silence of the program while something may move, s. Zeros are sent within a second of its
-last line.
+"""Longest silence of the program while something may move, s. Zeros then follow within a second of
+its last line.
 
 The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
 after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
@@ -49,13 +49,11 @@ hand, each command is a sign of life, and the source's timeout applies.
 LISTEN_S = 0.05
 
 LEAVING_S = 1.0
-"""Time to wait for the reader thread at the end, s, if the program does not read the last
-output.
-"""
+"""Time to wait for the reader thread at the end, s, if the program does not read."""
 
 LINE_BYTES = 65536
-"""Largest length of an input line. A program that sends a longer one is faulty, and is not read
-further.
+"""Largest length of an input line. A longer one interrupts the verb, because the program is
+faulty.
 """
 
 CHECK_STEPS = 16
@@ -126,10 +124,8 @@ class JsonLines:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file.
 
-        Returns whether it was done.
-
-        The question is asked only if the file can be changed. `trouble` is a reason not to write,
-        or "".
+        Returns whether it was done. The question is asked only if the file can be changed.
+        `trouble` is a reason not to write, or "".
         """
         try:
             if trouble:
@@ -179,8 +175,9 @@ class JsonLines:
     # Input
 
     def pressed(self, wait_s: float) -> bool:
-        """Return whether a key was pressed since the last answer or call; wait up to `wait_s` s
-        for one.
+        """Return whether a key was pressed since the last answer or call.
+
+        Waits up to `wait_s` s for one.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)

@@ -31,10 +31,9 @@ LEAVES = "q"
 class Screen:
     """Output of a check.
 
-    Findings go to standard output one by one, or all together as one JSON object.
-
-    The present activity is a line on the terminal that the next output overwrites. It is left out
-    if standard error is a pipe.
+    Findings go to standard output one by one, or all together as one JSON object. The present
+    activity is a line on the terminal that the next output overwrites. It is left out if standard
+    error is a pipe, and for JSON output.
     """
 
     def __init__(self, as_json: bool = False) -> None:

@@ -41,9 +41,7 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class NumberedMcu(FakeMcu):
-    """Simulated board whose lines each report a different speed, at the usual times and in the
-    usual form.
-    """
+    """Simulated board with the usual timing, each of whose lines reports a different speed."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)

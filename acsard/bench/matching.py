@@ -45,8 +45,9 @@ class Fed(Struct, frozen=True):
 
 
 def staircase(number: int) -> float:
-    """Return the wheel speed that stands for `number`, rad/s: up in even steps, down in odd
-    ones.
+    """Return the wheel speed that stands for `number`, rad/s.
+
+    The speeds rise over the even steps of the scale and fall over the odd ones.
     """
     half = STEPS // 2
     place = number % STEPS

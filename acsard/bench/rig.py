@@ -207,9 +207,8 @@ class Rig:
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
         """Send commands at random phases for `seconds`.
 
-        Returns the share of a core that the program used.
-
-        `wheel_speed` returns the speed of all wheels for the n-th command, rad/s.
+        Returns the share of a core that the program used. `wheel_speed` returns the speed of all
+        wheels for the n-th command, rad/s.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)

@@ -26,8 +26,7 @@ from acsard.config.writing import document
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """Return the configuration to measure with, which has a robot id, a bus and a source of its
-    own.
+    """Return the configuration to measure with: it has its own robot id, bus and source.
 
     With the simulator, a command must reach the next line unchanged, and feedback that does not
     match it must not be a fault. Lines are plain there, because the sequence number of a checked

@@ -1,6 +1,4 @@
-"""Prints the figures of `acsard bench`, with the machine and the points between which each was
-taken.
-"""
+"""Prints the figures of `acsard bench`, with the machine and the measuring points."""
 
 from __future__ import annotations
 
@@ -67,9 +65,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines that became odometry here."""
     lines_waiting_max: int | None
-    """Largest number of newer feedback lines handed over by the time of a sample; null on a real
-    port.
-    """
+    """Largest number of newer lines handed over by the time of a sample; null on a real port."""
     lines_sent: int
     """Lines that the daemon handed to the port, counted up to the same moment as
     `missed_periods`.

@@ -31,8 +31,8 @@ to do:
     NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
                                         its files
     CertificateError   ValueError       the certificates do not exist or cannot be used
-    UsageError         ValueError       an endpoint, id, key or number is not valid, or neither is
-                                        the file that ACSARD_CONFIG names
+    UsageError         ValueError       an endpoint, id, key or number is not valid, or the
+                                        file that ACSARD_CONFIG names is not valid
     DecodeError                         a payload is not a message of acsard
 """
 

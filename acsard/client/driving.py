@@ -104,7 +104,7 @@ def drive(
             watch.require(grace)
         yield from _stopping(robot, watch)
     finally:
-        # Whatever interrupts the drive, tell the robot to stop.
+        # Send a zero at the end, even if an exception interrupts the drive.
         robot.send(0.0, 0.0)
         watch.end()
 
@@ -144,7 +144,7 @@ def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
             continue
         linear, angular = watch.state.linear, watch.state.angular
         if linear is None or angular is None:
-            # Without feedback it is unknown whether the robot stands.
+            # Without feedback, it is unknown whether the robot stands.
             continue
         speed = max(abs(linear) / STANDS[0], abs(angular) / STANDS[1])
         if speed < 1.0:
@@ -166,9 +166,7 @@ class _Watch:
         self.state: RobotState | None = None
         self.heard = self._asked = time.monotonic()
         self.objection: str | None = None
-        """Why the robot does not follow, by the last state; "" if it follows, None before the
-        first state.
-        """
+        """Why the robot does not follow, by the last state; "" if it does, None without a state."""
         self._fine = self.heard
         self._unreadable = False
 

@@ -139,11 +139,9 @@ class Client:
     def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
-        Repeat it to keep moving.
-
-        The first call sends a zero instead, because the daemon requires one before it drives.
-        `stamp_ns` is for a program that forwards commands: the time of the command by the clock of
-        its origin, ns.
+        Repeat it to keep moving. The first call sends a zero instead, because the daemon requires
+        one before it drives. `stamp_ns` is for a program that forwards commands: the time of the
+        command by the clock of its origin, ns.
         """
         if self._opened:
             self._put(linear, angular, stamp_ns)
@@ -189,9 +187,7 @@ class Client:
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
     def get(self, name: str) -> Any:
-        """Return the last value of a key as its typed message: a published key, `info`,
-        `config`, …
-        """
+        """Return the last value of a key as its typed message: `odom`, `state`, `info`, …"""
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
@@ -199,9 +195,7 @@ class Client:
         return self._ask(name)
 
     def whoami(self) -> Identity:
-        """Return this client's identity as the daemon sees it; the role is "" if the daemon
-        confirms none.
-        """
+        """Return this client's identity as the daemon sees it. An unknown role is ""."""
         return identity(self.ask, self._tls, self.sender, self._id, self._endpoint)
 
     def pose(self) -> Pose:
@@ -325,9 +319,7 @@ class Client:
         return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Convert the error to its documented type, and mention the certificate if it may be the
-        cause.
-        """
+        """Convert the error to its documented type, and add the role of the certificate in it."""
         if isinstance(error, UnheardError) and not self._tls:
             return NotDrivenError(str(error))
         if not self._tls:

@@ -1,3 +1,1 @@
-"""Pure: decodes `acsard.toml` to one frozen `Config`, or to errors that name each key and its
-fix.
-"""
+"""Pure: decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix."""

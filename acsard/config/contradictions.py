@@ -301,6 +301,4 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules, each a function of its own. A rule that reads a key without a valid value is
-skipped.
-"""
+"""The rules, one function each. A rule that reads a key without a valid value is skipped."""

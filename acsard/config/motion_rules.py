@@ -13,9 +13,7 @@ from acsard.config.partial import Rule, told
 from acsard.config.settings import Config
 
 LEAST_JERK = 0.01
-"""Smallest jerk limit, m/s3 or rad/s3. With less, a robot takes over ten seconds to walking
-pace.
-"""
+"""Smallest jerk limit, m/s3 or rad/s3. With less, walking pace takes over ten seconds."""
 
 LONGEST_STOP_S = 2.0
 """Longest time from full speed to rest by a stop, s: the longest that a person who stops the
@@ -95,9 +93,7 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Find a feedback limit that would drop lines, or latch faults, in motion that the limits
-    allow.
-    """
+    """Find a feedback limit that would drop lines or latch faults in allowed motion."""
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
     if most >= needed:
@@ -125,9 +121,7 @@ def _reply_problems(config: Config) -> list[str]:
 
 
 def longest_reply(fault_s: float) -> float:
-    """Return the longest allowed `mcu.reply_period`, s; `fault_s` is `feedback.fault_time` (0:
-    no faults).
-    """
+    """Return the longest allowed `mcu.reply_period`, s, for this `feedback.fault_time` (0: off)."""
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
 

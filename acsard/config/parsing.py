@@ -31,9 +31,8 @@ class ConfigError(AcsardError):
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
     """Decode a configuration file.
 
-    Raises `ConfigError` with every problem found.
-
-    `overrides` are values from the command line, by table and key; they win over the file.
+    Raises `ConfigError` with every problem found. `overrides` are values from the command line, by
+    table and key; they win over the file.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError([f"{len(text)} bytes: not a configuration; at most {MAX_BYTES}"])

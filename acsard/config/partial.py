@@ -21,9 +21,7 @@ class SpoiltError(AcsardError):
 
 
 def without(config: Config, spoilt: Set[str]) -> Config:
-    """Return a view of the configuration in which reading a `spoilt` (dotted) key raises
-    `SpoiltError`.
-    """
+    """Return a view of the configuration that raises `SpoiltError` for these dotted keys."""
     return cast(Config, _View(config, "", spoilt)) if spoilt else config
 
 

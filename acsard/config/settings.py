@@ -359,9 +359,7 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control periods per second. "auto" is the highest rate that fits the wire comfortably,
-        up to 100.
-        """
+        """Control periods per second. "auto" is the highest comfortable rate, at most 100."""
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

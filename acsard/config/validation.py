@@ -94,8 +94,9 @@ def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoil
 
 
 def _finite(raw: object) -> bool:
-    """Return whether all numbers are finite: TOML can spell inf and nan, and msgspec's bounds
-    admit inf.
+    """Return whether all numbers are finite.
+
+    TOML has inf and nan, and msgspec's bounds admit inf.
     """
     if isinstance(raw, list):
         return all(_finite(item) for item in raw)

@@ -18,8 +18,8 @@ CHECK_BYTES = 8
 """Length of `#07*585F`: sequence number and check, in both directions."""
 
 SAMPLE_BYTES = 21
-"""Length of `@` and the five sample fields of a reply. The command that asks for them has one
-more letter.
+"""Length of `@` and the five sample fields of a reply. A command asks for them by one more
+letter.
 """
 
 FIELD = 65536
@@ -52,7 +52,5 @@ def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
 
 
 def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
-    """Return the highest rate, in lines of `count` bytes per second, that uses at most `use` of
-    the wire.
-    """
+    """Return how many lines of `count` bytes per second use at most the share `use` of the wire."""
     return int(use * baud_rate / (count * BITS_PER_BYTE))

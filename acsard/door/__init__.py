@@ -1,3 +1,1 @@
-"""The TLS gateway (`acsard door`): a separate process that terminates connections from the
-network.
-"""
+"""The TLS gateway (`acsard door`): a process that terminates connections from the network."""

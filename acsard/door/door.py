@@ -29,7 +29,7 @@ from acsard.values import NS_PER_S
 CONNECT_S = 1.0
 
 ASK_NS = NS_PER_S
-"""Interval between two queries to the daemon, ns. A query without an end after this time counts."""
+"""Interval between two queries to the daemon, ns. A query that has not ended by then counts."""
 
 LET_GO_S = 60.0
 """Time after which Zenoh itself ends a query, s; that is not an answer. It is long after the
@@ -96,8 +96,9 @@ class Door:
 class Question:
     """Repeated query to the daemon, because an open connection does not prove that data arrives.
 
-    On a machine with forty times its load, two gateways ended within half a minute. The connection
-    of the third stayed open for minutes, while the daemon's Zenoh did not read from it.
+    On a machine with forty times the work that it can do, two gateways ended within half a minute.
+    The connection of the third stayed open for minutes, while the daemon's Zenoh did not read from
+    it.
     """
 
     def __init__(self, key: str) -> None:

@@ -35,9 +35,7 @@ _GRAMMAR = re.compile(r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)
 
 
 def why(error: zenoh.ZError) -> str:
-    """Return Zenoh's complete message about a configuration that it cannot use, with the
-    position.
-    """
+    """Return Zenoh's complete message about an invalid configuration, with the position."""
     text = str(error)
     if match := _KNOWN.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])

@@ -21,7 +21,8 @@ TOLD_EVERY_NS = 60 * NS_PER_S
 
 UNANSWERED = 4
 """Number of consecutive queries without an end, each at least a second old, that show a dead
-connection: data from the network does not reach the daemon although the connection is open.
+connection. Data from the network then does not reach the daemon, although the connection is
+open.
 """
 
 NAMES = 5
@@ -56,9 +57,7 @@ class Watch:
     """Judgement of one look after the other."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = DOOR_EVENTS) -> None:
-        """Start at the monotonic time `opened_ns`; `most` is the largest number of connections
-        from outside.
-        """
+        """Start at the monotonic time `opened_ns`, with at most `most` connections from outside."""
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)

@@ -80,8 +80,9 @@ class Watched:
         self._leaving = False
 
     def run(self) -> Exit:
-        """Run the process: return OK after a signal or the holder's end, FAILURE if it must
-        restart.
+        """Run until the process must end.
+
+        Returns OK after a signal or the holder's end, and FAILURE if the process must restart.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._leave)

@@ -1,3 +1,1 @@
-"""Access to the machine: clock, timers, threads, scheduling, processes, systemd, journal and
-logs.
-"""
+"""Access to the machine: clock, threads, scheduling, processes, systemd, files and logs."""

@@ -19,9 +19,7 @@ class Asleep:
     """Detector that reports each suspend once."""
 
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
-        """Use `read`, which returns the time that the computer was suspended since its start,
-        ns.
-        """
+        """Use `read`, which returns how long the computer was suspended since its start, ns."""
         self._read, self._known_ns = read, read()
 
     def was(self) -> bool:

@@ -3,7 +3,7 @@
 The monotonic clock is CLOCK_MONOTONIC_RAW. NTP slews CLOCK_MONOTONIC by up to 8 %, and with it
 every distance that is computed as speed times time, and every apparent delay of a command.
 
-An `Instant` is in whole us. The digits below show only how long the reading took, and storing them
+An `Instant` is in whole us. Digits below that show only how long the reading took, and storing them
 would make a recording twice as large.
 """
 
@@ -16,15 +16,11 @@ from functools import partial
 from acsard.values import Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""Read the monotonic clock, ns. It is read a dozen times a period, so no Python function wraps
-it.
-"""
+"""Read the monotonic clock, ns. A dozen reads a period are too many for a Python wrapper."""
 
 
 def asleep_ns() -> int:
-    """Return how long this computer was suspended since its start, ns; `mono_ns` stood
-    meanwhile.
-    """
+    """Return how long this computer was suspended since its start, ns, while `mono_ns` stood."""
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
@@ -45,7 +41,7 @@ NS_PER_US = 1000
 
 
 def now() -> Instant:
-    """Read both clocks at the same time, as nearly as possible."""
+    """Read both clocks as close together as possible."""
     for _ in range(TRIES):
         mono, wall = mono_ns(), time.time_ns()
         if mono_ns() - mono < TOGETHER_NS:

@@ -12,9 +12,7 @@ PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def find(path: str | None) -> tuple[str, bytes]:
-    """Return the name and the content of the configuration; ("built-in defaults", b"") without a
-    file.
-    """
+    """Return the path and the content of the configuration, or ("built-in defaults", b"")."""
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
         try:

@@ -1,6 +1,4 @@
-"""Tells the user how to install an extra of `pyproject.toml`, as acsard is not on a package
-index.
-"""
+"""Tells how to install an extra of `pyproject.toml`, as acsard is not on a package index."""
 
 from __future__ import annotations
 

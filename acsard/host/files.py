@@ -15,9 +15,7 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
 NEW_MODE = 0o644
-"""Mode of a new configuration file. It holds no secrets, and the service reads it as another
-user.
-"""
+"""Mode of a new configuration. It holds no secrets, and the service's own user reads it."""
 
 Keys = Mapping[str, object]
 """Values by dotted keys, such as "mcu.port"."""
@@ -36,11 +34,10 @@ def require_tomlkit() -> None:
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml` and return them; a function may compute them from the
-    configuration.
+    """Set keys in an `acsard.toml`, and return them.
 
-    Raises `ExitError` and leaves the file unchanged if that is impossible. With `new` the file need
-    not exist.
+    `keys` may be a function that computes them from the configuration. Raises `ExitError` and
+    leaves the file unchanged if that is impossible. With `new` the file need not exist.
     """
     try:
         place, text, given = _changed(file, keys, new)

@@ -46,9 +46,7 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream that sends each write as a datagram; raises `OSError` if the journal cannot be
-    opened.
-    """
+    """Stream that sends each write as a datagram. Raises `OSError` without a journal."""
 
     def __init__(self, path: str = SOCKET) -> None:
         super().__init__()

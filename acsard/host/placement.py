@@ -1,6 +1,4 @@
-"""Checks whether a service can run this installation: its venv, and the Python that the venv
-uses.
-"""
+"""Checks whether a service can run this installation: the venv and the Python that it uses."""
 
 from __future__ import annotations
 
@@ -57,7 +55,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """Return the first directory on the way to `path` that other users may not enter, or None."""
+    """Return the first part of `path` that other users may not enter, or None."""
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode

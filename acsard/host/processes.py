@@ -15,9 +15,7 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys, with 256 minor numbers each. A serial port has another major
-number.
-"""
+"""Major device numbers of ptys, with 256 minor numbers each. Serial ports have others."""
 
 
 class Holder(Struct, frozen=True):
@@ -163,9 +161,7 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program's name, which is "acsard" also if Python runs acsard as a module or
-    script.
-    """
+    """Return the program's name; "acsard" also if Python runs it as a module or script."""
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

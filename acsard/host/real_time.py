@@ -12,9 +12,7 @@ import resource
 from pathlib import Path
 
 PRIORITY = 10
-"""Real-time priority: above everything that is not real-time, below the kernel's interrupt
-threads (50).
-"""
+"""Real-time priority: above ordinary processes, below the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
 """Time that the loop may run without a pause before the kernel ends it, s. The loop has priority

@@ -48,8 +48,8 @@ AGAIN = ("tty", "usb-serial", "misc")
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
-    # Start the daemon first, even if the start fails: the page's unit mounts the directory that the
-    # daemon's unit creates.
+    # Start the daemon first, and ignore a failure: the page's unit mounts the directory that
+    # systemd creates for the daemon.
     Run(("systemctl", "start", UNIT), may_fail=True),
     Run(("systemctl", "enable", "--now", *ALL)),
 )
@@ -85,11 +85,11 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that gives the service's TLS gateway these certificates; None without a
-    service.
+    """Return the step that gives the TLS gateway of the service these certificates, or None.
 
-    The unit itself may use loopback only and reads none of root's files. A drop-in that exists
-    keeps its networks, which an administrator may have narrowed.
+    None means that the service is not installed, or the user is not root. The unit itself may use
+    loopback only and reads none of root's files. A drop-in that exists keeps its networks, which an
+    administrator may have narrowed.
     """
     if os.geteuid() != 0 or not (UNITS / DOOR).exists():
         return None
@@ -142,9 +142,7 @@ def own_places() -> list[Path]:
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the other files in these places, such as certificates and an administrator's
-    drop-ins.
-    """
+    """Return the other files in these places, such as certificates and further drop-ins."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -161,8 +159,8 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    A changed file stays unless `force` is set. A `kept` file, `others`, and the `STATES` of the
-    `stateful` units stay unless `purge` is set.
+    A changed file stays unless `force` or `purge` is set; for a `kept` file only `purge` counts.
+    `others` and the `STATES` of the `stateful` units stay unless `purge` is set.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}

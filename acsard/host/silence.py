@@ -20,8 +20,6 @@ class Silence:
         self._most_ns, self._ns = most_ns, 0
 
     def too_long(self, heard: bool, passed_ns: int) -> bool:
-        """Return whether the silence now exceeds `most_ns`; `passed_ns` is the time since the
-        last call.
-        """
+        """Return whether the silence exceeds `most_ns`, `passed_ns` after the last call."""
         self._ns = 0 if heard else self._ns + min(passed_ns, MOMENT_NS)
         return self._ns > self._most_ns

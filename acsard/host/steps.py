@@ -25,9 +25,7 @@ class File(Struct, frozen=True):
     content: bytes
     mode: int = 0o644
     kept: bool = False
-    """True for a file that the user may change: it is never replaced, and removed only if it is
-    unchanged.
-    """
+    """True for a file that the user may change. It is not replaced, nor removed if changed."""
 
     def found(self) -> bytes | None:
         """Return the present content of the path, or None if the file does not exist."""
@@ -60,9 +58,7 @@ class Write(Struct, frozen=True):
         )
 
     def do(self) -> None:
-        """Write the file, in directories that the service's user can enter regardless of the
-        umask.
-        """
+        """Write the file. New directories are open to the service's user, whatever the umask."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)

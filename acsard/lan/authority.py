@@ -33,9 +33,7 @@ class Authority:
 
     @classmethod
     def make(cls, directory: Path, name: str, days: int) -> Authority:
-        """Create an authority in `directory`, valid five times as long as the certificates it
-        will sign.
-        """
+        """Create an authority in `directory`, valid five times as long as its certificates."""
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name[:64])])
@@ -53,9 +51,8 @@ class Authority:
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
         """Load the authority from `directory`.
 
-        Raises `OSError` or `ValueError` if that is impossible.
-
-        `password` is called for the password if the key is encrypted.
+        Raises `OSError` or `ValueError` if that is impossible. `password` is called for the
+        password if the key is encrypted.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -68,8 +65,8 @@ class Authority:
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the host names and IP addresses in the certificate of `directory`, or an empty
-        list.
+        """Return the host names and IP addresses in the certificate of `directory`, if it
+        exists.
         """
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
@@ -80,8 +77,7 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Write a certificate for both ends of a connection, its key and the authority's
-        certificate.
+        """Write a certificate for server and client use, its key and the authority's certificate.
 
         `addresses` are the host names and IP addresses under which its holder is reached, and
         `days` is how long it is valid.

@@ -78,9 +78,7 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """Return the names of the robot: for DNS, mDNS and itself, its present addresses, and
-    `more`.
-    """
+    """Return the robot's names: for DNS, mDNS and itself, its present addresses, `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))

@@ -32,8 +32,7 @@ _PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
 
 
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
-    """Return the configuration for these robots, and for these certificates besides those of the
-    roles.
+    """Return the configuration for these robots and for the further certificates of people.
 
     `people` maps a role to the common names of further certificates. Raises `UsageError` for a name
     that occurs twice, because a certificate belongs to one robot or to one role.

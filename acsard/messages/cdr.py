@@ -61,9 +61,8 @@ class Cdr(Generic[T]):
     def decode(self, payload: bytes) -> T:
         """Decode a message.
 
-        Raises `CdrError`, and no other exception, if the payload is not valid.
-
-        Bytes after the message are ignored as padding.
+        Raises `CdrError`, and no other exception, if the payload is not valid. Bytes after the
+        message are ignored as padding.
         """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
@@ -265,9 +264,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return the parts of a struct type in order, and the function that builds an instance from
-    values.
-    """
+    """Return the parts of a struct type in order, and the function that builds an instance."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

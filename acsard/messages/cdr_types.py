@@ -27,9 +27,7 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """Yield the dotted path and the type of every field that is not a struct, nested ones
-    included.
-    """
+    """Yield the dotted path and the type of every field, with the fields of nested structs."""
     for field in info.fields:
         kind = plain(field.type)
         if isinstance(kind, inspect.StructType):

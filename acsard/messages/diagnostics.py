@@ -1,6 +1,6 @@
 """Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, as rqt_robot_monitor shows them.
 
-A row is in every message of a run or in none: the monitor keeps a row that it has once received,
+A row is in every message of a run or in none. The monitor keeps a row that it has once received,
 and shows it as stale when it stays away. Level OK means that the robot needs no attention. WARN
 means that a person should know about it. ERROR means that it keeps the robot from driving.
 """

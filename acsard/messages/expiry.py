@@ -1,6 +1,4 @@
-"""Describes how long the certificate of the bus is valid, for `state`, `diagnostics` and
-`doctor`.
-"""
+"""Describes the validity of the bus's certificate, for `state`, `diagnostics` and `doctor`."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """The last events for the topic `events`.
 
-An event that repeats is one row with a count.
-
-A machine that misses a period every second would otherwise push a fault out of the twenty rows
-within 20 s. An event that brings news keeps a row of its own. The log has a line for each event.
+An event that repeats is one row with a count. A machine that misses a period every second would
+otherwise push a fault out of the twenty rows within 20 s. An event that brings news keeps a row of
+its own. The log has a line for each event.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""The JSON Schemas that answer queries of `schema/<Type>`: published types, received types,
-`Config`.
+"""The JSON Schemas of published types, received types and `Config`, for `schema/<Type>`.
 
 A published message has all its fields, and later versions may add more: all fields are required and
 others are allowed. A received message may omit fields with a default, and unknown fields are

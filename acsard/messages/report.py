@@ -1,5 +1,4 @@
-"""Converts `Outputs` to messages: those that are due now, and the present value of any published
-key.
+"""Converts `Outputs` to messages: those that are due, and the present value of any published key.
 
 Only messages with a subscriber are built. All messages of one feedback line carry its stamp.
 """
@@ -271,9 +270,7 @@ def from_yaw(yaw: float) -> Quaternion:
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the rotation by roll, then pitch, then yaw about the fixed axes x, y, z (REP-103),
-    rad.
-    """
+    """Return the rotation by roll, pitch and yaw about the fixed axes x, y, z (REP-103), rad."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)

@@ -53,9 +53,7 @@ class Time(Message, frozen=True):
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:
-        """Return the time `wall_ns` ns after 1970, clamped to the range of an int32 (1901 to
-        2038).
-        """
+        """Convert ns since 1970 to a `Time`, clamped to int32 seconds (1901 to 2038)."""
         sec, nanosec = divmod(wall_ns, NS_PER_S)
         return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
 
@@ -241,9 +239,7 @@ class RobotState(Message, frozen=True):
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """Use of the gyro in odometry, a value of `values.GyroDoes`."""
     encoders: list[int] = []
-    """Counts per wheel turn found in the speeds, in the order of `wheels`; 0 if the speeds show
-    none.
-    """
+    """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
     doubt: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
     sender: str = ""
@@ -311,8 +307,8 @@ class Happening(Message, frozen=True):
     by: str
     """Client that asked, sent or commands; empty if no client did."""
     count: int
-    """Number of repetitions since the last event of this name. For an event that goes on without
-    a pause of a minute, it is the number since the event began.
+    """Number of occurrences since the previous event of this name. For an event that goes on
+    without a pause of a minute, it is the number since the event began.
     """
 
 

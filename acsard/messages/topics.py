@@ -166,9 +166,7 @@ def command_key(kind: str, source: str, certificate: str = "") -> str:
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the keys on which these sources command; `certificate` "*" stands for all
-    certificates.
-    """
+    """Return the keys on which these sources command; `certificate` may be "*" for all of them."""
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 

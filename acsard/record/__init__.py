@@ -14,11 +14,11 @@ The pure modules:
 - `bag`: writes the `metadata.yaml` of a ROS bag.
 
 The modules that do I/O:
-- `recorder` takes steps from the control loop, and `disk` writes them in a thread.
-- `directory` bounds the directory of recordings.
+- `recorder`: takes steps from the control loop; `disk` writes them in a thread.
+- `directory`: bounds the directory of recordings.
 - `file`, `walk`, `closing`: write and read one MCAP file and its end.
-- `recovery` finishes a file that was cut off.
-- `state` turns a robot into bytes and back.
-- `replayed` replays a file and words the result.
-- `export` writes files for other programs, and `beside` puts each in its place atomically.
+- `recovery`: finishes a file that was cut off.
+- `state`: encodes a robot as bytes, and decodes it.
+- `replayed`: replays a file and describes the result.
+- `export`: writes files for other programs; `beside` puts each in its place atomically.
 """

@@ -19,20 +19,18 @@ class Around(Generic[File]):
         self.kind: Kind = "plain"
         """Retention class of the file that is being written."""
         self._recent: list[tuple[File, int]] = []
-        """Plain files that ended less than a minute ago, each with its end time. No incident is
-        near them.
-        """
+        """Plain files that ended less than a minute ago, each with its end time."""
         self._happened_ns = -AROUND_NS
 
     def begin(self, now_ns: int) -> None:
-        """Note that a new file begins at `now_ns`."""
+        """Register the beginning of a new file at `now_ns`."""
         self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
-        """Record an incident at `now_ns`: retain the current file, and return the earlier files to
-        retain.
+        """Retain the current file because of an incident at `now_ns`.
 
-        The returned files ended less than a minute before the incident.
+        Returns the earlier files to retain as well, which ended less than a minute before the
+        incident.
         """
         self.kind, self._happened_ns = "kept", now_ns
         close = [file for file, ended_ns in self._recent if now_ns - ended_ns < AROUND_NS]
@@ -40,7 +38,7 @@ class Around(Generic[File]):
         return close
 
     def end(self, file: File, last_ns: int) -> None:
-        """Note that the current file has ended as `file`, with its last step at `last_ns`."""
+        """Register the end of the current file as `file`, with its last step at `last_ns`."""
         self._recent = [(one, ns) for one, ns in self._recent if last_ns - ns < AROUND_NS]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
@@ -53,7 +51,5 @@ class Around(Generic[File]):
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Take over the time of an incident of the previous run, such as the crash that ended
-        it.
-        """
+        """Take over the time of an earlier incident, such as the crash of the previous run."""
         self._happened_ns = max(self._happened_ns, at_ns)

@@ -229,8 +229,8 @@ def _times(lane: Lane) -> list[int]:
 
 
 def _placed(batch: Batch) -> list[tuple[int, bool, int]]:
-    """Return for each step its time from `mono_ns` in ns, whether it is not a tick, and its
-    shape index.
+    """Return for each step the ns since `mono_ns`, whether it is not a tick, and its shape
+    index.
     """
     ticks, others = (
         [(ns, late, kind) for ns, kind in zip(_times(lane), lane.kinds, strict=True)]

@@ -45,9 +45,7 @@ class Closing(Struct, frozen=True):
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """Wall-clock time of the last message, ns since 1970. A message of steps has its first
-    step's time.
-    """
+    """Wall-clock time of the last message, ns since 1970. For steps it is that of the first one."""
     said: str
     """Summary of the events in a few words, as from `story.summary`."""
     cut: str = ""

@@ -3,7 +3,7 @@
 A column stores the difference of each number from its predicted value. The prediction is a straight
 line, the number before plus a constant step, or the number eight places before plus a constant
 step. Differences are counted in units of their common divisor and written as exponential Golomb
-codes: a small difference of either sign takes few bits, a large one takes as many as it needs.
+codes. A small difference of either sign takes few bits, a large one takes as many as it needs.
 `pack` tries the predictions and keeps the shortest.
 """
 
@@ -39,9 +39,7 @@ class Column(Struct, frozen=True, array_like=True):
     """Packed integers. Their count is not part of the column."""
 
     places: int = 0
-    """Distance to the number that predicts the next one; 0 for a prediction along a straight
-    line.
-    """
+    """Distance to the number that predicts the next one; 0 if a straight line predicts all."""
     order: int = EXACT
     """Order of the exponential Golomb codes: a small difference has about this number of bits."""
     base: int = 0

@@ -33,11 +33,11 @@ from acsard.values import NS_PER_S, Instant
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory and its files when the daemon records as a systemd service.
+"""Modes of the directory and its files when the daemon records as a systemd service: open to all.
 
-Only root can enter the directory above, and the unit of the robot's page mounts this one read-only.
-A group cannot give this access: a dynamic group has no name, and later versions of systemd (257)
-keep a state directory as nobody's on the disk.
+They are safe because only root can enter the directory above, and the unit of the robot's page
+mounts this one read-only. A group cannot give this access: a dynamic group has no name, and later
+versions of systemd (257) keep a state directory as nobody's on the disk.
 """
 
 PRIVATE = Path("/var/lib/private")
@@ -116,9 +116,7 @@ def _left(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts as long as the daemon, even when the disk fails and `Ring` is opened
-    again.
-    """
+    """State that lasts as long as the daemon, even if `Ring` is opened again after a disk error."""
 
     numbers: set[int] = field(default_factory=set)
     """Numbers of the files that ended in this run of the daemon."""
@@ -127,9 +125,7 @@ class Run(Struct):
     cut file was cut off by a crash before this run.
     """
     given: int = 0
-    """Bytes of recordings deleted for a disk that refused to write, and that has taken nothing
-    since.
-    """
+    """Bytes deleted since a disk refused to write, as long as it still refuses."""
     clock: Steady = field(default_factory=Steady)
 
 
@@ -243,8 +239,9 @@ class Ring:
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file as `Writing.finish` does, rename it by its retention class, and return
-        its path.
+        """Finish a file as `Writing.finish` does.
+
+        Returns its new path, named by its retention class.
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -296,10 +293,10 @@ class Ring:
                     os.utime(path, ns=(seen.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete the files that exceed the bounds in bytes or in age, but not the one being
-        written.
+        """Delete the files that exceed the bounds in bytes or in age.
 
-        `now` is None before a clock has been read; then no file counts as too old.
+        The file that is being written stays. `now` is None before a clock has been read; then no
+        file counts as too old.
         """
         ended, disk = self._ended(), self._disk()
         believed = now is not None and self._run.clock.believed(now)

@@ -31,9 +31,7 @@ RETRY_ROUNDS = 5
 """Rounds to wait, about one second each, after the disk refused."""
 
 BATCH = 256
-"""Largest number of steps in one message: as many as one second has, unless many commands
-arrive.
-"""
+"""Largest number of steps in one message. One second has fewer, unless many commands arrive."""
 
 LONGEST_NS = 3600 * NS_PER_S
 """Longest time that one file may cover."""
@@ -43,7 +41,7 @@ HAPPENED = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
 
 
 class Bug(NamedTuple):
-    """The daemon's own failure that ends it."""
+    """A failure of the daemon itself, which ends it."""
 
     why: str
     at: Instant | None
@@ -71,9 +69,7 @@ class OnDisk:
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """Start of the next file; None if steps before it were lost, so a new robot state is
-        needed.
-        """
+        """Start of the next file; None if steps were lost, so that a new robot state is needed."""
         self._around = Around[Path]()
         self._number = self._began_ns = 0
         self._last = Instant(0, 0)
@@ -92,8 +88,7 @@ class OnDisk:
         self._pause = 0
         self._handed = self._safe = 0
         """Steps of this round that were written to the file or counted as missing, and how many
-        of them are synced or counted. If the disk refuses, the steps that are not synced are
-        lost.
+        of them are synced or counted. Steps that are not synced when the disk refuses are lost.
         """
 
     def round(self, items: list[Taken | Start], over: bool) -> None:

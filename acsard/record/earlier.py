@@ -1,9 +1,8 @@
 """Reads batches of format 1, which recordings had until version 0.1.0.
 
-Nothing writes it any more.
-
-A column of format 1 holds the difference of each number from the median, in units of the common
-divisor of all differences. All lowest bytes come first, then all second bytes, and so on.
+Nothing writes this format any more. A column of format 1 holds the difference of each number from
+the median, in units of the common divisor of all differences. All lowest bytes come first, then all
+second bytes, and so on.
 """
 
 from __future__ import annotations

@@ -68,9 +68,7 @@ class About(Struct, frozen=True):
     """The `acsard.toml` in force, with every key."""
     format: str = FORMAT
     started_ns: Ns = 0
-    """Wall-clock time of the daemon's start, ns since 1970, which may be hours before; 0 if
-    unknown.
-    """
+    """Wall-clock time of the daemon's start, ns since 1970, perhaps hours before; 0 if unknown."""
 
 
 class Gist:

@@ -92,9 +92,7 @@ class Batch(Struct, frozen=True, array_like=True):
     order; of several steps at one time a tick comes first.
     """
     offsets: Column
-    """Change of the wall clock's offset from `offset_ns`, ns: at each read of a step, then at
-    the step.
-    """
+    """Change of the wall clock's offset from `offset_ns`, ns, at each read and then at the step."""
     ages: Column
     """Age of each read of the port at its step, ns."""
     lengths: Column
@@ -118,9 +116,7 @@ class Spread(NamedTuple):
     times: list[int]
     """Monotonic time of each step, ns."""
     offsets: list[int]
-    """Offset of the wall clock from the monotonic clock, ns: at each read of a step, then at the
-    step.
-    """
+    """Offset of the wall clock from the monotonic clock, ns, at each read and then at the step."""
     ages: list[int]
     lengths: list[int]
     received: bytes

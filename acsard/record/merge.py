@@ -1,5 +1,4 @@
-"""Applies another configuration to a recorded robot state, to show how the robot would have behaved
-with it.
+"""Applies another configuration to a recorded robot state, to replay the drive with it.
 
 Three robots take part: the recorded one in the middle of a drive, a new one with the recording's
 configuration, and a new one with the other configuration. A part of the recorded robot that still
@@ -20,7 +19,9 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
-    """Change `robot` in place; `begun` and `other` are new robots of the old and the new
+    """Change `robot` in place.
+
+    `begun` is a new robot of the recording's configuration, and `other` one of the other
     configuration.
     """
     _Walk().into(robot, begun, other)
@@ -29,9 +30,7 @@ def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
 class _Walk:
     def __init__(self) -> None:
         self._seen: dict[int, Any] = {}
-        """Visited objects by `id`. The reference keeps each alive, so its `id` is not used
-        again.
-        """
+        """Visited objects by `id`. The reference keeps each alive, so its `id` stays unique."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
         """Merge each attribute of an object."""

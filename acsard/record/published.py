@@ -44,8 +44,9 @@ class Publisher:
     """
 
     def __init__(self, robot: Robot, started_ns: int) -> None:
-        """Start with the wall-clock time of the daemon's start, which stamps messages that never
-        change.
+        """Start.
+
+        `started_ns`, the wall-clock time of the daemon's start, stamps the static messages.
         """
         self._robot, self._config = robot, robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
@@ -58,9 +59,7 @@ class Publisher:
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
-        """Yield the messages around a step that has just been replayed: commands first, log
-        lines last.
-        """
+        """Yield the messages of a step after its replay: commands first, log lines last."""
         # A setting was changed.
         if self._robot.config is not self._config:
             self._config = self._robot.config

@@ -22,9 +22,7 @@ from acsard.robot import Robot
 from acsard.values import Event, Inputs, Outputs, Recording
 
 MOST = 4096
-"""Largest number of steps in the queue. At 100 Hz, a disk may stall for 10 s before a step is
-lost.
-"""
+"""Largest number of steps in the queue. At 100 Hz a disk may stall for 10 s without a loss."""
 
 FLUSH_S = 0.98
 """Pause between two chunks. With the time that one takes to write, there is one each second."""

@@ -30,11 +30,11 @@ version cannot read it.
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make a finished file `whole` of `part`, and return a message for the log; "" if all went
-    well.
+    """Make a finished file `whole` of `part`.
 
-    `cut` is a key of `CUTS`; `room` says that the disk has room for a copy. A file without content
-    is deleted. A file that cannot be read or ended is only renamed. Raises `OSError`.
+    Returns a message for the log, or "" without trouble. `cut` is a key of `CUTS`; `room` says that
+    the disk has room for a copy. A file without content is deleted. A file that cannot be read or
+    ended is only renamed. Raises `OSError`.
     """
     seen, told = part.stat(), ""
     try:

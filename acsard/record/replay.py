@@ -99,9 +99,7 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and the guard's `memory` before the first step, or with a new
-        robot.
-        """
+        """Start with `robot` and the guard's `memory`, or with a new robot."""
         self.robot = robot or Robot(config)
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step."""
@@ -114,7 +112,7 @@ class Replay:
     def step(self, step: Step) -> Difference | None:
         """Replay a step.
 
-        Return its difference from the recording, or None if all outputs are equal.
+        Returns its difference from the recording, or None if all outputs are equal.
         """
         if step.begins:
             self._checksum = 0
@@ -182,9 +180,7 @@ class Replay:
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the speed of the fastest wheel in a line, hundredths of rad/s; 0 if it cannot be
-    read.
-    """
+    """Return the highest wheel speed in a line, hundredths of rad/s; 0 if it cannot be read."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

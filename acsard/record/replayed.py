@@ -1,4 +1,4 @@
-"""Replays a recording file, and words the result for the command line."""
+"""Replays a recording file, and describes the result for the command line."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ class Lived(NamedTuple):
     trouble: str
     """Why the replay ended before the end of the file; "" if it is complete."""
     again: str = ""
-    """How this version handles the step in which the daemon failed; "" if the daemon did not
-    fail.
-    """
+    """How this version handles the step in which the daemon failed; "" without a failure."""
 
 
 def config_of(recording: Recording) -> Config:
@@ -81,9 +79,7 @@ def steps(recording: Recording) -> Iterator[Step]:
 
 
 class Course:
-    """The steps of a recording without a gap from its beginning, and the robot that they begin
-    with.
-    """
+    """The steps of a recording up to the first gap, and the robot that they begin with."""
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
         """Use the recording's own configuration, or `other`.
@@ -263,9 +259,7 @@ def verdict(tally: Tally) -> str:
 
 
 def compared(other: bool) -> str:
-    """Explain the figures of `verdict`; `other` is true if the configuration differs from the
-    recording's.
-    """
+    """Explain the figures of `verdict`; `other` is true for another configuration."""
     by = "that configuration" if other else "this version"
     return (
         "(compared: every line to the board, every pose by odometry to the um, and the mode in "
@@ -340,9 +334,7 @@ def _set(key: str, settings: Mapping[str, object]) -> str:
 
 
 def otherwise(tally: Tally) -> list[str]:
-    """Return the lines that describe how the robot would have behaved with other code or
-    settings.
-    """
+    """Describe in lines how the robot would have behaved with other code or settings."""
     then_most, now_most = (speed / HUNDREDTHS for speed in tally.fastest)
     rows = [
         f"{tally.lines - tally.lines_same} of {tally.lines} lines would be others, "

@@ -40,9 +40,7 @@ JUMP_NS = 60 * NS_PER_S
 """A change of the wall clock against the monotonic clock above which it counts as set."""
 
 STEADY_NS = 600 * NS_PER_S
-"""Time for which the wall clock must not have been set before it may tell the age of a
-recording.
-"""
+"""Time without a step of the wall clock after which it may tell the age of a recording."""
 
 
 class Disk(NamedTuple):
@@ -82,9 +80,7 @@ class Bounds(NamedTuple):
     size: int
     """Largest total size in bytes."""
     oldest_s: float
-    """A recording that ended before this time is too old, s since 1970; -inf if no clock is
-    reliable.
-    """
+    """Recordings that ended before this time are too old, s since 1970; -inf without a clock."""
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
@@ -100,11 +96,9 @@ def too_much(
 ) -> set[str]:
     """Return the names of the recordings to delete.
 
-    `ended` is in the order of their numbers.
-
-    One more file must fit afterwards. `given` is None unless the disk refuses to write, whatever
-    free space it reports. Then it is the number of bytes that were deleted for that disk without
-    success:
+    `ended` is in the order of their numbers. One more file must fit afterwards. `given` is None
+    unless the disk refuses to write, whatever free space it reports. Then it is the number of bytes
+    that were deleted for that disk without success:
     - With 0, at least one recording is deleted.
     - Above 0 but below `LEAST_BYTES`, one more is deleted, but no protected one.
     - From `LEAST_BYTES` on, none is deleted for this reason.

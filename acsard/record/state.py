@@ -1,4 +1,4 @@
-"""Turns a robot between two steps into bytes, and back: the start of a file in a drive's middle.
+"""Encodes a robot between two steps as bytes, and decodes it, for files that begin during a drive.
 
 `freeze` uses pickle, which copies a robot in a fraction of a millisecond. `thaw` uses
 `unpickling.py`, which makes only values and the robot's own parts, and refuses anything else that a
@@ -100,11 +100,9 @@ def short(error: Exception) -> str:
 def part(module: str, name: str) -> type:
     """Return the class of a part of a robot.
 
-    Raises `ValueError` for any other name.
-
-    The class must have been defined in that module under that name, and the module must be loaded
-    already: nothing is imported. Re-exported names, functions and attributes of attributes are
-    refused.
+    Raises `ValueError` for any other name. The class must have been defined in that module under
+    that name, and the module must be loaded already: nothing is imported. Re-exported names,
+    functions and attributes of attributes are refused.
     """
     module = MOVED.get(module, module)
     if (module, name) in BESIDE:

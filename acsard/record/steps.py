@@ -111,7 +111,7 @@ class UnfinishedError(AcsardError):
 
 
 class Unfinished(Struct, frozen=True):
-    """Inputs of the step in which the daemon failed. It did not produce outputs."""
+    """Inputs of the step in which the daemon failed. The step did not produce outputs."""
 
     number: int
     inputs: Inputs
@@ -133,9 +133,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 `before` continued over the poses, speeds and wheel angles, to the last
-    bit.
-    """
+    """Continue the CRC-32 `before` over every bit of the poses, speeds and wheel angles."""
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)

@@ -122,9 +122,7 @@ NEWS = {
     "wheels_doubted": "doubted wheel",
     "link_up": "",
 }
-"""Words for the events in the summary of a recording. The word is empty for an event that only
-ends another.
-"""
+"""Words for the events in a summary; "" for an event that only ends another one."""
 
 
 def _several(word: str) -> str:

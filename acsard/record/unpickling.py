@@ -323,9 +323,7 @@ def _keys(entries: Sequence[_Entry]) -> None:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether an instance consists of its attributes alone, and making it runs no code of
-    its own.
-    """
+    """Return whether an instance is its attributes alone, and is made without code of its class."""
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 

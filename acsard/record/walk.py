@@ -1,8 +1,8 @@
 """Yields the records of an MCAP file one after the other, and skips damaged places.
 
 A chunk's length and end are known twice: from the head of its record and from its own content. A
-damaged head therefore costs nothing. Where a chunk is damaged, or a record's length leads nowhere,
-the reader searches for the next sound chunk.
+damaged head therefore costs nothing. If a chunk is damaged, or a record's length leads nowhere, the
+reader searches for the next sound chunk.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ class Found(NamedTuple):
     inside: list[McapRecord]
     """Records in a chunk; empty otherwise."""
     end: int
-    """Offset of the record's end in the file, bytes; for damage, the offset at which reading
-    goes on.
-    """
+    """Offset of the record's end in the file, bytes. After damage, reading goes on there."""
 
     @property
     def damaged(self) -> bool:
@@ -87,9 +85,9 @@ def walk(data: bytes) -> Iterator[Found]:
 def _chunk(data: bytes, stream: io.BytesIO, at: int, claimed: int) -> Found | None:
     """Return the sound chunk whose record begins at `at`, even if its head is damaged, or None.
 
-    If the head and the content of the chunk disagree about its end, the next sound chunk decides: a
-    length that is too great would swallow every record after it, because compressed data knows its
-    own end.
+    If the head and the content disagree about the chunk's end, the next sound chunk decides.
+    Compressed data decodes even if its recorded length is too great, and such a length would
+    otherwise swallow the records after it.
     """
     found = _sound(data, stream, at)
     if found is None or found.end == claimed:

@@ -1,6 +1,6 @@
 """The 33-byte attachment of every rmw_zenoh_cpp sample: sequence number, time and GID.
 
-The receiver drops a sample or a request without it; so do rmw_zenoh_cpp and acsard.
+Both rmw_zenoh_cpp and acsard drop a sample or a request without it.
 """
 
 from __future__ import annotations

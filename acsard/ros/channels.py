@@ -2,7 +2,7 @@
 
 Every topic is CDR with its message definition (MCAP's `ros2msg`). Foxglove, Lichtblick and
 PlotJuggler read any such type. `ros2 bag play` refuses a file in which any topic has another
-encoding. ROS has no message for `state`, so it has a type of its own package: `ros2 bag play`
+encoding. ROS has no message for `state`, so it has a type of its own package. `ros2 bag play`
 reports that it leaves out this topic, and the other programs show it. Names and types that exist in
 the ROS tree come from `transports.py`.
 """

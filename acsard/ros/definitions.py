@@ -75,9 +75,7 @@ RULE = "=" * 80
 
 
 def schema_text(name: str) -> str:
-    """Return the definition of a type with all nested types, each once, in MCAP's `ros2msg`
-    format.
-    """
+    """Return the definition of a type and of all nested types in MCAP's `ros2msg` format."""
     parts = [_fields(name)]
     parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
     return "".join(parts)

@@ -1,5 +1,4 @@
-"""The parameter descriptors for `describe_parameters`: description, range, and when a key may be
-set.
+"""The descriptors for `describe_parameters`: description, range, and when a key may be set.
 
 They are derived from the declarations that the configuration is checked with, so both agree.
 """
@@ -51,9 +50,7 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of a parameter; `type_of` is its ROS type, or 0 for an unknown
-    parameter.
-    """
+    """Return a parameter's descriptor; `type_of` is its ROS type, 0 for an unknown parameter."""
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
@@ -85,9 +82,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of a key of `acsard.toml`.
 
-    A source is named in place of its index.
-
-    Raises `KeyError` if the key is a table.
+    A source is named in place of its index. Raises `KeyError` if the key is a table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))

@@ -63,9 +63,7 @@ def how_often(text: str, count: int) -> str:
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """Return the message of `cmd_vel_in/<source>`: the command of a source, stamped with its
-    arrival.
-    """
+    """Return a source's command as a message of `cmd_vel_in/<source>`, stamped with its arrival."""
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
     )

@@ -1,5 +1,4 @@
-"""The liveliness tokens that ROS tools discover, their QoS strings, and the GID derived from a
-token.
+"""The liveliness tokens that ROS tools discover, their QoS strings, and the GID of a token.
 
 The formats are those of rmw_zenoh_cpp (Jazzy 0.2.4 and later) and zenoh-plugin-ros2dds 1.10. A
 token says that an endpoint exists. Data flows without it, but `ros2 topic list` and

@@ -72,9 +72,7 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix of the parameter services in place of a native key. The native tree has `config`
-instead.
-"""
+"""Prefix of the parameter services in place of a native key; the native tree has `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -91,15 +89,11 @@ SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2
 """The command source of each topic that commands the robot."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to a gyro. Its QoS accepts sensor drivers, which publish with SensorDataQoS or
-better.
-"""
+"""Subscription to a gyro; its QoS accepts drivers that publish with SensorDataQoS or better."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """Return the native keys without content, which ROS tools would otherwise show as topics in
-    use.
-    """
+    """Return the native keys without content, so that ROS tools do not show them as topics."""
     silent = set() if config.odometry.publish_tf else {"tf"}
     # The simulated robot has a gyro of its own.
     if not config.odometry.gyro or config.mcu.simulated:
@@ -141,9 +135,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Return the text with the services under their ROS names: /acsard/clear instead of
-    srv/clear.
-    """
+    """Replace the services in a text by their ROS names: srv/clear by /acsard/clear."""
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
