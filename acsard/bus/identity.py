@@ -42,7 +42,10 @@ class Identity(Struct, frozen=True):
     """The endpoint of the query."""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use a key below the robot's id, "" if it may."""
+        """Return why this client may not use a key below the robot's id.
+
+        "" means that it may, or that neither its role nor its certificate is known.
+        """
         least = least_role(key)
         if not self.role:
             return self.silence
