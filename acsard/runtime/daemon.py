@@ -109,8 +109,7 @@ async def _run(
         after = stack.enter_context(ExitStack())
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
         ends_ns = _certificates(config, door is not None)
-        # Open the bus first: if the id or the address is in use, the daemon must end before it
-        # sends the first byte to the board.
+        # The bus comes first: an id or address in use must end the daemon before the port opens.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         if simulated is not None:
