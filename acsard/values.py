@@ -1,8 +1,8 @@
 """The value types of acsard, in SI units, that every other module uses.
 
 This module holds frozen values without behaviour beyond simple arithmetic on themselves. It reads
-no clock, does no I/O and decides nothing. Types with `gc=False` are never part of a reference cycle. Wheel
-order is `WHEELS` everywhere.
+no clock, does no I/O and decides nothing. Types with `gc=False` are never part of a reference
+cycle. Wheel order is `WHEELS` everywhere.
 """
 
 from __future__ import annotations

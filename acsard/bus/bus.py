@@ -84,7 +84,7 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with about `queries` queries at most."""
+        """Return the input since the last call, with at most `queries` + 1 queries."""
         got = self._inbox.take(queries)
         routers = self._links.news()
         if routers is not None:

@@ -51,7 +51,7 @@ class Bus(Protocol):
         """Published topics that have a listener."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with about `queries` queries at most."""
+        """Return the input since the last call, with at most `queries` + 1 queries."""
 
     def publish(self, key: str, message: Message) -> None:
         """Queue a message for its listeners. `flush` sends it."""
