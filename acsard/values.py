@@ -286,7 +286,7 @@ class GyroSample(Struct, frozen=True, omit_defaults=True):
     at_ns: int
     """Monotonic time of its arrival."""
     stamp_ns: int | None
-    """Time of the measurement by the sender's clock, None if the sample does not tell it."""
+    """Time of the measurement by the sender's clock, None if the sample has no stamp."""
     rate: float
     variance: float = 0.0
     anew: bool = False

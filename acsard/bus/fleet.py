@@ -101,7 +101,7 @@ def nobody(endpoint: str) -> str:
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
-    """Subscribe to one key of all these robots. `robot_of` tells the robot of a sample."""
+    """Subscribe to one key of all these robots. `robot_of` gives the robot of a sample."""
     topic = by_key(name)
     latched = topic is not None and topic.latched
     keys = [full_key(one, name) for one in ids]

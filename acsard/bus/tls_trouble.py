@@ -21,7 +21,7 @@ REFUSAL_S = 0.5
 silence of this many seconds means that it accepts it."""
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Errors that say that no machine has the address, so that nothing is known about its ports."""
+"""Errors by which no machine has the address, so that nothing is known about its ports."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's verify codes (X509_V_ERR_...). All others mean a certificate of another authority."""

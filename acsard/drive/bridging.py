@@ -30,7 +30,7 @@ class Rolled(Struct, frozen=True, gc=False):
     """Wheel angles since the last line that was believed, rad in `WHEELS` order."""
 
     pieces: tuple[Motors, ...]
-    """The angles in the order in which they came about, one arc each, without empty ones."""
+    """The angles in the order in which they occurred, one arc each, without empty ones."""
     turned: Motors
     """The angles by the encoders' cumulative counts. They precede the `pieces`."""
     seen: Motors
@@ -122,7 +122,7 @@ class Step(Struct, frozen=True, gc=False):
     pieces: tuple[Motors, ...]
     """How far the wheels turned in it, rad."""
     gyro: Turn | None
-    """The turn by a gyro, if one told it."""
+    """The turn by a gyro, None without one."""
     speeds: WheelSpeeds
     """The speeds in the line."""
     turn: float

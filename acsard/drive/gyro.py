@@ -107,7 +107,7 @@ class Gyro:
         self._learned: Track | None = None
         """The track that the gyro before this one taught."""
         self.owes = False
-        """Whether the wheels told the turn of the last line, for the gyro to correct after its
+        """Whether the turn of the last line came from the wheels and the gyro corrects it after its
         trial."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
@@ -162,7 +162,7 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the turn until a line of the time `at_ns`, or None if only the wheels can tell it.
+        """Return the turn until a line of the time `at_ns`, or None if the wheels must provide it.
 
         `wheels` is the turn by the wheels in rad over `dt` s. `still` means that all four wheels
         stood. After a gap `dt` is 0, and the turn is that of the whole gap.
@@ -176,8 +176,8 @@ class Gyro:
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
-        # The wheels have told the turn of a silence, and the samples that end it cover that turn
-        # again. So the line after a silence is the wheels' too.
+        # The wheels have provided the turn of a silence, and the samples that end it cover that
+        # turn again. So the turn of the line after a silence comes from the wheels too.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         # The error of the bias does not average out.
@@ -250,9 +250,10 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test a gyro that is not proven yet; return whether the wheels tell the turn of this line.
+        """Test a gyro that is not proven yet; return whether this line's turn comes from the
+        wheels.
 
-        They do, except at rest, where the wheels would not notice that somebody turns the robot.
+        It does, except at rest, where the wheels would not notice that a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:

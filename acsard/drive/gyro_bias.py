@@ -12,7 +12,7 @@ KNOWN_S = 0.5
 """Seconds of rest before the bias is known."""
 
 MAX_BIAS = 0.2
-"""Greatest plausible bias, rad/s. A higher rate means that somebody turns the robot."""
+"""Greatest plausible bias, rad/s. A higher rate means that a person turns the robot."""
 
 WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate by the wheels, rad/s. From it on, a line to the other side is a new turn, not a count
-more or less."""
+"""Turn rate by the wheels, rad/s. A line at this rate or above to the other side is a new turn, not
+a difference of one count."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
 """Mean turn rate by the wheels, rad/s, over this many s; a slower motion is not a turn. With

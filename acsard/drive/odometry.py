@@ -108,7 +108,7 @@ class Odometry:
         self._twist_uncertainty.use(odometry)
 
     def turn_by(self, track: Track) -> None:
-        """Use this effective track from now on, wherever the wheels tell the turn."""
+        """Use this effective track from now on for the turns that the wheels provide."""
         if track != self._track:
             self._track, self._share = track, track.share
             parameters = columns(self._declared, self._kinematics, track)
@@ -157,9 +157,9 @@ class Odometry:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count back
-        and forth waits until its direction is clear. If `gyro` tells the turn since the line
-        before, the wheels tell the distance only. `told` is the commanded wheel speeds, by which a
-        faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
+        and forth waits until its direction is clear. If `gyro` provides the turn since the line
+        before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
+        a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
         recomputed.
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
@@ -267,7 +267,8 @@ class Odometry:
     ) -> list[tuple[float, float]]:
         """Return the arcs for these wheel angles, m and rad: (4) to (7) are linear.
 
-        A gyro tells one turn for all of them. Otherwise the track is `share` of the configured one.
+        A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
+        one.
         """
         believed, kinematics = self._witness.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]

@@ -33,7 +33,7 @@ class Told:
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """The source that sends speeds in vain, as the log knows it."""
+        """The source whose speeds do not move the robot, as last logged."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
         """Return the events for a change of the mode (with `why`) and of the commander.

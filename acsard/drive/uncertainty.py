@@ -42,7 +42,7 @@ MAX_VARIANCE = 1e9
 years."""
 
 COARSE_COUNTS = 400
-"""Counts per wheel turn if the configuration does not tell. Hardly any encoder has fewer."""
+"""Counts per wheel turn if none are configured. Hardly any encoder has fewer."""
 
 SAME_COUNT = 0.02
 """Relative difference between two angles of a count that rounding to two decimals can cause."""
@@ -149,7 +149,7 @@ class PoseUncertainty:
         """Add an arc of `distance` m through `turn` rad; in odom it leads by `dx`, `dy` m.
 
         `heading` is the direction of the chord. `variance` is that of the turn, rad2, if a gyro
-        tells it instead of the wheels. Then the wheels' parameters affect only the distance, and
+        measured it instead of the wheels. Then the wheels' parameters affect only the distance, and
         the gyro's relative `scale` error affects the turn. `slips` means that the wheels slip.
         """
         if self._lost:
@@ -182,9 +182,9 @@ class PoseUncertainty:
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Account for a gap in which the robot may have moved on by `distance` and `turn`, unseen.
 
-        The pose says that it stood. So it does in every gap, and such errors all have one direction
-        and do not average out, so they form a column like a parameter. `along` m2 and `yaw` rad2
-        are the variances of the unseen motion.
+        The pose stands still in a gap. Such errors all have one direction and do not average out,
+        so they form a column like a parameter. `along` m2 and `yaw` rad2 are the variances of the
+        unseen motion.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -231,7 +231,7 @@ class PoseUncertainty:
     ) -> None:
         """Apply F J + G_p. One half of the step's own heading error acts on its lever arm.
 
-        `scale` is that of the gyro that tells the turn, None if the wheels tell it.
+        `scale` is that of the gyro that measured the turn, None if the wheels did.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []

@@ -154,7 +154,7 @@ class Prompts:
     def answer(self, asked_ns: int | None = None) -> Answered | None:
         """Return the time of the next reply's line, or None if no line waits for a reply.
 
-        `asked_ns` is when the line was made, if the reply tells it.
+        `asked_ns` is when the line was made, if the reply names its line.
         """
         left = self._left
         if asked_ns is not None:

@@ -44,17 +44,17 @@ EXACT = 0.001
 """As DRIFT for periods that nobody has configured: a quartz's error and that of the fit."""
 
 LONE = 0.7
-"""Share of the reads with one line. From it on, lines count as read one by one."""
+"""Share of the reads with one line at which lines count as read one by one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """Largest lateness of a line in slots when a clock is found: for lines read one by one, for
 batches."""
 
 JUMP = 1.4
-"""Slots since the last line, from which on another one can be missing before a lone line."""
+"""Slots since the last line. Below this a lone line cannot have another one missing before it."""
 
 SURE = 0.15
-"""Slots beyond the greatest possible lateness, from which on a line is certainly missing."""
+"""Slots beyond the greatest possible lateness at which a line is certainly missing."""
 
 EARLY = 0.25
 """Slots by which no line of a window may be early if the clock is right."""

@@ -59,8 +59,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Seconds at the start of `dt` that no line reported. The speeds of the lines around it stand
     in."""
     asked_ns: int | None = None
-    """Monotonic time at which the answered line was made, None if the reply does not tell its
-    line."""
+    """Monotonic time at which the answered line was made, None if that line is unknown."""
     since: float = 0.0
     """Seconds since the previous line arrived, 0 after a silence. The plausibility checks use
     it."""
@@ -292,8 +291,8 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """Return how far the motors turned since the line before, or None if its counts do not
-        tell."""
+        """Return how far the motors turned since the line before, or None if its counts do not show
+        it."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -123,7 +123,8 @@ class Negotiation:
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence and time of the sealed line just made, until `settle` tells whether it left."""
+        """Sequence and time of the sealed line just made, until `settle` reports whether it
+        left."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
         """Sequences and times of the lines that left and are not answered."""
         self._knows = False

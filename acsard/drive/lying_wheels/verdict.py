@@ -20,8 +20,8 @@ from acsard.mcu.codec import Motors
 from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""rad. Range in which the angle of a count is learned if the configuration does not tell it. A
-wheel that turns slowly reports one count or none per line."""
+"""rad. Range in which the angle of a count is learned if none is configured. A wheel that turns
+slowly reports one count or none per line."""
 
 PERIOD, SMOOTHED = 0.01, 0.05
 """Assumed period of the lines, s, and weight of a new one in their mean."""
