@@ -189,8 +189,10 @@ Level = Literal["info", "warning", "error"]
 
 
 class Event(Struct, frozen=True):
-    """An event for the log; `text` is for people. `tally.py` writes at most a line per name and
-    second."""
+    """An event for the log.
+
+    `text` is for people. `tally.py` writes at most a line per name and second.
+    """
 
     name: EventName
     text: str

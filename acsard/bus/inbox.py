@@ -155,8 +155,10 @@ class Inbox:
             self._waker.command()
 
     def _line(self, key: str) -> deque[Arrival]:
-        """Return the buffer of a key. The certificates of one source share it, as they share a rate
-        limit."""
+        """Return the buffer of a key.
+
+        The certificates of one source share it, as they share a rate limit.
+        """
         held = self._arrivals.get(key)
         if held is None:
             held = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])

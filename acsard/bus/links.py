@@ -43,8 +43,10 @@ class Links:
         return self._status
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, even without `bus.connect`, because a router may have connected to the
-        daemon."""
+        """Start polling.
+
+        Poll even without `bus.connect`, because a router may have connected to the daemon.
+        """
         self._session = session
         self._thread.start()
 
@@ -94,8 +96,10 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether a link leads to the endpoint. Zenoh lists addresses; the endpoint may be a
-    name."""
+    """Return whether a link leads to the endpoint.
+
+    Zenoh lists addresses; the endpoint may be a name.
+    """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, place = bare.partition("/")
     host, _, port = place.rpartition(":")

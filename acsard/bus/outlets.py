@@ -106,8 +106,10 @@ class Outlets:
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread to send the queued messages. Raise the error that ended the thread, if
-        any."""
+        """Wake the thread to send the queued messages.
+
+        Raise the error that ended the thread, if any.
+        """
         if self._error is not None:
             raise self._error
         if self._waiting:
@@ -120,7 +122,7 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return how many messages were dropped since the last call, and whether the bus just
+        """Return how many messages were dropped since the last call, and if the bus just
         blocked."""
         dropped, self._dropped = self._dropped, 0
         began_ns, was = self._began_ns, self._stuck

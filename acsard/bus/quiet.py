@@ -1,5 +1,7 @@
-"""Explains why no sample arrives on a key. Pure: `fleet.around` looks and this module
-interprets."""
+"""Explains why no sample arrives on a key.
+
+Pure: `fleet.around` looks and this module interprets.
+"""
 
 from __future__ import annotations
 

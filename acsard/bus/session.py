@@ -76,8 +76,10 @@ def door_session(
     limited: tuple[str, ...],
     access: dict[str, object],
 ) -> zenoh.Session:
-    """Open the TLS gateway's session: a router between TLS clients and the daemon on this
-    machine."""
+    """Open the TLS gateway's session, a router.
+
+    It connects TLS clients with the daemon on this machine.
+    """
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     # Limit puts only: a flood of DELETEs, which are not stops, must not use up the limit of the
     # stops. The daemon's own session does not limit stops.
@@ -205,8 +207,10 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return the TLS settings: both ends present a certificate of one CA, and links end with
-    them."""
+    """Return the TLS settings.
+
+    Both ends present a certificate of one CA, and a link ends when its certificate does.
+    """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
         "transport/link/tls": {

@@ -20,8 +20,7 @@ QUEUED = 1000
 
 
 class Arrivals:
-    """The queue between Zenoh's thread, which fills it, and the reader, which waits for an
-    event."""
+    """The queue between Zenoh's thread, which fills it, and the waiting reader."""
 
     def __init__(self) -> None:
         self.declared: list[Any] = []
@@ -70,8 +69,10 @@ class Subscription:
     """The samples of a key in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read from a queue. With `key`, skip samples that were put on another key or a
-        wildcard."""
+        """Read from a queue.
+
+        With `key`, skip samples that were put on another key or a wildcard.
+        """
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:

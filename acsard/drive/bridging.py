@@ -134,8 +134,7 @@ class Step(Struct, frozen=True, gc=False):
 
 
 def count_of(line: Feedback) -> float:
-    """Return the angle of the coarsest encoder's count in a line with whole counts, rad; 0
-    without."""
+    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
     rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
     return max([
         step * turned / speed for turned, speed, step in rows

@@ -74,8 +74,7 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of the way in `seconds` between two known twists, m2 along and
-        rad2."""
+        """Return the variances of `seconds` between two known twists, m2 along and rad2."""
         scale = (seconds / SPAN) ** GROWTH
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds

@@ -216,8 +216,10 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return when a sample was measured, by our clock and up to a constant. Its stamp has no
-        jitter."""
+        """Return when a sample was measured, by our clock and up to a constant.
+
+        Its stamp has no jitter.
+        """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -250,8 +252,9 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test a gyro that is not proven yet; return whether this line's turn comes from the
-        wheels.
+        """Test a gyro that is not proven yet.
+
+        Return whether this line's turn comes from the wheels.
 
         It does, except at rest, where the wheels would not notice that a person turns the robot.
         """

@@ -76,8 +76,10 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Decide between a turn of a robot whose wheels stand and another bias, which stays
-        constant."""
+        """Return whether a contradicting sample belongs to another bias instead of a turn.
+
+        Another bias is one that stays constant. It then replaces this one.
+        """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
             return False

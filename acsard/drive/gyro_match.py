@@ -102,8 +102,10 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Take a line: the turns by wheels and gyro, rad, in its `dt` s. Do not learn from a
-        slip."""
+        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
+
+        Do not learn from a slip.
+        """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
         # Take the mean of two lines, because a count more or less is a step.
@@ -118,8 +120,10 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether the gyro contradicts the wheels, given its variance over the window,
-        rad2."""
+        """Return whether the gyro contradicts the wheels.
+
+        `variance` is that of the gyro's turn over the window, rad2.
+        """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:
             return False

@@ -36,8 +36,10 @@ Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not bel
 
 
 class Trial:
-    """The trial of a gyro, line by line until it is proven. A refuted gyro may still be proven
-    later."""
+    """The trial of a gyro, line by line until it is proven.
+
+    A refuted gyro may still be proven later.
+    """
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"

@@ -74,8 +74,10 @@ class Kinematics:
         )
 
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
-        """Return the twist, scaled down until no wheel exceeds `wheel_speed` rad/s. Curvature is
-        kept."""
+        """Return the twist, scaled down until no wheel exceeds `wheel_speed` rad/s.
+
+        Curvature is kept.
+        """
         speeds = self.wheel_speeds(twist)
         fastest = max(abs(speeds.front_right), abs(speeds.front_left))
         if fastest <= wheel_speed:

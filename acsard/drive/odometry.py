@@ -117,8 +117,10 @@ class Odometry:
             self._twist_uncertainty.bent_by(parameters, apart)
 
     def set_pose(self, pose: Pose) -> None:
-        """Set the pose of base_link in odom, as certain as at the start. The wheel angles
-        continue."""
+        """Set the pose of base_link in odom, as certain as at the start.
+
+        The wheel angles continue.
+        """
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
@@ -228,8 +230,10 @@ class Odometry:
         return self._kinematics.moved(self._witness.believed(turned))[1]
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles to advance by. At rest, hold counts until their direction is
-        clear."""
+        """Return the wheel angles to advance by.
+
+        At rest, hold counts until their direction is clear.
+        """
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)

@@ -97,8 +97,10 @@ class _Wheel:
 
 
 class Sanity:
-    """The judgement of feedback, line by line, with the last possible line and each wheel's
-    evidence."""
+    """The judgement of feedback, line by line.
+
+    It remembers the last possible line and the evidence against each wheel.
+    """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback

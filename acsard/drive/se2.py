@@ -38,8 +38,10 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 
 
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
-    """Return xx, xy and yy of E[[a, b] [a, b]'], a and b independent with covariances `p` and
-    `q`."""
+    """Return xx, xy and yy of E[[a, b] [a, b]'].
+
+    The errors a and b are independent and have the covariances `p` and `q`.
+    """
     return (
         p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
         p.yyaw * q.xyaw - p.xy * q.yawyaw - p.yawyaw * q.xy + p.xyaw * q.yyaw,
@@ -48,8 +50,10 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """Return E[[e, [e, b]] b'] plus its transpose, where b has covariance `p` and `a` is E[e
-    yaw]."""
+    """Return E[[e, [e, b]] b'] plus its transpose.
+
+    The error b has the covariance `p`, and `a` is E[e yaw].
+    """
     x, y, yaw = a
     return PoseCovariance(
         2 * (x * p.xyaw - yaw * p.xx),

@@ -1,5 +1,7 @@
-"""Creates the events about modes, commanders and commands. `drive/tally.py` decides how often to
-log."""
+"""Creates the events about modes, commanders and commands.
+
+`drive/tally.py` decides how often to log.
+"""
 
 from __future__ import annotations
 
@@ -53,8 +55,7 @@ class Told:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return an event, once, if a source has sent speeds for some time that do not move the
-        robot."""
+        """Return an event, once, if a source keeps sending speeds that do not move the robot."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

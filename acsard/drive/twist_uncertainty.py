@@ -94,8 +94,10 @@ class TwistUncertainty:
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of a robot whose wheels reported no speed for `seconds`; see
-        `of`."""
+        """Return the variances of a robot whose wheels reported no speed for `seconds`.
+
+        `step` is the quantization step as in `of`.
+        """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
             max(LEAST, self._to_linear * quantum),
@@ -104,8 +106,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances for wheels that slip, also sideways, because a robot skids
-        sideways."""
+        """Return the variances for wheels that slip, which also moves the robot sideways."""
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),

@@ -98,8 +98,10 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the angle of a count. Each side is the mean of two wheels, which may stand anywhere
-        in it."""
+        """Set the angle of a count.
+
+        Each side is the mean of two wheels, which may stand anywhere in it.
+        """
         self._count, count = angle, self._radius * angle
         self._play = count / self._track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / self._track**2, 0.0)
@@ -211,8 +213,10 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Give up the position: a robot that moves without a known heading or position knows
-        neither."""
+        """Give up the position.
+
+        A robot that moves without a known heading or position knows neither.
+        """
         if distance or turn:
             self.covariance = NOWHERE
 

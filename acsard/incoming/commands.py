@@ -196,8 +196,10 @@ class Receiver:
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """Decode a service query into a request that is answered by `ticket`; raise
-        `DecodeError`."""
+        """Decode a service query into a request that is answered by `ticket`.
+
+        Raise `DecodeError` if it is not a valid request.
+        """
         if verb not in EXAMPLES or (verb in MAY_BE_PLAIN and not payload):
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:

@@ -20,8 +20,10 @@ class DoorTold:
         self._last = DoorState(0, 0, 0)
 
     def hear(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Count the news in a report; return the wall time at which the certificate ends, if it is
-        known."""
+        """Count the news in a report.
+
+        Return the wall time at which the certificate ends, if it is known.
+        """
         try:
             told = _decoder.decode(arrival.encoding, arrival.payload)
         except DecodeError:

@@ -54,8 +54,10 @@ class ImuTold:
     """Follower of the gyros on the bus, one at a time."""
 
     def __init__(self, own: bool = False) -> None:
-        """Start. With `own` the robot is the simulated one, whose gyro is the only one that
-        counts."""
+        """Start.
+
+        With `own` the robot is the simulated one, whose gyro is the only one that counts.
+        """
         self._own = own
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS

@@ -190,8 +190,10 @@ class Prompts:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest line it can answer: only its wire time is known
-        yet."""
+        """Assign the first reply to the newest line that it can answer.
+
+        Only the wire time of a reply is known yet.
+        """
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -229,8 +231,10 @@ class Prompts:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Return whether the line given up last was not lost; if it was, give up the lines lost
-        now."""
+        """Return whether the line given up last was not lost.
+
+        If it was, give up the lines lost now.
+        """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
         self._missing -= LOSING * self._missing

@@ -138,8 +138,7 @@ class Slots:
         return self._lag * self.usual
 
     def time_ns(self, behind: int) -> int:
-        """Return when the line was complete that lies `behind` lines before the read's last one,
-        ns."""
+        """Return when a line was complete, ns, that lies `behind` lines before the last one."""
         return int(self._first + (self._slot - behind) * self.usual)
 
     def place(self, behind: int) -> float:
@@ -230,8 +229,10 @@ class Slots:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct c and T by equations (2) and (3), or give the clock up if the window contradicts
-        it."""
+        """Correct c and T by equations (2) and (3).
+
+        If the window contradicts the clock, give the clock up instead.
+        """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > MOST_LOST or least < -EARLY or least == math.inf:
@@ -248,8 +249,10 @@ class Slots:
         self._begin(at_ns)
 
     def _nominal(self) -> float:
-        """Return the period that the firmware means: configured, in whole milliseconds, or as
-        measured."""
+        """Return the period that the firmware means.
+
+        It is a configured period, a whole number of milliseconds, or the measured period.
+        """
         seconds = self.usual / NS_PER_S
         for known in self._known:
             if abs(seconds / known - 1) < DRIFT:
@@ -259,8 +262,10 @@ class Slots:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of each read's last line if lines are `period` ns apart, with missing
-    ones."""
+    """Return the slot of each read's last line.
+
+    A gap between reads adds missing lines if lines are `period` ns apart.
+    """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -278,8 +283,10 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the time of slot 0 at which no line is early, ns, and each line's lateness in
-    slots."""
+    """Return the latest time of slot 0, ns, and each line's lateness in slots.
+
+    The time is such that no line is early.
+    """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
     return first, [(offset - first) / period for offset in offsets]

@@ -90,8 +90,10 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the speeds in a line without its end; raise `FrameError` unless all of it is
-        valid."""
+        """Return the speeds in a line without its end.
+
+        Raise `FrameError` unless all of it is valid.
+        """
         match = _LINE.fullmatch(line)
         if match is None:
             raise FrameError("malformed", line)

@@ -140,8 +140,10 @@ class Timeline:
         self._habit.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """Take a read of `size` bytes that completes `lines` lines, with `following` bytes after
-        the last."""
+        """Take a read of `size` bytes that completes `lines` lines.
+
+        Behind the last line `following` bytes came.
+        """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
             end_ns -= wire_ns(following, self._baud_rate)
@@ -157,8 +159,10 @@ class Timeline:
         self._prompts.read(end_ns, lines)
 
     def spoilt(self) -> None:
-        """Note that the next line of the read is bad. A prompted board made it as a reply all the
-        same."""
+        """Note that the next line of the read is bad.
+
+        A prompted board still made it as a reply.
+        """
         self._rest -= 1
         if not self._habit.speaks:
             self._prompts.skip()
@@ -291,8 +295,7 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """Return how far the motors turned since the line before, or None if its counts do not show
-        it."""
+        """Return how far the motors turned since the line before, None if unknown."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -33,8 +33,10 @@ class Port(Protocol):
         """
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Send the line made at `now`, or report that it did not go. The line is never kept for
-        later."""
+        """Send the line made at `now`, or report that it did not go.
+
+        The line is never kept for later.
+        """
 
 
 class Gate:
@@ -67,8 +69,10 @@ class Gate:
         return (b"\r\n" if self._torn else b"") + goes
 
     def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
-        """Note that the kernel took `taken` of the bytes `handed` for `line`. The rest is
-        dropped."""
+        """Note that the kernel took `taken` of the bytes `handed` for `line`.
+
+        The rest is dropped.
+        """
         whole = taken == len(handed)
         if whole:
             self._first = False

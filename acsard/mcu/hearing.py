@@ -47,8 +47,10 @@ _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
 
 
 class Heard(Struct):
-    """The bytes and lines received in an interval; `last` is the last line, or bytes, that was
-    bad."""
+    """The bytes and lines received in an interval.
+
+    `last` is the last line, or bytes, that was bad.
+    """
 
     size: int = 0
     """Number of bytes."""

@@ -57,8 +57,7 @@ class Lattice(Struct, frozen=True):
     deviation: float
 
     def counts(self, period: float) -> int:
-        """Return the counts per turn that a firmware divides by `period` s, 0 if they are not
-        whole."""
+        """Return the counts per turn of a firmware that divides by `period` s, 0 if not whole."""
         exact = math.tau / (self.quantum * period)
         doubt = max(LEAST_DOUBT, 3 * exact * self.deviation / self.quantum)
         near = doubt <= NOT_ONE_OF_THEM and abs(exact - round(exact)) <= doubt
@@ -158,6 +157,8 @@ def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> 
 
 
 def on(speed: float, quantum: float, doubt: float = 0.0) -> bool:
-    """Return whether a speed in two decimals is a multiple of `quantum`, whose relative error is
-    `doubt`."""
+    """Return whether a speed in two decimals is a multiple of `quantum`.
+
+    `doubt` is the relative error of `quantum`.
+    """
     return abs(speed - quantum * round(speed / quantum)) <= ROUNDING + doubt * abs(speed)

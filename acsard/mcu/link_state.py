@@ -85,8 +85,10 @@ class Link:
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line; return the ns since the one before, None for the first of a
-        session."""
+        """Count a good line.
+
+        Return the ns since the one before, None for the first of a session.
+        """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
             self.excuse()
@@ -105,14 +107,18 @@ class Link:
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
-        """Note a bad line or a silence. Unless the link is up, this resets the count of good
-        lines."""
+        """Note a bad line or a silence.
+
+        Unless the link is up, this resets the count of good lines.
+        """
         if self.state != "up":
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line; return True when BAD_LINES came in a row, so that the check must be
-        asked for."""
+        """Count a bad line.
+
+        Return True if it is the last of BAD_LINES in a row, so that the check must be asked for.
+        """
         self.missed()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
@@ -123,8 +129,10 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Update the state for silence or trust; `may_rise` is False if the link must not come up
-        now."""
+        """Update the state for silence or trust.
+
+        `may_rise` is False if the link must not come up now.
+        """
         silent = self.silent(now_ns)
         if self.state == "up":
             if silent:

@@ -147,8 +147,10 @@ class Negotiation:
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Ask from the start and forget all earlier answers; `fresh` after an opening of the
-        port."""
+        """Ask from the start and forget all earlier answers.
+
+        `fresh` means that the port has been opened.
+        """
         self._sign("gap")
         self._begin(fresh)
         if fresh:
@@ -224,8 +226,10 @@ class Negotiation:
         self.trouble = "echo"
 
     def heard_plain(self) -> None:
-        """Note a whole plain line while asking: the board is awake, so its silence is an answer
-        too."""
+        """Note a whole plain line while asking.
+
+        The board is awake, so from now on its silence is an answer too.
+        """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
@@ -253,8 +257,10 @@ class Negotiation:
         return made_ns
 
     def judge(self, now_ns: int) -> None:
-        """Count a question without an answer; after the last one accept the plain form or report
-        trouble."""
+        """Count a question without an answer.
+
+        After the last one accept the plain form or report trouble.
+        """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:
             return

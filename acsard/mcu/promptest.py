@@ -15,8 +15,10 @@ class Promptest:
     """The lateness of the last event, in the caller's unit of time."""
 
     def __init__(self, drift: float, most: float = math.inf) -> None:
-        """Start; `drift` is the relative drift of the clocks, and a lateness above `most` counts as
-        `most`."""
+        """Start.
+
+        `drift` is the relative drift of the clocks, and a lateness above `most` counts as `most`.
+        """
         self._drift, self._most = drift, most
         self.late = 0.0
         """Lateness of the last event over the minimum delay."""
@@ -33,8 +35,10 @@ class Promptest:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """Return the lateness of an event, less drift. A negative result is below the accepted
-        minimum."""
+        """Return the lateness of an event, less drift.
+
+        A negative result is below the accepted minimum.
+        """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late
 

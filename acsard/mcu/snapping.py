@@ -76,8 +76,7 @@ class Snapping:
         return tuple([wheel.counts for wheel in self._wheels])
 
     def look(self, line: Feedback) -> Feedback:
-        """Return the line with its counted angles, if the speeds show counts, and with its
-        steps."""
+        """Return the line with its counted angles, if its speeds show any, and its steps."""
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if line.turned is None and own > 0.0:
             counted = self._counted(speeds, own)

@@ -25,8 +25,10 @@ RECUR = 3
 
 
 class Steps:
-    """The step of one wheel's speed; `size` is in rad/s, `math.inf` until enough steps were
-    seen."""
+    """The step of one wheel's speed.
+
+    `size` is in rad/s, `math.inf` until enough steps were seen.
+    """
 
     def __init__(self) -> None:
         self.size = math.inf

@@ -12,8 +12,10 @@ class Throttle:
         self._before_ns: int | None = None
 
     def lets(self, now_ns: int, wait_ns: int) -> bool:
-        """Return whether an event may pass now, `wait_ns` after the last. If so it becomes the
-        last."""
+        """Return whether an event may pass now, `wait_ns` after the last.
+
+        If so it becomes the last.
+        """
         if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
             return False
         self._before_ns, self.last_ns = self.last_ns, now_ns

@@ -240,8 +240,7 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """In client mode, report while the block waits for the router, because nothing works without
-    it."""
+    """In client mode, report to the log and to systemd while the block waits for the router."""
     if config.bus.mode == "peer":
         yield
         return

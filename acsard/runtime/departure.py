@@ -25,15 +25,19 @@ class Departure:
         self.hurried = False
 
     def watch(self) -> None:
-        """Handle the signals, also those of a closed terminal, which must not leave the wheels
-        turning."""
+        """Handle the signals.
+
+        Those of a closed terminal are included, because it must not leave the wheels turning.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
 
     def started(self) -> None:
-        """Note that the start is complete. Before this a signal cancels the start; now it begins
-        the ramp."""
+        """Note that the start is complete.
+
+        Before this a signal cancels the start; now it begins the ramp.
+        """
         self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:

@@ -47,8 +47,10 @@ class Histogram:
         self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
-        """Return median, 99th percentile and maximum; a percentile is the upper end of its
-        bucket."""
+        """Return median, 99th percentile and maximum.
+
+        A percentile is the upper end of its bucket.
+        """
         return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
 
     def _percentile(self, share: float) -> float:

@@ -21,8 +21,10 @@ POSE = "sim/pose"
 
 
 class Simulated:
-    """The simulator. Entering it creates the device at `path`; `tell` sets the bus to publish
-    on."""
+    """The simulator.
+
+    Entering it creates the device at `path`; `tell` sets the bus to publish on.
+    """
 
     def __init__(self, config: Config) -> None:
         self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))

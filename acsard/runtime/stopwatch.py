@@ -22,8 +22,10 @@ class Stopwatch:
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record the start of a period's step, `late_ns` late after `missed` periods without a
-        step."""
+        """Record the start of a period's step, `late_ns` late.
+
+        `missed` periods before it had no step.
+        """
         self._figures.add("period_lateness", now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
@@ -38,8 +40,10 @@ class Stopwatch:
             self._figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
-        """Record a feedback line; `told_ns` is when its messages were queued, None if nobody
-        listens."""
+        """Record a feedback line.
+
+        `told_ns` is when its messages were queued, None if nobody listens.
+        """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self._figures.add("mcu_round_trip", at_ns, at_ns - asked_ns)

@@ -48,8 +48,10 @@ class Alarm(_Timer):
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Wake at monotonic `at_ns`. With None nothing is set, but an earlier setting still goes
-        off."""
+        """Wake at monotonic `at_ns`.
+
+        With None nothing is set, but an earlier setting still goes off.
+        """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
@@ -60,8 +62,10 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that calls `wake` every period while entered; `take` tells which periods have
-    ended."""
+    """A timer that calls `wake` every period while entered.
+
+    `take` tells which periods have ended.
+    """
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)

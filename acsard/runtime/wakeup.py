@@ -34,8 +34,10 @@ class Next(Struct, frozen=True):
 
 
 class Wakeup:
-    """The wake-up of the control loop. A call runs a step; a call during a step runs one
-    afterwards."""
+    """The wake-up of the control loop.
+
+    A call runs a step; a call during a step runs one afterwards.
+    """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -52,8 +54,10 @@ class Wakeup:
             self._run(self._step, self._over)
 
     def command(self) -> None:
-        """Report a possible command, from any thread. It wakes the loop once until a step listens
-        again."""
+        """Report a possible command, from any thread.
+
+        It wakes the loop once until a step listens again.
+        """
         self._heard = True
         if self._listens:
             self._listens = False

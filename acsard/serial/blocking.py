@@ -80,8 +80,10 @@ class BlockingPort:
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write all of `data` to the driver; raise `WireLostError` if the driver stops taking
-        bytes."""
+        """Write all of `data` to the driver.
+
+        Raise `WireLostError` if the driver stops taking bytes.
+        """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:
@@ -96,8 +98,7 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the data that comes until `until_ns`, each piece with the time at which it was
-        read."""
+        """Return the data received until `until_ns`, each piece with the time of its read."""
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:

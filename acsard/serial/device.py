@@ -34,8 +34,10 @@ class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call. The caller knows that data is waiting."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` waiting bytes; raise `SerialException` if the port is lost or
-        closed."""
+        """Return up to `size` waiting bytes.
+
+        Raise `SerialException` if the port is lost or closed.
+        """
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -109,8 +111,10 @@ def draining(fd: int, deadline_ns: int) -> Iterator[float]:
 
 
 def unlock(fd: int) -> None:
-    """Let others open the device. A pty outlives this process with its exclusive mark, and nobody
-    else could open it."""
+    """Let others open the device.
+
+    A pty outlives this process with its exclusive mark, and nobody else could open it.
+    """
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -179,8 +183,10 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise `refusal` if the path is not a character device. The daemon waits for its port; a tool
-    must not."""
+    """Raise `refusal` if the path is not a character device.
+
+    The daemon waits for its port; a tool must not.
+    """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):
             raise OSError(errno.ENOTTY, "no character device")

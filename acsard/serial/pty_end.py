@@ -11,8 +11,10 @@ from acsard.serial.device import unlock
 
 
 class PtyEnd:
-    """The pty's end of the board. It never blocks, and `fileno` is readable when the host has
-    written."""
+    """The pty's end of the board.
+
+    It never blocks, and `fileno` is readable when the host has written.
+    """
 
     def __init__(self) -> None:
         self._master, self.slave = pty.openpty()

@@ -112,8 +112,10 @@ class FakeMcu(Faults):
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`; return the bytes that have arrived at the host
-        meanwhile."""
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -138,8 +140,10 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Power on again: stopped, without input while the bootloader runs, with noise on the line
-        first."""
+        """Power on again.
+
+        The board is stopped, ignores its input while the bootloader runs, and sends noise first.
+        """
         self._now_ns = now_ns
         self._events.clear()
         self._held = self._batch = b""
@@ -221,8 +225,7 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the received bytes that the USB adapter passes to the host now, and keep the
-        rest."""
+        """Return the bytes that the USB adapter passes to the host now, and keep the rest."""
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -268,8 +271,7 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the ms from power-on to the last encoder reading, and the counts of that
-        reading."""
+        """Return the ms from power-on to the last encoder reading, and its counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
@@ -289,8 +291,7 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return for the motors a to d the wheel (`values.WHEELS` order) and its sign, as
-    configured."""
+    """Return the configured wheel (`values.WHEELS` order) and sign of the motors a to d."""
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

@@ -183,8 +183,10 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Obey a value only when a comma follows it, as the old sketches do, and ignore the
-        check."""
+        """Obey a value only if a comma follows it, as the old sketches do.
+
+        The check is ignored.
+        """
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
@@ -231,8 +233,7 @@ class Faults:
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Keep all bytes from the host for `length_s` s in every `every_s` s, then pass them on at
-        once."""
+        """Hold all bytes to the host for `length_s` s in every `every_s` s."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:

@@ -24,8 +24,7 @@ PLAIN = 31
 
 
 class Command(Struct, frozen=True):
-    """The speeds of a command by motor, rad/s, and for a checked line the digits of its
-    sequence."""
+    """The speeds of a command by motor, rad/s, and the digits of a checked line's sequence."""
 
     values: dict[int, float]
     sequence: bytes = b""
@@ -33,8 +32,10 @@ class Command(Struct, frozen=True):
 
 
 def whole(line: bytes) -> Command | None:
-    """Decode a line as today's firmware: it must be valid, and with `#` or `*` have a correct
-    suffix."""
+    """Decode a line as today's firmware.
+
+    The line must be valid, and with `#` or `*` it must have a correct suffix.
+    """
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -62,8 +63,7 @@ def prefix(line: bytes) -> Command | None:
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line as the old sketches: a value counts if a comma ends it, whatever else is
-    there."""
+    """Decode a line as the old sketches: a value counts if a comma ends it, in any line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]

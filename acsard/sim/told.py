@@ -12,8 +12,7 @@ FRAME = "sim"
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
-    """Return the true pose of base_link at `wall_ns`, relative to its start, m in the frame
-    `sim`."""
+    """Return the true pose of base_link at `wall_ns`, m from its start, in the frame `sim`."""
     pose = sight.pose
     where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)

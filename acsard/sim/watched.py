@@ -48,8 +48,10 @@ class WatchedMcu(FakeMcu):
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`; return the bytes that have arrived at the host
-        meanwhile."""
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -70,8 +72,10 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle in rad at this time; the robot stood still before the first
-        observation."""
+        """Return the angle in rad at this time.
+
+        The robot stood still before the first observation.
+        """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

@@ -125,8 +125,10 @@ class Suspect:
         return lie is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> Lie | None:
-        """Return the sign. An earlier sign is kept where all signs look alike: through zero and at
-        rest."""
+        """Return the sign.
+
+        An earlier sign is kept where all signs look alike: through zero and at rest.
+        """
         if self.lie == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.lie == "reversed" and own * other == 0.0):
@@ -147,8 +149,10 @@ class Suspect:
             self._gyro.add(own, other, known.gyro, known.gyro)
 
     def lies(self, count: float) -> bool:
-        """Return whether this wheel is faulty, and not the other; `count` rad is the angle of a
-        count."""
+        """Return whether this wheel is faulty, and not the other.
+
+        `count` rad is the angle of a count.
+        """
         enough = LIE_COUNTS * count + LIE_ANGLE
         if self._lines < LIE_LINES or self._seconds < LIE_S or abs(self._apart) < enough:
             return False
@@ -172,8 +176,7 @@ class Suspect:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad stands, or nearly, while the other one
-    turned."""
+    """Return whether a wheel that turned `own` rad stands, or nearly, beside the `other`."""
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
@@ -183,8 +186,10 @@ def reverses(own: float, other: float, count: float) -> bool:
 
 
 def has_lied(lie: Lie, own: float, other: float, now: float) -> bool:
-    """Return whether an earlier line with these speeds may belong to the same fault; `now` is the
-    present speed."""
+    """Return whether an earlier line with these speeds may belong to the same fault.
+
+    `now` is the present speed.
+    """
     if lie == "reversed":
         return own * other < 0.0
     return stands(own, other) if lie == "dead" else own == now

@@ -199,8 +199,7 @@ class Witness:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return four wheel values, rad or rad/s, with ignored wheels replaced by their
-        partners."""
+        """Return four wheel values with ignored wheels replaced by their partners, rad or rad/s."""
         if not self._leaves_out:
             return wheels
         said = list(wheels)
@@ -278,13 +277,14 @@ class Witness:
         return right if of_right else left if of_left else None
 
     def lied(self, before: WheelSpeeds) -> bool:
-        """Return whether the wheel that the last line proved faulty may have been wrong in that
-        line."""
+        """Return whether the wheel that the last line proved faulty was wrong in that line too."""
         return self._found is not None and self._found.lied(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of a count: the smallest angle per line that recurs is at least one
-        count."""
+        """Learn the angle of a count.
+
+        The smallest angle per line that recurs is at least one count.
+        """
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
