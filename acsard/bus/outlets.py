@@ -122,8 +122,7 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return how many messages were dropped since the last call, and if the bus just
-        blocked."""
+        """Return the number of messages dropped since the last call, and if the bus blocked."""
         dropped, self._dropped = self._dropped, 0
         began_ns, was = self._began_ns, self._stuck
         self._stuck = began_ns is not None and now_ns - began_ns > STUCK_NS

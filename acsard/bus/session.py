@@ -21,7 +21,7 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands accepted per key and second: enough for a stop 1 ms after a command, too few to cost a
+"""Commands accepted per key and second: enough for a zero 1 ms after a command, too few to cost a
 control period. The TLS gateway accepts as many stops. A stop beyond the limit repeats the one of
 the previous millisecond, so dropping it is safe."""
 

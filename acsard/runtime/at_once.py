@@ -1,4 +1,4 @@
-"""Decides when a line may go: in every period, and at once for a new command.
+"""Decides when a line may go: in every period, and at once for a new command or mode.
 
 A line that goes at once replaces the line of the next period, so a flood of commands does not add
 lines. It keeps a distance to the line before it: the wire time of that line and a margin. Each

@@ -1,8 +1,8 @@
 """The protocol from the board's side: which lines it accepts as commands, and its answers.
 
-There are three kinds of firmware. Today's accepts only whole valid lines, plain or with a correct
-suffix. Two older kinds do not know the suffix and obey the plain part of the line. The module
-shares no code with the host.
+Today's firmware (`whole`) accepts only whole valid lines, plain or with a correct suffix. Older
+firmware does not know the suffix: `plain_only` rejects a line that has one, while `prefix` and
+`latched` obey its plain part. The module shares no code with the host.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the ratio of the wheels' angles: front to rear, or rear to front if not `front`."""
+        """Return the ratio of the angles, front to rear, or rear to front if not `front`."""
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 
