@@ -28,12 +28,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from multiprocessing import get_context
 from pathlib import Path
 
 from tests.mutation.equivalent import EQUIVALENT
 from tests.mutation.mutants import Mutant, mutants
-from tests.mutation.trials import OTHER, OWN, Trials
+from tests.mutation.trials import ENDLESS, NONE, OTHER, OWN, Trials
 
 ROOT = Path(__file__).parents[2]
 CORE = (
@@ -102,45 +101,42 @@ def main() -> int:
     sample = drawn(pool, asked.seed)[: asked.sample or size]
     enough = ENOUGH_OF_ALL if only else ENOUGH
     print(f"{len(sample)} of {len(pool)} mutants, seed {asked.seed}", flush=True)
-    counts: Counter[str] = Counter()
+    counts: Counter[int] = Counter()
     holes: list[str] = []
-    timeouts = 0
-    # The copy may not change while its tests run.
-    with tempfile.TemporaryDirectory() as folder, get_context("fork").Pool(asked.jobs) as workers:
-        ignored = shutil.ignore_patterns(".*", "__pycache__")
-        shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
-        trials = Trials(Path(folder), paths)
-        workers.starmap(trials.measure, [(part, asked.jobs) for part in range(asked.jobs)], 1)
-        for part in range(asked.jobs):
-            trials.add(part)
+
+    def work(trials: Trials) -> None:
+        trials.measure(asked.jobs)
         if len(trials.failed) > MOST_LEFT_OUT:
             sys.exit(f"these tests fail without any mutant: {sorted(trials.failed)}")
         for test in sorted(trials.failed):
             print(f"left out, because it fails without any mutant: {test}", flush=True)
-        verdicts = workers.imap(trials.verdict, sample)
-        for number, (mutant, (verdict, endless)) in enumerate(
-            zip(sample, verdicts, strict=True), 1
-        ):
+        print(f"measured in {(time.monotonic() - began) / 60:.1f} min", flush=True)
+        for mutant, verdict in trials.verdicts(sample, asked.jobs):
             counts[verdict] += 1
-            timeouts += endless
-            if not number % 20:
-                print(f"    {number} tried", file=sys.stderr, flush=True)
+            if not counts.total() % 20:
+                print(f"    {counts.total()} tried", file=sys.stderr, flush=True)
             if verdict and mutant.key in EQUIVALENT:
-                print(f"{number}: not equivalent, a test notices it: {mutant.key}", flush=True)
+                print(f"not equivalent, a test notices it: {mutant.key}", flush=True)
             if not verdict:
                 why = EQUIVALENT.get(mutant.key, "")
                 if not why:
                     holes.append(mutant.key)
-                print(f"{number}: line {mutant.line} of {mutant.key}", flush=True)
+                print(f"line {mutant.line} of {mutant.key}", flush=True)
                 print(f"    {why or 'NO TEST NOTICES IT'}", flush=True)
-    killed = len(sample) - counts[""]
+
+    # The copy may not change while its tests run.
+    with tempfile.TemporaryDirectory() as folder:
+        ignored = shutil.ignore_patterns(".*", "__pycache__")
+        shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
+        Trials(Path(folder), paths, work).run()
+    killed = len(sample) - counts[NONE]
     score = killed / max(1, killed + len(holes))
     minutes = (time.monotonic() - began) / 60
     print(
         f"killed {killed} of {len(sample)} = {killed / len(sample):.1%}, "
-        f"{score:.1%} without the {counts[''] - len(holes)} equivalent "
+        f"{score:.1%} without the {counts[NONE] - len(holes)} equivalent "
         f"({counts[OWN]} by the module's own tests, {counts[OTHER]} by others, "
-        f"{timeouts} by never ending), "
+        f"{counts[ENDLESS]} by never ending), "
         f"{len(holes)} not noticed, {enough:.0%} is enough; {minutes:.1f} min"
     )
     return 0 if score >= enough else 1
