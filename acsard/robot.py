@@ -10,6 +10,7 @@ that leaves.
 from __future__ import annotations
 
 from collections import Counter
+from typing import assert_never
 
 from msgspec.structs import replace
 
@@ -356,6 +357,8 @@ class Robot:
                 return self._place(request.pose or Pose())
             case "set":
                 return self._set(request.settings, now.mono_ns)
+            case _:
+                assert_never(request.verb)
 
     def _place(self, pose: Pose) -> str:
         """Set the pose, and drop the corrections that were due to the pose before."""
@@ -447,3 +450,5 @@ class Robot:
                 return self._life.why
             case Mode.LEAVING:
                 return LEAVING
+            case _:
+                assert_never(self._life.mode)
