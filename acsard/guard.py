@@ -65,7 +65,7 @@ class Guard:
         """`stop` is the plain stop line: an MCU in any state obeys it."""
         self._stop = stop
         memory = memory or Memory()
-        self._last = memory.last or stop
+        self._last = memory.last
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)

@@ -483,6 +483,15 @@ def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
     assert clocked.trip(1801, "stopped") == LATE
 
 
+def test_a_second_stop_has_its_own_time_even_right_behind_a_command() -> None:
+    clocked = Clocked()
+    assert clocked.trip(100, "stopped") == ""
+    clocked.drive(600)
+    assert clocked.trip(1300, "stopped") == ""
+    assert clocked.trip(2100, "stopped") == ""
+    assert clocked.trip(2101, "stopped") == LATE
+
+
 def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -> None:
     clocked = Clocked()
     slower = replace(SLOW_TO_STOP, linear_speed=0.1, linear_deceleration=5.0)
