@@ -111,7 +111,7 @@ class Guard:
         """Let a robot in motion end its ramp by the limits under which it began to move."""
         if (_wheels(self._last) or _ZERO) == _ZERO:
             self._longest = self._ramps
-        elif self._longest != self._ramps:
+        else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
             self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
