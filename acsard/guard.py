@@ -65,7 +65,7 @@ class Guard:
         """`stop` is the plain stop line: an MCU in any state obeys it."""
         self._stop = stop
         memory = memory or Memory()
-        self._last = memory.last or stop
+        self._last = memory.last
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
@@ -111,7 +111,7 @@ class Guard:
         """Let a robot in motion end its ramp by the limits under which it began to move."""
         if (_wheels(self._last) or _ZERO) == _ZERO:
             self._longest = self._ramps
-        elif self._longest != self._ramps:
+        else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
             self._longest = max(ramp, now), max(stop_ramp, stop_now)
 

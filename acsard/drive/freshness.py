@@ -130,7 +130,6 @@ class _Proof:
             if self._again:
                 del self._halves[0]
                 self.least = self._first = minima[1]
-            return False
         if count < 8:
             return False
         del self._halves[0]

@@ -34,6 +34,7 @@ ARITHMETIC: dict[type, type] = {
     ast.Mod: ast.FloorDiv,
     ast.Pow: ast.Mult,
 }
+COMMUTATIVE = (ast.Add, ast.Mult, ast.BitXor, ast.BitAnd, ast.BitOr)
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
 MEMBERS = {"Mode": list(Mode.__members__)}
 
@@ -69,7 +70,8 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
         case ast.BinOp(op=op) | ast.AugAssign(op=op):
             if type(op) in ARITHMETIC:
                 yield made(type(node), op=ARITHMETIC[type(op)]())
-            if isinstance(node, ast.BinOp) and not isinstance(op, ast.Add | ast.Mult):
+            sized = isinstance(parent, ast.Call) and ast.unparse(parent.func) == "abs"
+            if isinstance(node, ast.BinOp) and not isinstance(op, COMMUTATIVE) and not sized:
                 yield made(ast.BinOp, left=node.right, right=node.left)
         case ast.BoolOp(op=op, values=values):
             yield made(ast.BoolOp, op=ast.Or() if isinstance(op, ast.And) else ast.And())

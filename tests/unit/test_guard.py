@@ -443,10 +443,10 @@ def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is
 def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
     mode: str, ramp_ms: float
 ) -> None:
-    last_ms = ramp_ms + MARGIN_NS / MS
+    last_ms = ramp_ms + 300
     clocked = Clocked()
     assert clocked.trip(0, mode) == clocked.trip(last_ms, mode) == ""
-    assert clocked.trip(last_ms + 0.001, mode, 0.01) == LATE
+    assert clocked.trip(last_ms + 0.000001, mode, 0.01) == LATE
     assert clocked.trip(last_ms + 1, mode, 0.0) == ""
 
 
@@ -483,6 +483,15 @@ def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
     assert clocked.trip(1801, "stopped") == LATE
 
 
+def test_a_second_stop_has_its_own_time_even_right_behind_a_command() -> None:
+    clocked = Clocked()
+    assert clocked.trip(100, "stopped") == ""
+    clocked.drive(600)
+    assert clocked.trip(1300, "stopped") == ""
+    assert clocked.trip(2100, "stopped") == ""
+    assert clocked.trip(2101, "stopped") == LATE
+
+
 def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -> None:
     clocked = Clocked()
     slower = replace(SLOW_TO_STOP, linear_speed=0.1, linear_deceleration=5.0)
@@ -491,6 +500,13 @@ def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -
         assert clocked.trip(ms, "ready") == ""
     assert clocked.trip(2300, "ready") == ""
     assert clocked.trip(2301, "ready") == LATE
+
+
+def test_new_settings_with_a_longer_ramp_give_a_robot_in_motion_more_time() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=replace(SLOW_TO_STOP, linear_deceleration=0.25)))
+    assert clocked.trip(4300, "ready") == ""
+    assert clocked.trip(4301, "ready") == LATE
 
 
 def test_at_rest_new_settings_bring_their_own_ramp() -> None:

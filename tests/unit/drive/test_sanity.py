@@ -166,6 +166,11 @@ def test_a_proven_count_more_is_not_too_fast() -> None:
     assert "wheel_speed" in sanity.impossible(stepping(only(2, 81.5), 31.4, proven=True))
 
 
+def test_a_speed_of_the_limit_and_one_proven_count_is_possible() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
+    assert sanity.impossible(stepping(only(2, 81.25), 31.25, proven=True)) == ""
+
+
 def test_a_step_that_may_be_a_lie_leaves_no_speed_too_fast_unsaid() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
     assert "feedback.wheel_speed" in sanity.impossible(stepping(only(2, 50.1), 31.4))
@@ -238,6 +243,10 @@ def test_a_constant_speed_more_than_two_and_three_tenths_away_is_stuck(
     assert ("one and the same speed" in fault) is stuck
 
 
+def test_a_wheel_that_reports_one_rad_s_and_no_other_speed_is_stuck() -> None:
+    assert "one and the same speed" in watched_after_driving(2, 10.0, 1.0)
+
+
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("seen", "word"), [(10.0, "faster than"), (2.1, "faster than"), (1.9, "")])
@@ -299,6 +308,19 @@ def test_wheels_turned_by_hand_are_told_once_a_second_and_never_a_fault(speed: f
         assert told == pytest.approx([0.21, 1.21, 2.21, 3.21], abs=0.011)
 
 
+def test_nothing_is_told_before_the_first_line() -> None:
+    assert Sanity(FeedbackConfig()).turned == ""
+
+
+def test_a_push_is_told_again_after_exactly_one_second() -> None:
+    sanity, told = Sanity(FeedbackConfig()), []
+    for step in range(1, 12):
+        sanity.watch(STILL, noisy(TEN, step), 0.125)
+        if sanity.turned:
+            told.append(step * 0.125)
+    assert told == [0.25, 1.25]
+
+
 def test_one_wheel_turned_by_hand_is_told_too() -> None:
     sanity = driven(10.0)
     told = [sanity.watch(STILL, STILL, DT)]
@@ -340,6 +362,17 @@ def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slo
     assert not any(faults)
     stays = [sanity.watch(STILL, noisy(only(2, speed), step), DT) for step in range(52)]
     assert "rear_left wheel turns faster" in next(filter(None, stays))
+
+
+def test_a_wheel_that_slows_down_slowly_a_second_time_is_no_fault() -> None:
+    sanity = Sanity(FeedbackConfig())
+    for _ in range(2):
+        told = only(1, 20.0)
+        assert not any(sanity.watch(told, noisy(told, step), DT) for step in range(300))
+        speed = 20.0
+        while speed > 0.0:
+            speed -= 5.0 * DT
+            assert sanity.watch(STILL, only(1, speed), DT) == ""
 
 
 def test_a_runaway_seen_by_a_coarse_encoder_does_not_look_like_slowing_down() -> None:

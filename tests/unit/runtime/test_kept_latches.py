@@ -128,6 +128,13 @@ def test_the_number_of_a_stop_by_the_daemon_is_the_wall_time_in_ms() -> None:
     assert made.stop.number == 1_800_000_000_000
 
 
+@pytest.mark.parametrize("wall_ns", [0, -NS_PER_S])
+def test_a_wall_clock_that_was_never_set_gives_a_stop_the_number_0(wall_ns: int) -> None:
+    latches = stopped(Latches(), "stopped", Instant(1, wall_ns))
+    assert latches.stop
+    assert latches.stop.number == 0
+
+
 def test_a_stop_that_is_latched_already_stays() -> None:
     assert stopped(ALL, "the file cannot be read", NOW) is ALL
 
