@@ -26,9 +26,6 @@ KINDS = (
 WAYS = ("client", "page", "signed", "rmw", "header", "zenoh", "plain", "bridge", "bridged")
 SOURCES = ("teleop", "app", "ros2_control", "nav")
 
-EPILOGUE_S = 16.0
-"""After the last fault: what it takes to clear, to boot, to arm and to drive."""
-
 LIES = (
     "stuck_encoder", "frozen_encoder", "dead_motor", "reversed_motor", "reversed_encoder",
     "bias", "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",

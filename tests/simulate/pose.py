@@ -68,7 +68,9 @@ class PoseWitness:
         for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
             if not all(map(math.isfinite, (ex, ey, eyaw, *covariance))):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
-            self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, bool(faults & LIARS))
+            self._one(
+                now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, bool(faults & LIARS)
+            )
 
     def end_step(self) -> None:
         """Forget the pose if it was set in this step."""
@@ -84,7 +86,9 @@ class PoseWitness:
             way = math.hypot(pose[0] - last[1][0], pose[1] - last[1][1])
             seconds = max(0.0, (at_ns - last[0]) / NS)
             if way > self.fastest * 1.1 * seconds + 0.05:
-                raise BrokenError("the pose never jumps", now_ns, f"{last[1]} to {pose} in {seconds:.3f} s")
+                raise BrokenError(
+                    "the pose never jumps", now_ns, f"{last[1]} to {pose} in {seconds:.3f} s"
+                )
         if lies:
             return
         true = self._true_at(at_ns)

@@ -81,8 +81,7 @@ class Sender:
 class Witness:
     """Holds every line and every step against what really happened."""
 
-    def __init__(self, config: dict[str, Any], board: list[list[Any]]) -> None:
-        del board
+    def __init__(self, config: dict[str, Any]) -> None:
         self.config = config
         drive = config.get("drive", {})
         self.radius = drive.get("wheel_radius", 0.05)
@@ -112,6 +111,8 @@ class Witness:
         self.inactive_ns: int | None = None
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
+        self.pending = False
+        """An answer waits for the disk, so it is not known yet what is in force."""
         self.mode = self.reason = ""
         self._decoded: dict[bytes, tuple[float, ...]] = {}
         self.new_life(0)
@@ -151,6 +152,7 @@ class Witness:
         if source not in self.priority or message.junk not in ("", "cancels", "stranger"):
             known = self.senders.get((source, sample.identity))
             if known is not None:
+                self._arm(known, arrived_ns)
                 known.zeros.clear()
             return
         if message.junk == "stranger":
@@ -163,7 +165,9 @@ class Witness:
         wish = Wish(arrived_ns, v, w)
         wish.identity, wish.shared = sample.identity, sample.shared
         wish.fresh = self._fresh(sender, message, sample, arrived_ns)
-        wish.certain = not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
+        wish.certain = (
+            not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
+        )
         known = self.senders.setdefault((source, sample.identity), Sender())
         if zero:
             if not sample.shared:
@@ -216,9 +220,7 @@ class Witness:
             return False
         return age <= least + allowed
 
-    def _falls(
-        self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int
-    ) -> bool:
+    def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
         """Return whether the delays cannot have looked constant for the time of a proof."""
         window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
         if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
@@ -270,7 +272,9 @@ class Witness:
             if parts[0] == "limits":
                 self.limits[parts[1]] = value
                 low = self.softest.get(parts[1], value)
-                self.softest[parts[1]] = min(low, value) if "deceleration" in key else max(low, value)
+                self.softest[parts[1]] = (
+                    min(low, value) if "deceleration" in key else max(low, value)
+                )
             else:
                 if parts[1] == "pause":
                     self.pause_ns = int(value * NS)
@@ -315,9 +319,9 @@ class Witness:
 
     def line(self, at_ns: int, line: bytes, fed_ns: int) -> None:
         """Judge a line on the wire; `fed_ns` is when the board was last heard."""
-        wheels = self._decoded.get(line)
+        wheels = self._decoded.get(line) or self._read(at_ns, line)
         if wheels is None:
-            wheels = self._read(at_ns, line)
+            return
         if wheels == ZERO:
             self.last, self.last_ns, self.coasting = ZERO, at_ns, None
             self.softest = dict(self.limits)
@@ -332,19 +336,21 @@ class Witness:
             abs(new) > abs(old) + 0.001 or new * old < 0.0
             for new, old in zip(wheels, before, strict=True)
         )
-        self._limits(at_ns, wheels, before, at_ns - last_ns, grows)
-        held = self.held
+        if not self.pending:
+            self._limits(at_ns, wheels, before, at_ns - last_ns, grows)
+        held = None if self.pending else self.held
         if held is not None:
             self._held(at_ns, held, grows, line)
         self._wished(at_ns, wheels, before, grows, line)
         self.last, self.last_ns = wheels, at_ns
 
-    def _read(self, at_ns: int, line: bytes) -> tuple[float, ...]:
+    def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
+        """Return the wheel speeds of a line, None for a question to the board or a torn line."""
         match = LINE.match(line)
         if match is None:
             if line.endswith(b"\n") and line[:1] in b"abcd#":
                 raise BrokenError("every line is whole", at_ns, repr(line))
-            return self.last  # a question to the board, or a line that the kernel tore
+            return None
         motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
         wheels = tuple(motors[place] * sign + 0.0 for place, sign in self.motors)
         if len(self._decoded) > 20_000:
@@ -431,7 +437,9 @@ class Witness:
             self.wished_ns, self.coasting = at_ns, None
             return
         if grows:
-            raise BrokenError("motion needs a fresh wish of an armed sender", at_ns, f"{line!r}: {why}")
+            raise BrokenError(
+                "motion needs a fresh wish of an armed sender", at_ns, f"{line!r}: {why}"
+            )
         fastest = max(map(abs, wheels))
         if self.coasting is None:
             self.coasting = at_ns, fastest

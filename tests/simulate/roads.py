@@ -69,9 +69,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 if chance[4] < sender["swap"]:
                     arrives_ns += int(1.5 / sender["hz"] * NS)
                 stamp_ns = wall_ns + int((t + _ahead(sender, t)) * NS)
-                message = Message(
-                    int(t * NS), arrives_ns, wish[0], wish[1], stamp_ns, number, junk
-                )
+                message = Message(int(t * NS), arrives_ns, wish[0], wish[1], stamp_ns, number, junk)
                 found.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
@@ -142,7 +140,9 @@ def sample(
             )
         case "rmw":
             gid = hashlib.sha256(own.encode()).digest()[:16]
-            options["attachment"] = struct.pack("<qqB16s", message.number, message.stamp_ns, 16, gid)
+            options["attachment"] = struct.pack(
+                "<qqB16s", message.number, message.stamp_ns, 16, gid
+            )
         case "header":
             identity, shared, clock = by_key, True, f"header {by_key}"
         case "zenoh":
