@@ -382,7 +382,7 @@ class Run:
                 self._moved_ns = at_ns + offset
         if seen.estimates:
             lies = {name for name, _ in self._active}
-            self.pose.see(true_ns, seen.estimates, self.product.truth(), offset, lies, witness.held)
+            self.pose.see(true_ns, seen.estimates, self.product.truth(), offset, lies)
         self.pose.end_step()
         if self.log is not None:
             self.log(
@@ -438,8 +438,12 @@ class Run:
             "name": "lawful", "id": "lawful/1", "way": "client", "source": source, "wheels": False,
             "form": "json", "ahead": 0.0, "drift": 0.0, "clock": [], "churn": False, "delay": 0.002,
         }  # fmt: skip
-        own = [one for one in plan["senders"] if one["way"] in ("client", "page")
-               and not (one["churn"] or one["junk"]) and one["id"] not in self.witness.shared_clocks]  # fmt: skip
+        own = [
+            one
+            for one in plan["senders"]
+            if one["way"] in ("client", "page")
+            and not (one["churn"] or one["junk"] or one["id"] in self.witness.shared_clocks)
+        ]
         number = 10**6
         if plan["lawful"] != "a new client" and own:
             sender = own[0]

@@ -43,7 +43,7 @@ if product.exists():
 from tests.simulate.pairs import serve
 serve(Path(acsard.__file__))
 """
-"""What the process of one side runs; `tree` may be a checkout or a directory of an installed wheel."""
+"""What the process of one side runs. `tree` is a checkout or where a wheel was installed."""
 
 Step = dict[str, Any]
 
@@ -169,7 +169,7 @@ def first_difference(ours: list[Step], theirs: list[Step]) -> str:
 def compare(
     tree: Path, seed: int, seconds: float, workers: int, show: Callable[[str], None] = print
 ) -> int:
-    """Compare this checkout with another one for so much simulated time; return 1 if they differ."""
+    """Compare this checkout with another one for so many s; return 1 if they differ."""
     began, differing, runs, total = time.perf_counter(), 0, 0, 0.0
     pairs = [Pair(OURS, tree) for _ in range(max(1, workers // 2))]
     try:

@@ -1,4 +1,4 @@
-"""From a seed to a plan: what the robot, the board, the senders, the operators and the host will do.
+"""From a seed to a plan: what the robot, its board, senders, operators and host will do.
 
 A plan is plain data, so that `shrink.py` can drop parts of it and `corpus/` can keep it. Times are
 in s from the start, by the true clock. Swarm testing (Groce and others, 2012): each run switches a
@@ -129,7 +129,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     commands = config["commands"]
     commands["neutral_first"] = dice.random() < 0.85
     commands["pause"] = dice.choice((0.5, 1.0, 2.0))
-    names = list(SOURCES) + ["twin"]
+    names = [*SOURCES, "twin"]
     commands["sources"] = [
         {
             "name": name,
@@ -245,9 +245,8 @@ def _events(
 ) -> list[dict[str, Any]]:
     events: list[dict[str, Any]] = []
 
-    def add(kind: str, every: float, **more: Any) -> list[float]:
+    def add(kind: str, every: float) -> list[float]:
         """Return times for events of this kind, about one in `every` s."""
-        del more
         if kind not in kinds:
             return []
         count = dice.randrange(1, max(2, int(2 * seconds / every)))
@@ -328,7 +327,8 @@ def _events(
         events.append({
             "at": at, "do": "call", "verb": verb, "late": late,
             "lost": lossy and dice.random() < 0.2, "twice": lossy and dice.random() < 0.2,
-            "by": f"op{dice.randrange(3)}", "via": dice.choice(("native", "native", "rmw", "bridge")),
+            "by": f"op{dice.randrange(3)}",
+            "via": dice.choice(("native", "native", "rmw", "bridge")),
             **more,
         })  # fmt: skip
 

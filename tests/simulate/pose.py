@@ -1,12 +1,12 @@
-"""The promise of odometry: the pose stays within its covariance of the true one, and never jumps."""
+"""The promise of odometry: the pose stays within its covariance and never jumps."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
-from tests.simulate.promises import ZERO as _ZERO
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
 
@@ -21,9 +21,6 @@ SIGMAS = 6.0
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
 
-STANDS_S = 1.5
-"""After a ramp to rest: what motors with a lag of 0.12 s take to stand."""
-
 Pose = tuple[float, float, float]
 
 
@@ -33,14 +30,13 @@ class PoseWitness:
     def __init__(self, config: dict[str, Any]) -> None:
         drive = config.get("drive", {})
         fastest = config.get("feedback", {}).get("wheel_speed", 80.0)
-        self.fastest = fastest * drive.get("wheel_radius", 0.05)
-        self.track = drive.get("wheel_separation", 0.3)
+        self.fastest: float = fastest * drive.get("wheel_radius", 0.05)
+        self.track: float = drive.get("wheel_separation", 0.3)
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
         self._room = 0.0
         self._last: tuple[int, Pose] | None = None
-        self._moving_ns = 0
 
     def doubt(self) -> None:
         """A way was lost that no encoder told of: compare from the next estimate on."""
@@ -53,14 +49,12 @@ class PoseWitness:
     def see(
         self,
         now_ns: int,
-        estimates: list[Any],
+        estimates: Sequence[Any],
         truth: tuple[int, float, float, float, float],
         offset_ns: int,
         faults: set[str],
-        held: tuple[int, str] | None,
     ) -> None:
         """Judge the estimates of one step."""
-        del held
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         if faults & LIARS:
@@ -125,7 +119,7 @@ class PoseWitness:
         (t0, a), (t1, b) = self._true[-2], self._true[-1]
         seconds = max(0.005, (t1 - t0) / NS)
         turn = math.remainder(b[2] - a[2], math.tau) * self.track
-        return (math.hypot(b[0] - a[0], b[1] - a[1]) + abs(turn)) / seconds
+        return float((math.hypot(b[0] - a[0], b[1] - a[1]) + abs(turn)) / seconds)
 
     def _true_at(self, at_ns: int) -> Pose | None:
         """Return the true pose at a time, None where nobody looked shortly before and after."""
@@ -155,6 +149,3 @@ def _through(anchor: tuple[Pose, Pose], true: Pose) -> Pose:
     dx, dy = true[0] - tx, true[1] - ty
     c, s = math.cos(turn), math.sin(turn)
     return ox + c * dx - s * dy, oy + s * dx + c * dy, true[2] + turn
-
-
-assert _ZERO

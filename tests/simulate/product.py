@@ -9,7 +9,7 @@ Time is in ns of the robot's monotonic clock. `Product.see` is called after ever
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ from acsard.runtime.kept_latches import (
     unreadable,
     unwritable,
 )
+from acsard.sim.watched import WatchedMcu
 from acsard.values import Event, Instant, Latches, Outputs, Received
 from tests.scenarios.world import START, World
 
@@ -51,7 +52,7 @@ class Seen(NamedTuple):
     link: str
     lines: list[tuple[int, bytes]]
     """Lines that went to the board since the step before, each with its time."""
-    estimates: list[Estimate]
+    estimates: Sequence[Estimate]
 
 
 def problems(config: dict[str, Any]) -> list[str]:
@@ -150,7 +151,7 @@ class Product:
                 for _, line in lines:
                     world.port.feed(Received(world.instant, line))
         world.events.clear()
-        estimates = [
+        estimates: list[Estimate] = [
             (
                 found.at.mono_ns,
                 found.pose.x,
@@ -229,7 +230,7 @@ class Product:
     def ask(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
     ) -> None:
-        """Hand over a service call; a stop also goes ahead of its query, as the real bus does it."""
+        """Hand over a service call. A stop also goes ahead of its query, as on the real bus."""
         key = f"srv/{service}"
         if service == "stop":
             self.deliver(at_ns, "stop", b"", via=via, attachment=attachment)
@@ -281,7 +282,7 @@ class Product:
             other._replied_ns = other._fed_ns = self.now_ns
             other.reset(self.now_ns, int(self._config.sim.boot_time * 1e9))
             other.vehicle.pose = pose
-            if hasattr(other, "_look_ns"):
+            if isinstance(other, WatchedMcu):
                 other._look_ns = self.now_ns + 10_000_000
                 other._see = world._see
                 other._history[0] = (self.now_ns, 0.0)
@@ -346,7 +347,7 @@ class Product:
         world.now_ns = world.next_period_ns = old.now_ns
         world.wall_offset_ns = old.wall_offset_ns
         world.mcu = old.mcu
-        if hasattr(world.mcu, "_see"):
+        if isinstance(world.mcu, WatchedMcu):
             world.mcu._see = world._see
         if old.port.mcu is not None:
             world.port.plug(world.mcu)

@@ -15,7 +15,7 @@ from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any
 
-from tests.simulate.roads import FOREIGN, NS, STEADY, Message, Sample
+from tests.simulate.roads import FOREIGN, NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 ZERO = (0.0, 0.0, 0.0, 0.0)
@@ -31,8 +31,8 @@ EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""
 
 HARMLESS = {
-    "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi", "stalls",
-    "sparse_replies", "echo",
+    "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
+    "stalls", "sparse_replies", "echo",
 }  # fmt: skip
 """Troubles of the board that are no reason to latch a fault."""
 
@@ -89,8 +89,10 @@ class Witness:
         wheels = config["mcu"].get("wheels") or {
             "front_right": "+a", "front_left": "+b", "rear_left": "+c", "rear_right": "+d",
         }  # fmt: skip
-        self.motors = [("abcd".index(wheels[w][1]), -1 if wheels[w][0] == "-" else 1)
-                       for w in ("front_right", "front_left", "rear_left", "rear_right")]  # fmt: skip
+        self.motors = [
+            ("abcd".index(wheels[w][1]), -1 if wheels[w][0] == "-" else 1)
+            for w in ("front_right", "front_left", "rear_left", "rear_right")
+        ]
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
         commands = config["commands"]
@@ -193,7 +195,7 @@ class Witness:
         if not sample.clock:
             return True
         age = arrived_ns - message.sent_ns
-        timeout_ns = self.timeout[sender["source"]]
+        timeout_ns: int = self.timeout[sender["source"]]
         clock = self.clocks.setdefault(sample.clock, Clock())
         if sample.clock in self.shared_clocks:
             clock.loose = True
@@ -207,18 +209,19 @@ class Witness:
         clock.least_ns = age if least is None else min(least, age)
         while recent and recent[0][0] < arrived_ns - 3 * NS:
             recent.popleft()
-        prompt = int(sender["delay"] * NS)
+        prompt: int = int(sender["delay"] * NS)
         allowed = max(timeout_ns, 0) + EARLY_NS + MARGIN_NS
         if foreign:
             minutes = (arrived_ns - self.learned_ns) / NS / 60
             allowed += int((1.0 + minutes) * NS)
-        falls = self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS))
-        recent.append((arrived_ns, age))
         if clock.loose or age <= prompt + allowed:
-            return True
-        if least is None or falls:
-            return False
-        return age <= least + allowed
+            fresh = True
+        elif least is None or self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS)):
+            fresh = False
+        else:
+            fresh = age <= least + allowed
+        recent.append((arrived_ns, age))
+        return fresh
 
     def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
         """Return whether the delays cannot have looked constant for the time of a proof."""
@@ -244,7 +247,7 @@ class Witness:
         self.stops.append({"at": at_ns, "sent": sent_ns})
 
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
-        """Note a clear that the daemon says has worked. `read_ns` is when its sender saw the latch."""
+        """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
         if text.startswith("nothing"):
             return
         self.counts["clear"] += 1
@@ -517,6 +520,3 @@ class Witness:
         if rim:
             scale = min(scale, limits["wheel_speed"] / rim)
         return v * scale, w * scale
-
-
-assert set(STEADY).isdisjoint(FOREIGN)

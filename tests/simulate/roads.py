@@ -57,7 +57,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
         while place + 1 < len(phases) and phases[place + 1][0] <= t:
             place += 1
         chance = [dice.random() for _ in range(6)]
-        wish = phases[place][1:] if place >= 0 else [None, None]
+        wish: list[Any] = phases[place][1:] if place >= 0 else [None, None]
         if wish[0] is not None:
             number += 1
             late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
@@ -69,7 +69,8 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 if chance[4] < sender["swap"]:
                     arrives_ns += int(1.5 / sender["hz"] * NS)
                 stamp_ns = wall_ns + int((t + _ahead(sender, t)) * NS)
-                message = Message(int(t * NS), arrives_ns, wish[0], wish[1], stamp_ns, number, junk)
+                v, w = float(wish[0]), float(wish[1])
+                message = Message(int(t * NS), arrives_ns, v, w, stamp_ns, number, junk)
                 found.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
@@ -90,7 +91,7 @@ def _held(sender: dict[str, Any], t: float) -> float:
             # Everything waits until half of the time is over, then flows faster than it was sent.
             middle = (begin + end) / 2
             if begin <= t < end:
-                return max(0.0, middle + (t - begin) / size - t)
+                return float(max(0.0, middle + (t - begin) / size - t))
             continue
         if not begin <= t < end:
             continue
@@ -126,7 +127,8 @@ def sample(
     sender: dict[str, Any], message: Message, config: dict[str, Any], robot_wall_ns: int
 ) -> Sample:
     """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`."""
-    way, source, options = sender["way"], sender["source"], {}
+    way, source = sender["way"], sender["source"]
+    options: dict[str, Any] = {}
     own = f"{sender['id']}{message.number}" if sender["churn"] else sender["id"]
     identity, shared, clock = own, False, own
     keeps = message.stamp_ns - robot_wall_ns <= AHEAD_NS

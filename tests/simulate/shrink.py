@@ -1,4 +1,4 @@
-"""Drops from a plan whatever its finding can spare, by delta debugging (Zeller & Hildebrandt, 2002).
+"""Drops from a plan what its finding can spare: delta debugging (Zeller & Hildebrandt, 2002).
 
 A part of a plan is named by its path: a sender, an event, a phase of a sender, a setting. Each
 sender draws its chances by its own name, so the others do the same without it.
