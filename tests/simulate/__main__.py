@@ -1,14 +1,12 @@
 """Lets the machine look for what nobody thought of: random plans against the whole daemon.
 
-python -m tests.simulate --seed 1 --hours 0.5   # seeds 1, 2, ... until half an hour is simulated
-python -m tests.simulate --replay 17            # one seed again, or a plan of corpus/
-python -m tests.simulate --shrink 17 --keep late_clear
-python -m tests.simulate --seed 1 --hours 24 --against ../other-checkout
+`tests/README.md` says how to use it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import subprocess
 import sys
@@ -34,8 +32,9 @@ def commit() -> str:
     return told.stdout.strip() or "unknown"
 
 
-def results(seed: int, seconds: float, workers: int) -> Iterator[Result]:
-    """Play this seed and those behind it until so much time is simulated."""
+def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
+    """Play this seed and those behind it until so much time is simulated or has passed."""
+    end = time.monotonic() + within_s
     with ProcessPoolExecutor(workers) as pool:
         running = {pool.submit(_play, seed + n) for n in range(workers)}
         following, total = seed + workers, 0.0
@@ -45,7 +44,7 @@ def results(seed: int, seconds: float, workers: int) -> Iterator[Result]:
                 result = one.result()
                 total += result.simulated_s
                 yield result
-                if total < seconds:
+                if total < seconds and time.monotonic() < end:
                     running.add(pool.submit(_play, following))
                     following += 1
 
@@ -68,11 +67,11 @@ def table(counts: Counter[str]) -> str:
     return "\n".join(f"  {group:<11} {', '.join(items)}" for group, items in groups.items())
 
 
-def explore(seed: int, hours: float, workers: int) -> int:
+def explore(seed: int, hours: float, workers: int, within_s: float = math.inf) -> int:
     """Play seeds for so many simulated hours; return the number of findings."""
     counts, simulated, cpu, findings, runs = Counter[str](), 0.0, 0.0, 0, 0
     began = time.perf_counter()
-    for result in results(seed, hours * 3600, workers):
+    for result in results(seed, hours * 3600, workers, within_s):
         runs += 1
         simulated += result.simulated_s
         cpu += result.cpu_s
@@ -122,6 +121,9 @@ def main() -> int:
     parser = argparse.ArgumentParser("tests.simulate", description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
     parser.add_argument("--hours", type=float, default=0.1, help="simulated hours in all")
+    parser.add_argument(
+        "--within", type=float, default=math.inf, metavar="MINUTES", help="real time for new seeds"
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--replay", metavar="SEED", help="play one seed, or a plan's file, again")
     parser.add_argument("--shrink", metavar="SEED", type=int, help="drop what a finding can spare")
@@ -135,7 +137,7 @@ def main() -> int:
     if options.against:
         tree = Path(options.against)
         return pairs.compare(tree, options.seed, options.hours * 3600, options.workers)
-    return min(1, explore(options.seed, options.hours, options.workers))
+    return min(1, explore(options.seed, options.hours, options.workers, options.within * 60))
 
 
 if __name__ == "__main__":
