@@ -51,10 +51,7 @@ class Path:
         self.pose = Pose(self._x, self._y, self._yaw)
 
     def _turn(self, turn: float) -> None:
-        yaw, rest = plus(self._yaw, turn)
-        wrapped = math.remainder(yaw, math.tau)
-        if wrapped != yaw:
-            rest -= round((yaw - wrapped) / math.tau) * TAU_REST
+        wrapped, rest = _wrapped(self._yaw, turn)
         self._yaw, self._yaw_rest = plus(wrapped, rest + self._yaw_rest)
 
 
@@ -67,7 +64,19 @@ def plus(a: float, b: float) -> tuple[float, float]:
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:
     """`pose` after an arc of length `distance` m through `turn` rad."""
-    path = Path()
-    path.set(pose)
-    path.advance(distance, turn)
-    return path.pose
+    half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
+    chord = distance * (math.sin(half) / half if half else 1.0)
+    heading = yaw + half
+    wrapped, rest = _wrapped(yaw, turn)
+    return Pose(
+        pose.x + chord * math.cos(heading), pose.y + chord * math.sin(heading), wrapped + rest
+    )
+
+
+def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
+    """yaw + turn within [-pi, pi], and what that leaves out."""
+    total, rest = plus(yaw, turn)
+    wrapped = math.remainder(total, math.tau)
+    if wrapped != total:
+        rest -= round((total - wrapped) / math.tau) * TAU_REST
+    return wrapped, rest

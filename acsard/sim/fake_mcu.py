@@ -43,11 +43,12 @@ class FakeMcu(Faults):
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
         super().__init__()
-        self.vehicle = Vehicle(config.sim, config.drive)
+        self._vehicle = Vehicle(config.sim, config.drive)
         self.baud_rate = config.mcu.baud_rate
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
-        self._now_ns = now_ns
+        self._now_ns = self._moved_ns = now_ns
+        """Monotonic times of the last `advance`, and up to which the vehicle has moved."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -64,12 +65,24 @@ class FakeMcu(Faults):
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
         """The last lines received with the time each was complete, valid or not, as they came."""
         self.valid_lines = 0
-        self.watchdog_trips = 0
+        self._watchdog_trips = 0
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
         for text in config.sim.faults:
             self._lasting.enter_context(self.having(named(text)))
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The robot on the floor at the last `advance`. It moves only when its state matters."""
+        self._catch_up()
+        return self._vehicle
+
+    @property
+    def watchdog_trips(self) -> int:
+        """How often the watchdog has stopped the motors."""
+        self._catch_up()
+        return self._watchdog_trips
 
     # time
 
@@ -95,7 +108,7 @@ class FakeMcu(Faults):
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
-            self._pass(due_ns)
+            self._now_ns = due_ns
             if what in ("sent", "batch"):
                 out += self._handed_over(due_ns, what, data)
             elif what == "line":
@@ -112,12 +125,12 @@ class FakeMcu(Faults):
                 if due_ns >= self._boot_until_ns:
                     self._reply(due_ns, protocol.Command({}))
                 self._schedule(due_ns + self.unprompted_ns, "report", data)
-        self._pass(now_ns)
+        self._now_ns = now_ns
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
         """Power on again: stopped, deaf while the bootloader runs, noise on the line first."""
-        self._pass(now_ns)
+        self._now_ns = now_ns
         self._events.clear()
         self._held = self._batch = b""
         self.vehicle.set_points[:] = [0.0] * 4
@@ -133,17 +146,20 @@ class FakeMcu(Faults):
     def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
-    def _pass(self, now_ns: int) -> None:
-        """Move the vehicle; the watchdog trips at its own time on the way."""
-        deadline = max(self._fed_ns + self.watchdog_ns, self._now_ns)
-        if self.watchdog and deadline <= now_ns and any(self.vehicle.set_points):
-            self.vehicle.advance((deadline - self._now_ns) / NS_PER_S, self.push)
-            self._now_ns = deadline
-            self.watchdog_trips += 1
-            self.vehicle.set_points[:] = [0.0] * 4
-        if now_ns > self._now_ns:
-            self.vehicle.advance((now_ns - self._now_ns) / NS_PER_S, self.push)
-            self._now_ns = now_ns
+    def _catch_up(self) -> None:
+        """Move the vehicle up to now; the watchdog trips at its own time on the way."""
+        vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
+        deadline = self._fed_ns + self.watchdog_ns
+        if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
+            deadline = max(deadline, moved_ns)
+            vehicle.advance((deadline - moved_ns) / NS_PER_S, self.push)
+            moved_ns = deadline
+            self._watchdog_trips += 1
+            vehicle.set_points[:] = [0.0] * 4
+        if now_ns > moved_ns:
+            vehicle.advance((now_ns - moved_ns) / NS_PER_S, self.push)
+            moved_ns = now_ns
+        self._moved_ns = moved_ns
 
     # lines
 
@@ -153,11 +169,15 @@ class FakeMcu(Faults):
             return
         command = self.understand(line)
         if command is None:
-            self._fed_ns = now_ns if self.any_feeds else self._fed_ns
+            if self.any_feeds:
+                self._catch_up()
+                self._fed_ns = now_ns
             return
+        # The vehicle obeys the line before until now.
+        set_points = self.vehicle.set_points
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]
-            self.vehicle.set_points[wheel] = forward * self.drives[motor] * value
+            set_points[wheel] = forward * self.drives[motor] * value
         self.valid_lines += 1
         self._fed_ns = now_ns
         if not self.unprompted_ns:
@@ -208,12 +228,15 @@ class FakeMcu(Faults):
 
     def _encoders(self) -> list[int]:
         """Counts of motors a to d."""
-        angles = self.vehicle.angles
-        return [math.floor(f * angles[w] / math.tau * self._counts + 0.5) for w, f in self._wiring]
+        angles, tau, per_turn = self.vehicle.angles, math.tau, self._counts
+        return [math.floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
 
     def _speeds(self, now_ns: int) -> list[float]:
         """What the encoders say: whole counts over the time since they were last read."""
         since, before = self._window
+        gains = self.gains
+        if self.stuck is not None:
+            gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
@@ -227,12 +250,10 @@ class FakeMcu(Faults):
             if self.frozen is not None:
                 said[self.frozen] = self._measured[self.frozen]
             self._measured = said
-            for motor, (count, gain) in enumerate(zip(moved, self.gains, strict=True)):
-                self._counted[motor] += 0.0 if motor == self.stuck else count * gain
+            rows = zip(self._counted, moved, gains, strict=True)
+            self._counted = [total + count * gain for total, count, gain in rows]
             self._window = (now_ns, counts)
-        seen = [speed * gain for speed, gain in zip(self._measured, self.gains, strict=True)]
-        if self.stuck is not None:
-            seen[self.stuck] = 0.0
+        seen = [speed * gain for speed, gain in zip(self._measured, gains, strict=True)]
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:

@@ -64,13 +64,20 @@ class Faults:
     @contextmanager
     def _with(self, **values: object) -> Iterator[None]:
         before = {name: getattr(self, name) for name in values}
-        for name, value in values.items():
-            setattr(self, name, value)
+        self._turn(values)
         try:
             yield
         finally:
-            for name, value in before.items():
-                setattr(self, name, value)
+            self._turn(before)
+
+    def _turn(self, values: dict[str, object]) -> None:
+        """Turn these switches; until now the vehicle has moved by what they were."""
+        self._catch_up()
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def _catch_up(self) -> None:
+        """Move the vehicle up to now, where there is one."""
 
     def _hit(self, what: str, every: int) -> bool:
         """Count one more of `what`; whether it is the n-th."""

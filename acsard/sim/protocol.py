@@ -7,6 +7,7 @@ older kinds know no suffix, and take the line before it as ever. Shares no code 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 from msgspec import Struct
@@ -14,6 +15,8 @@ from msgspec import Struct
 MOTORS = "abcd"
 
 HEX = b"0123456789ABCDEF"
+
+_LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
 
 PLAIN = 31
 """Bytes of a plain line without comma and end."""
@@ -71,27 +74,26 @@ def latched(line: bytes) -> Command:
 
 
 def _plain(text: bytes) -> Command | None:
-    tokens = text.removesuffix(b",").split(b",")
-    if [token[:1] for token in tokens] != [b"a", b"b", b"c", b"d"]:
+    match = _LINE.fullmatch(text)
+    if match is None:
         return None
-    values = []
-    for token in tokens:
-        digits, point, part = token[2:].partition(b".")
-        if token[1:2] not in (b"p", b"n") or point != b".":
-            return None
-        if len(digits) != 2 or len(part) != 2 or not (digits + part).isdigit():
-            return None
-        values.append((int(digits) + int(part) / 100) * (1 if token[1:2] == b"p" else -1))
-    return Command(dict(enumerate(values)))
+    a, b, c, d = match.groups()
+    return Command({0: _value(a), 1: _value(b), 2: _value(c), 3: _value(d)})
+
+
+def _value(word: bytes) -> float:
+    size = int(word[1:3]) + int(word[4:]) / 100
+    return -size if word[0] == 0x6E else size
 
 
 def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> bytes:
     """The plain part of a reply."""
-    form = ".2f" if unpadded else "05.2f"
-    return separator.join(
-        f"{motor}{'n' if speed < 0 else 'p'}{min(abs(speed), 99.99):{form}}"
+    form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
+    words = [
+        form % (motor, "n" if speed < 0 else "p", min(abs(speed), 99.99))
         for motor, speed in zip(MOTORS, speeds, strict=True)
-    ).encode()
+    ]
+    return separator.join(words).encode()
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:

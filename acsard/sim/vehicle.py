@@ -65,18 +65,19 @@ class Vehicle:
             right, left = push / self._right_radius, push / self._left_radius
             goals, lag = [right, left, left, right], HANDS_S
         else:
-            goals, lag = [point * (1.0 - self.load) for point in self.set_points], self._lag
+            given = 1.0 - self.load
+            goals, lag = [point * given for point in self.set_points], self._lag
         if not (any(goals) or any(self.speeds)):
             return
         rest = math.exp(-dt / lag) if lag else 0.0
-        turned = [0.0] * 4
+        gone, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
         for i, goal in enumerate(goals):
-            error = self.speeds[i] - goal
+            error = speeds[i] - goal
             # The integral of an exponential approach, so that any dt gives the same path.
-            turned[i] = goal * dt + error * lag * (1.0 - rest)
+            angle = turned[i] = goal * dt + error * lag * gone
             speed = goal + error * rest
-            self.speeds[i] = speed if abs(speed) > 1e-9 else 0.0
-            self.angles[i] += turned[i]
+            speeds[i] = speed if abs(speed) > 1e-9 else 0.0
+            angles[i] += angle
         left = self._left_radius * (turned[1] + turned[2]) / 2
         right = self._right_radius * (turned[0] + turned[3]) / 2
         turn = (right - left) / self._track

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import msgspec
 
 from acsard.config.settings import Config
-from acsard.incoming.bus import BusInput
+from acsard.incoming.bus import NOTHING, BusInput
 from acsard.incoming.commands import Arrival
 from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Query, Reply
@@ -105,6 +105,8 @@ class MemoryBus:
         self.queries: list[Query] = []
 
     def take(self, queries: int) -> BusInput:
+        if not (self.arrivals or self.queries):
+            return NOTHING
         got = BusInput(tuple(self.arrivals), tuple(self.queries[:queries]))
         self.arrivals.clear()
         del self.queries[:queries]
@@ -200,29 +202,39 @@ class World:
         """Let time pass: bytes arrive when they do, a step comes every period."""
         end_ns = self.now_ns + int(seconds * NS_PER_S)
         while True:
-            mcu_ns = self.port.mcu.next_ns() if self.port.mcu else None
-            tick = mcu_ns is None or self.next_period_ns <= mcu_ns
-            at_ns = self.next_period_ns if mcu_ns is None or tick else mcu_ns
-            alarm_ns = self._alarm_ns
-            if alarm_ns is not None and alarm_ns <= min(at_ns, end_ns):
-                self._alarm_ns = None
-                self.now_ns = max(self.now_ns, alarm_ns)
+            alarm_ns, at_ns = self._alarm_ns, self.next_period_ns
+            rings = alarm_ns is not None and alarm_ns <= at_ns
+            if alarm_ns is not None and rings:
+                at_ns = alarm_ns
+            # Of two things at the same time the alarm is first, then the period, then the bytes.
+            if self._bytes_came(min(at_ns - 1, end_ns)):
                 self._step()
                 continue
             if at_ns > end_ns:
                 self.now_ns = max(self.now_ns, end_ns)
                 return
             self.now_ns = max(self.now_ns, at_ns)
-            if tick:
-                missed, self._missed = self._missed, 0
-                due_ns = self.next_period_ns - missed * self.period_ns
-                self.next_period_ns += self.period_ns
-                self._step(Period(1 + missed, due_ns))
-            elif self.port.mcu is not None:
-                data = self.port.mcu.advance(at_ns)
-                if data:
-                    self.port.feed(Received(self.instant, data))
-                    self._step()
+            if rings:
+                self._alarm_ns = None
+                self._step()
+                continue
+            missed, self._missed = self._missed, 0
+            due_ns = self.next_period_ns - missed * self.period_ns
+            self.next_period_ns += self.period_ns
+            self._step(Period(1 + missed, due_ns))
+
+    def _bytes_came(self, until_ns: int) -> bool:
+        """Let the MCU live until its next bytes reach the port; False if none do by then."""
+        mcu = self.port.mcu
+        if mcu is None:
+            return False
+        while (due_ns := mcu.next_ns()) is not None and due_ns <= until_ns:
+            data = mcu.advance(due_ns)
+            if data:
+                self.now_ns = max(self.now_ns, due_ns)
+                self.port.feed(Received(self.instant, data))
+                return True
+        return False
 
     def stall(self, seconds: float) -> None:
         """The loop does not run, the world goes on."""
@@ -328,8 +340,8 @@ class World:
         return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
-        """Return a service's answer; `clear` names the latch of `state`, as our tools do."""
-        if service == "clear" and not payload:
+        """Return a service's answer; a release names the latch of `state`, as our tools do."""
+        if service in ("clear", "activate") and not payload:
             payload = msgspec.json.encode({"latch": self.state.latch})
         (reply,) = self.ask(f"srv/{service}", payload=payload)
         return msgspec.json.decode(reply.payload, type=ServiceReply)
