@@ -246,7 +246,7 @@ class Run:
     # the board and the host
 
     def _do(self, event: dict[str, Any]) -> None:
-        product, witness = self.product, self.witness
+        product = self.product
         lasts_ns = min(
             int(event.get("for", 0.0) * NS),
             max(0, int(self.plan["seconds"] * NS) - self.true_ns),

@@ -288,11 +288,13 @@ class Witness:
                 self.softest[parts[1]] = (
                     min(low, value) if "deceleration" in key else max(low, value)
                 )
+                continue
+            before_ns = self.pause_ns, dict(self.timeout)
+            if parts[1] == "pause":
+                self.pause_ns = int(value * NS)
             else:
-                if parts[1] == "pause":
-                    self.pause_ns = int(value * NS)
-                else:
-                    self.timeout[parts[2]] = int(value * NS)
+                self.timeout[parts[2]] = int(value * NS)
+            if before_ns != (self.pause_ns, self.timeout):
                 self.arming(at_ns)
 
     # what the daemon showed
