@@ -392,7 +392,7 @@ class Run:
             witness.troubles[name] = true_ns
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         for at_ns, line in seen.lines:
-            witness.line(at_ns + offset, line, self._fed_ns)
+            witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if any(witness.last):
                 self._moved_ns = at_ns + offset
         if seen.estimates:

@@ -289,13 +289,17 @@ class Witness:
             found.append((self.dormant_ns, "being switched off"))
         return min(found, default=None)
 
-    def line(self, at_ns: int, line: bytes, fed_ns: int) -> None:
-        """Judge a line on the wire; `fed_ns` is when the board was last heard."""
+    def line(self, at_ns: int, line: bytes, fed_ns: int, made_ns: int) -> None:
+        """Judge a line on the wire.
+
+        `fed_ns` is when the board was last heard. Speeds grow by the time between the steps that
+        made two lines, at `made_ns`; a stalled step hands its line over later.
+        """
         wheels = self._decoded.get(line) or self._read(at_ns, line)
         if wheels is None:
             return
         if wheels == ZERO:
-            self.last, self.last_ns, self.coasting, self.braking = ZERO, at_ns, None, None
+            self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
             self.softest = dict(self.limits)
             return
         self.counts["moving lines"] += 1
@@ -309,14 +313,14 @@ class Witness:
             for new, old in zip(wheels, before, strict=True)
         )
         if not self.pending:
-            self._limits(at_ns, wheels, before, at_ns - last_ns, grows)
+            self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
         held = None if self.pending else self.held
         if held is None:
             self.braking = None
         else:
             self._held(at_ns, held, grows, line, max(map(abs, wheels)))
         self._wished(at_ns, wheels, before, grows, line)
-        self.last, self.last_ns = wheels, at_ns
+        self.last, self.last_ns = wheels, made_ns
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
