@@ -21,7 +21,7 @@ from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import NS, Message, messages, sample
+from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
 MOST_HELD = 2000
 """Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
@@ -224,7 +224,7 @@ class Run:
         ticket = self._ticket
 
         def answered(reply: bytes) -> None:
-            success, text = _read_reply(reply, via)
+            success, text = read_reply(reply, via)
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
             if not success:
                 return
@@ -498,12 +498,3 @@ class Run:
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
         if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
             raise BrokenError("the robot drives as told", self.true_ns, f"{got} for {told}")
-
-
-def _read_reply(reply: bytes, via: str) -> tuple[bool, str]:
-    if via == "native":
-        found = msgspec.json.decode(reply)
-        return found["success"], found["message"]
-    # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
-    length = struct.unpack_from("<I", reply, 8)[0]
-    return bool(reply[4]), reply[12 : 12 + length - 1].decode()

@@ -204,7 +204,7 @@ def compare(
             pair.close()
     show(
         f"{runs} pairs from seed {seed}, {total / 3600:.2f} h simulated on both sides in "
-        f"{time.perf_counter() - began:.0f} s, {differing} differ; {len(DIFFERENCES + LEFT_OUT + DEFAULTS)} deliberate "
-        "differences are listed"
+        f"{time.perf_counter() - began:.0f} s, {differing} differ; "
+        f"{len(DIFFERENCES + LEFT_OUT + DEFAULTS)} deliberate differences are listed"
     )
     return min(1, differing)

@@ -15,7 +15,7 @@ from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any
 
-from tests.simulate.ages import MARGIN_NS, Ages
+from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
@@ -44,28 +44,6 @@ class BrokenError(AssertionError):
     def __init__(self, promise: str, at_ns: int, text: str) -> None:
         super().__init__(f"{promise} at {at_ns / NS:.3f} s: {text}")
         self.promise, self.at_ns, self.text = promise, at_ns, text
-
-
-class Wish:
-    """A command that arrived, and what the omniscient view thinks of it."""
-
-    __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
-
-    def __init__(self, arrived_ns: int, v: float, w: float) -> None:
-        self.arrived_ns, self.v, self.w = arrived_ns, v, w
-        self.fresh = self.certain = self.shared = False
-        self.identity = ""
-        self.armed_ns = -1
-        """Arrival of the zero by which this sender is armed, -1 for none."""
-
-
-class Sender:
-    """Zeros and speeds of one identity on one source."""
-
-    def __init__(self) -> None:
-        self.zeros: list[int] = []
-        """Arrivals of the zeros that no speed has followed."""
-        self.armed_ns = -1
 
 
 class Witness:
