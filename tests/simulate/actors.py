@@ -391,6 +391,7 @@ class Run:
         for name, _ in self._active:
             witness.troubles[name] = true_ns
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
+        witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if any(witness.last):

@@ -89,6 +89,8 @@ class Witness:
         """Since when the kernel takes no line."""
         self.braking: tuple[int, float] | None = None
         """When a robot that must not move was first seen to move, and how fast."""
+        self.cut = False
+        """The link was lost since the last line, so the speed starts over from zero."""
         self.pending = False
         """An answer waits for the disk, so it is not known yet what is in force."""
         self.mode = self.reason = ""
@@ -292,7 +294,7 @@ class Witness:
         else:
             self._held(at_ns, held, grows, line, max(map(abs, wheels)))
         self._wished(at_ns, wheels, before, grows, line)
-        self.last, self.last_ns = wheels, made_ns
+        self.last, self.last_ns, self.cut = wheels, made_ns, False
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
@@ -348,7 +350,7 @@ class Witness:
                     f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
                 )  # fmt: skip
             lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
-            if lost > down * (dt / NS + 0.002) + 2 * room and not saturated:
+            if lost > down * (dt / NS + 0.002) + 2 * room and not (saturated or self.cut):
                 raise BrokenError(
                     "no deceleration is over its limit", at_ns,
                     f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
