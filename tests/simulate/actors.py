@@ -17,14 +17,12 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS, Message, messages, read_reply, sample
-
-MOST_HELD = 2000
-"""Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
 
 
 class Result(NamedTuple):
@@ -65,18 +63,19 @@ class Run:
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
         self.counts: Counter[str] = self.witness.counts
+        self.liveness = Liveness(self)
         self.failure: BrokenError | None = None
-        self._todo: list[tuple[int, int, Callable[[], None]]] = []
+        self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
         self._calls: dict[int, Callable[[bytes], None]] = {}
         self._ticket = 0
-        self._active: list[tuple[str, tuple[Any, ...]]] = []
+        self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
-        self._epilogue = False
-        self._moved_ns = -1
+        self.epilogue = False
+        self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
         self.product.fed = self._fed
 
@@ -86,14 +85,15 @@ class Run:
     def true_ns(self) -> int:
         return self.product.now_ns - START_NS + self.slept_ns
 
-    def _at(self, at_ns: int, do: Callable[[], None]) -> None:
+    def at(self, at_ns: int, do: Callable[[], None]) -> None:
+        """Have something done at this time."""
         self._order += 1
-        heapq.heappush(self._todo, (at_ns, self._order, do))
+        heapq.heappush(self.todo, (at_ns, self._order, do))
 
-    def _run_to(self, true_ns: int) -> None:
+    def run_to(self, true_ns: int) -> None:
         """Do all that is due by then, at its own time."""
-        while self._todo and self._todo[0][0] <= true_ns:
-            at_ns, _, do = heapq.heappop(self._todo)
+        while self.todo and self.todo[0][0] <= true_ns:
+            at_ns, _, do = heapq.heappop(self.todo)
             self._pass(at_ns)
             do()
             self._raise()
@@ -117,8 +117,8 @@ class Run:
         """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
         try:
             self._begin()
-            self._run_to(int(self.plan["seconds"] * NS))
-            self._end()
+            self.run_to(int(self.plan["seconds"] * NS))
+            self.liveness.end()
         except BrokenError:
             raise
         except Exception as error:
@@ -128,8 +128,9 @@ class Run:
 
     def _begin(self) -> None:
         plan, seen = self.plan, Counter[str]()
-        self._active = [(name, tuple(values)) for name, *values in plan["board"]]
-        self.product.board(self._active)
+        self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
+        self.active = list(self.lasting)
+        self.product.board(self.active)
         for sender in plan["senders"]:
             self.counts[f"way {sender['way']}"] += 1
             for shape in sender["congestion"]:
@@ -149,30 +150,33 @@ class Run:
         self.witness.shared_clocks = frozenset(several)
         for event in plan["events"]:
             self.counts[f"event {event['do']} {event.get('verb', '')}".strip()] += 1
-            self._at(int(event["at"] * NS), lambda event=event: self._do(event))  # type: ignore[misc]
+            self.at(int(event["at"] * NS), lambda event=event: self._do(event))  # type: ignore[misc]
 
     def _next(self, sender: dict[str, Any], queue: list[Message]) -> None:
         message = queue.pop()
 
         def arrive() -> None:
-            self._deliver(sender, message)
+            self.deliver(sender, message)
             if queue:
                 self._next(sender, queue)
 
-        self._at(message.arrives_ns, arrive)
+        self.at(message.arrives_ns, arrive)
 
-    def _deliver(self, sender: dict[str, Any], message: Message) -> None:
+    def deliver(self, sender: dict[str, Any], message: Message) -> None:
+        """Hand a message to the daemon, if there is one."""
         if not self.product.alive:
             return
         at_ns = self._arrival(message.arrives_ns)
         one = sample(sender, message, self.plan["config"], self.product.wall_ns)
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.command(sender, message, one, true_ns)
+        self.liveness.command(sender, one)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
 
     # operators
 
-    def _call(self, event: dict[str, Any]) -> None:
+    def call(self, event: dict[str, Any]) -> None:
+        """Have an operator call a service, over a network that may lose or delay the call."""
         if event["lost"]:
             return
         latch, read_ns = None, None
@@ -181,8 +185,8 @@ class Run:
         end_ns = int(self.plan["seconds"] * NS)
         due_ns = self.true_ns + int(event["late"] * NS)
         for extra_ns in (0, 700_000_000) if event["twice"] else (0,):
-            if due_ns + extra_ns < end_ns or self._epilogue:
-                self._at(
+            if due_ns + extra_ns < end_ns or self.epilogue:
+                self.at(
                     due_ns + extra_ns,
                     lambda due=due_ns + extra_ns: self._ask(event, due, latch, read_ns),  # type: ignore[misc]
                 )
@@ -195,6 +199,8 @@ class Run:
         read_ns: int | None,
     ) -> None:
         product, verb, witness = self.product, event["verb"], self.witness
+        if "pose" not in verb and "odometry" not in verb:
+            self.liveness.event()
         if not product.alive:
             return
         at_ns = self._arrival(due_ns)
@@ -248,6 +254,8 @@ class Run:
 
     def _do(self, event: dict[str, Any]) -> None:
         product = self.product
+        if event["do"] not in ("wall", "disk", "call"):
+            self.liveness.event()
         lasts_ns = min(
             int(event.get("for", 0.0) * NS),
             max(0, int(self.plan["seconds"] * NS) - self.true_ns),
@@ -255,29 +263,29 @@ class Run:
         after_ns = self.true_ns + lasts_ns
         match event["do"]:
             case "call":
-                self._call(event)
+                self.call(event)
             case "board":
                 name, *values = event["fault"]
                 self.counts[f"board {name}"] += 1
                 fault = (name, tuple(values))
-                self._active.append(fault)
+                self.active.append(fault)
                 self._troubled(name)
-                product.board(list(self._active))
-                self._at(after_ns, lambda: self._mended(fault))
+                product.board(list(self.active))
+                self.at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
                 self.pose.doubt()
                 self._troubled("reset")
                 deaf_ns = int(event["deaf"] * NS)
                 if deaf_ns > 12 * NS // 10:
-                    self._at(self.true_ns + deaf_ns, lambda: self._disarmed(self.true_ns))
+                    self.at(self.true_ns + deaf_ns, lambda: self._disarmed(self.true_ns))
             case "unplug":
                 product.unplug()
                 self.pose.doubt()
-                self._at(after_ns, lambda: self._plug(event["new"]))
+                self.at(after_ns, lambda: self.plug(event["new"]))
             case "block":
                 self._block(True)
-                self._at(after_ns, lambda: self._block(False))
+                self.at(after_ns, lambda: self._block(False))
             case "tear":
                 product.tear(event["taken"])
             case "stall" | "stall in step":
@@ -292,12 +300,13 @@ class Run:
                 product.step_wall(event["by"])
             case "disk":
                 product.disk.fill(True)
-                self._at(after_ns, lambda: product.disk.fill(False))
+                self.at(after_ns, lambda: product.disk.fill(False))
             case "restart":
                 if product.alive:
                     self._restart(event, after_ns)
 
     def _block(self, blocked: bool) -> None:
+        self.liveness.event()
         self.product.block(blocked)
         self.witness.blocked_ns = self.true_ns if blocked else None
 
@@ -307,15 +316,18 @@ class Run:
             self.pose.doubt()
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
-        self._active.remove(fault)
+        self.active.remove(fault)
+        self.liveness.event()
         self._troubled(fault[0])
-        self.product.board(list(self._active))
+        self.product.board(list(self.active))
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.product.unplug()
-            self._at(self.true_ns + NS // 10, lambda: self._plug(False))
+            self.at(self.true_ns + NS // 10, lambda: self.plug(False))
 
-    def _plug(self, new: bool) -> None:
+    def plug(self, new: bool) -> None:
+        """Plug the board in again, unless it is plugged in."""
+        self.liveness.event()
         if not self.product.plugged:
             self.product.plug(new)
             self._disarmed(self.true_ns)
@@ -333,7 +345,7 @@ class Run:
         self.resumed_ns = product.now_ns
         product.step_wall(lasts_ns / NS)
         self.witness.suspended(true_ns + lasts_ns)
-        self._at(self.true_ns + 20_000_000, lambda: self._plug(False))
+        self.at(self.true_ns + 20_000_000, lambda: self.plug(False))
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
         product, witness = self.product, self.witness
@@ -351,11 +363,12 @@ class Run:
             if product.disk.full:
                 witness.stops.append(self.true_ns)
             product.start()
+            self.liveness.event()
             self._linked = False
             witness.new_life(self.true_ns)
             self.pose.doubt()
 
-        self._at(after_ns + 1000, start)
+        self.at(after_ns + 1000, start)
 
     # what the product shows
 
@@ -388,16 +401,17 @@ class Run:
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
-        for name, _ in self._active:
+        for name, _ in self.active:
             witness.troubles[name] = true_ns
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if any(witness.last):
-                self._moved_ns = at_ns + offset
+                self.moved_ns = at_ns + offset
+        self.liveness.look(true_ns)
         if seen.estimates:
-            lies, truth = {name for name, _ in self._active}, self.product.truth()
+            lies, truth = {name for name, _ in self.active}, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             witness.wheels(true_ns, truth[4])
         self.pose.end_step()
@@ -409,93 +423,3 @@ class Run:
                     "odometry": seen.estimates,
                 }
             )  # fmt: skip
-
-    # the end: the faults are over, and a lawful sender must be able to drive
-
-    def _end(self) -> None:
-        self._epilogue = True
-        product, end_ns = self.product, self.true_ns
-        if not product.alive:
-            self._run_to(max(at for at, _, _ in self._todo) if self._todo else end_ns)
-        self._run_to(self.true_ns + NS // 2)
-        if not product.plugged:
-            self._plug(False)
-        product.disk.fill(False)
-        self._check_counts()
-        size, kind = product.largest()
-        self.counts["largest container"] = max(self.counts["largest container"], size)
-        if size > MOST_HELD:
-            raise BrokenError("memory is bounded", self.true_ns, f"a {kind} of {size} entries")
-        self._run_to(
-            self.true_ns + int((2.5 + self.plan["config"]["sim"].get("boot_time", 0)) * NS)
-        )
-        for _ in range(3):
-            verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
-            verb = verbs.get(product.state()["mode"])
-            if verb:
-                self._call({"verb": verb, "named": True, "by": "op", "via": "native",
-                            "late": 0.0, "lost": False, "twice": False})  # fmt: skip
-            self._run_to(self.true_ns + NS // 10)
-        self._drive_lawfully()
-
-    def _check_counts(self) -> None:
-        """Every command that arrived was accepted or refused, and is counted."""
-        counters = self.product.state()["counters"]
-        counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
-        counted += sum(n for name, n in counters.items() if name.startswith("command_"))
-        expected = self.witness.delivered - self.product.dropped
-        if counted != expected:
-            text = f"{expected} arrived, {counted} are counted: {counters}"
-            raise BrokenError("every command is counted", self.true_ns, text)
-
-    def _drive_lawfully(self) -> None:
-        plan, begin_ns = self.plan, self.true_ns
-        source = plan["config"]["commands"]["sources"][0]["name"]
-        sender = {
-            "name": "lawful", "id": "lawful/1", "way": "client", "source": source, "wheels": False,
-            "form": "json", "ahead": 0.0, "drift": 0.0, "clock": [], "churn": False, "delay": 0.002,
-        }  # fmt: skip
-        own = [
-            one
-            for one in plan["senders"]
-            if one["way"] in ("client", "page")
-            and not (one["churn"] or one["junk"] or one["id"] in self.witness.shared_clocks)
-        ]
-        number = 10**6
-        if plan["lawful"] != "a new client" and own:
-            sender = own[0]
-        zeros_s = self.witness.pause_ns / NS + 1.0
-        speed = 0.5 * self.witness.limits["linear_speed"]
-        turn = 0.25 * self.witness.limits["angular_speed"]
-        end_ns = begin_ns + int((zeros_s + 3.0) * NS)
-        while self.true_ns < end_ns:
-            zero = self.true_ns - begin_ns < zeros_s * NS
-            now_ns = self.true_ns
-            t = now_ns / NS
-            number += 1
-            v, w = (0.0, 0.0) if zero else (speed, turn)
-            stamp_ns = (
-                START_NS + WALL_OFFSET_NS + int((t + sender["ahead"] + sender["drift"] * t) * NS)
-            )
-            delay_ns = int(sender["delay"] * NS)
-            message = Message(now_ns, now_ns + delay_ns, v, w, stamp_ns, number, "")
-            self._at(now_ns + delay_ns, lambda m=message: self._deliver(sender, m))  # type: ignore[misc]
-            self._run_to(now_ns + 50_000_000)
-        mode, reason = self.witness.mode, self.witness.reason
-        moving = self.true_ns - self._moved_ns < NS // 5
-        if mode != "driving" or not moving:
-            raise BrokenError("a lawful sender drives", self.true_ns, f"{mode}: {reason}")
-        self._check_course(speed, turn)
-        self.counts["lawful drives"] += 1
-        self._run_to(self.true_ns + NS)
-
-    def _check_course(self, speed: float, turn: float) -> None:
-        """The robot drives as it was told, or slower on the same curve."""
-        witness, limits = self.witness, self.witness.limits
-        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
-        if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
-            return
-        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
-        room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
-        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
-            raise BrokenError("the robot drives as told", self.true_ns, f"{got} for {told}")
