@@ -229,8 +229,10 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_simulate.py",
         "test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else",
     ),
-    ".venv/bin/python -m tests.mutation": Shown("takes hours, for changes of the core"),
-    ".venv/bin/python -m tests.mutation --safety --fast": Shown("takes an hour, for the same"),
+    ".venv/bin/coverage run": InCi(".venv/bin/coverage run"),
+    ".venv/bin/coverage report": InCi(".venv/bin/coverage report"),
+    ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
+    ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
         "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop"
     ),

@@ -1,4 +1,4 @@
-"""Interfaces that the check needs: a serial line, and an operator at the robot."""
+"""The two parts outside the check: a serial line, and an operator at the robot."""
 
 from __future__ import annotations
 

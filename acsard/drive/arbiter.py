@@ -63,20 +63,18 @@ class _Source:
         for sender in self.senders.values():
             sender.use(self.timeout_ns, self.pause_ns)
 
-    def sender(self, name: str, now_ns: int) -> Sender | None:
-        """Return the sender of this name, or None if the table is full of senders that drive.
+    def add(self, name: str, now_ns: int) -> Sender | None:
+        """Return a new sender of this name, or None if the table is full of senders that drive.
 
-        A new sender replaces the one of the lowest account if the table is full.
+        The new sender replaces the one of the lowest account if the table is full.
         """
-        known = self.senders.get(name)
-        if known is None:
-            if len(self.senders) >= MAX_SENDERS:
-                least = min(self.senders, key=lambda other: self._account(other, now_ns))
-                if self._account(least, now_ns)[0]:
-                    return None
-                del self.senders[least]
-            known = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
-        return known
+        if len(self.senders) >= MAX_SENDERS:
+            least = min(self.senders, key=lambda other: self._account(other, now_ns))
+            if self._account(least, now_ns)[0]:
+                return None
+            del self.senders[least]
+        added = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
+        return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
         """Rank a sender: armed and live before armed, and then by its last message."""
@@ -173,7 +171,7 @@ class Arbiter:
             if known is not None:
                 known.refuse(command, verdict)
             return "stale"
-        sender = known or source.sender(command.sender, command.arrived_ns)
+        sender = known or source.add(command.sender, command.arrived_ns)
         if sender is None:
             return "crowded"
         if verdict in ("set", "first"):

@@ -338,9 +338,8 @@ class LatchFile:
         return ""
 
     def _sync(self) -> str:
-        """Wait until the disk has the file; return the reason if that fails."""
-        if self._path is None or self._barred:
-            return self._barred
+        """Wait until the disk has the file, which `_replace` has written; return a failure."""
+        assert self._path is not None
         try:
             sync(self._path)
         except OSError as error:
@@ -382,8 +381,6 @@ def _content(path: Path) -> bytes:
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
         about = os.fstat(handle)
-        if stat.S_ISDIR(about.st_mode):
-            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
         if not stat.S_ISREG(about.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file")
         data = file.read(MAX_BYTES + 1)

@@ -39,10 +39,19 @@ MEMBERS = {"Mode": list(Mode.__members__)}
 
 
 class Mutant(NamedTuple):
-    """One fault: the module's text with it, where it is and how it reads."""
+    """One fault.
+
+    Attributes:
+        path: The module, relative to the project.
+        line: The line of the fault.
+        statement: The line where its statement starts, or 0 if it is outside of functions.
+        key: The description that `equivalent.py` uses. It has no line number.
+        text: The source of the module with the fault in it.
+    """
 
     path: str
     line: int
+    statement: int
     key: str
     text: str
 
@@ -111,20 +120,48 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
                 yield ast.Pass()
 
 
-def places(node: ast.AST, scope: str = "") -> Iterator[tuple[ast.AST, str, ast.AST, str]]:
-    """All that may be mutated below a node: its parent, its field there, itself, its scope."""
+def places(
+    node: ast.AST, scope: str = "", statement: int = 0, inside: bool = False
+) -> Iterator[tuple[ast.AST, str, ast.AST, str, int]]:
+    """Yield the parent, its field, the node, its scope and the line of its statement.
+
+    Args:
+        node: The node below which faults may be.
+        scope: The names of the classes and functions around it.
+        statement: The line of the statement around it, or 0 outside of functions.
+        inside: Whether it is part of a function.
+    """
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         scope += f".{node.name}" if scope else node.name
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "bases"):
             continue
+        within = inside or (isinstance(node, ast.FunctionDef) and field == "body")
         for child in value if isinstance(value, list) else [value]:
             match child:
                 case ast.JoinedStr() | ast.keyword(arg="strict" | "frozen"):
                     continue
                 case ast.AST():
-                    yield node, field, child, scope
-                    yield from places(child, scope)
+                    starts = within and isinstance(child, ast.stmt)
+                    line: int = getattr(child, "lineno", 0) if starts else statement
+                    yield node, field, child, scope, line
+                    yield from places(child, scope, line, within)
+
+
+def traced(root: Path, path: str) -> str:
+    """Return a module that adds the line of each statement of a function to the set `executed`."""
+    tree = ast.parse((root / path).read_text(encoding="utf-8"))
+    inside = {line for *_, line in places(tree)} - {0}
+    for node in ast.walk(tree):
+        for field in ("body", "orelse", "finalbody"):
+            statements = getattr(node, field, None)
+            if not isinstance(statements, list):
+                continue
+            for place in range(len(statements) - 1, -1, -1):
+                line = statements[place].lineno
+                if line in inside:
+                    statements.insert(place, ast.parse(f"executed.add({line})").body[0])
+    return ast.unparse(tree)
 
 
 def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
@@ -140,7 +177,7 @@ def mutants(root: Path, path: str) -> Iterator[Mutant]:
     """All mutants of one module."""
     tree = ast.parse((root / path).read_text(encoding="utf-8"))
     original = ast.unparse(tree)
-    for parent, field, node, scope in list(places(tree)):
+    for parent, field, node, scope, statement in list(places(tree)):
         for variant in variants(node, parent, field):
             new = deepcopy(variant)
             put(parent, field, node, new)
@@ -148,7 +185,8 @@ def mutants(root: Path, path: str) -> Iterator[Mutant]:
             put(parent, field, new, node)
             if text != original:
                 line: int = getattr(node, "lineno", getattr(parent, "lineno", 0))
-                yield Mutant(path, line, f"{path} {scope}: {change(original, text)}", text)
+                key = f"{path} {scope}: {change(original, text)}"
+                yield Mutant(path, line, statement, key, text)
 
 
 def change(before: str, after: str) -> str:

@@ -17,6 +17,7 @@ from acsard.config.settings import (
     FeedbackConfig,
     LimitsConfig,
     McuConfig,
+    OdometryConfig,
     Source,
 )
 from acsard.drive.told import MAX_SENDER
@@ -30,6 +31,7 @@ from acsard.values import (
     Answer,
     Command,
     Event,
+    GyroSample,
     Inputs,
     Instant,
     Latch,
@@ -60,9 +62,10 @@ class Bench:
         self,
         config: Config | None = None,
         latches: Latches = Latches(),  # noqa: B008
+        fault_time: float = 0.0,
     ) -> None:
         # Its MCU says the same whatever it is told, which `sanity` would call a fault in time.
-        config = replace(config or Config(), feedback=FeedbackConfig(fault_time=0.0))
+        config = replace(config or Config(), feedback=FeedbackConfig(fault_time=fault_time))
         self.robot = Robot(config, latches)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self.now_ns = 50 * NS_PER_S
@@ -88,15 +91,19 @@ class Bench:
         superseded: bool = False,
         guard_trip: str = "",
         refusals: tuple[Refusal, ...] = (),
+        gyro: float | None = None,
+        late_ms: float | None = None,
     ) -> Outputs:
         """One period later (or `ms`): what happened meanwhile goes in, the outputs come out.
 
-        A `clear` or `activate` names the latch of the step before, as the tools do.
+        A `clear` or `activate` names the latch of the step before, as the tools do. `gyro` is the
+        rate of a sample; the commands are stamped `late_ms` ago by a clock of their own.
         """
         held = self.out.latches.in_force
         latch = held.number if ask in ("clear", "activate") and held else None
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
         heard = self.reply is not None and self.port_open
+        stamp_ns = None if late_ms is None else self.now_ns + WALL_NS - int(late_ms * MS)
         self.out = self.robot.step(
             Inputs(
                 now=self.now,
@@ -104,7 +111,8 @@ class Bench:
                 port_open=self.port_open,
                 opened=self.opened,
                 received=(Received(self.now, self.reply),) if heard and self.reply else (),
-                commands=tuple(Command(source, twist, self.now_ns) for twist in commands),
+                commands=tuple(Command(source, t, self.now_ns, stamp_ns) for t in commands),
+                gyro=() if gyro is None else (GyroSample(self.now_ns, None, gyro),),
                 requests=(Request(ask, 7, pose, latch=latch),) if ask else (),
                 refusals=refusals,
                 guard_trip=guard_trip,
@@ -1221,3 +1229,164 @@ def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
                 received=(Received(now, data),),
             )
         )
+
+
+# the gyro, the wheels and the clocks, as the robot reports them
+
+
+def test_the_track_that_a_gyro_taught_is_an_event_and_is_used_from_then_on() -> None:
+    bench = Bench(Config(odometry=OdometryConfig(gyro=True, learned_track=True))).linked()
+    for _ in range(150):
+        bench.step(gyro=0.0)
+    told: list[Event] = []
+    for second in range(60):
+        # Opposite wheels turn it by 1 rad/s at the configured track; it turns by 1/1.6 of that.
+        rate = (1.0, -1.0, 0.5, 0.0)[second % 4]
+        bench.reply = bench.codec.encode(bench.robot._kinematics.wheel_speeds(Twist(0.0, rate)))
+        for _ in range(100):
+            told += [one for one in bench.step(gyro=rate / 1.6).events if one.name == "track"]
+    (event,) = told
+    assert event.text.endswith(" in use, configured 1.000")
+    assert bench.robot.snapshot(bench.now_ns).gyro.track_use == "used"
+
+
+def test_a_pose_may_be_set_with_a_gyro() -> None:
+    bench = Bench(Config(odometry=OdometryConfig(gyro=True))).linked()
+    assert bench.answer("set_pose", Pose(1.0, 2.0, 0.5)).success
+    assert bench.step(gyro=0.0).estimates[-1].pose == Pose(1.0, 2.0, 0.5)
+
+
+def test_the_distance_travelled_counts_forwards_and_backwards() -> None:
+    bench = Bench().linked()
+    for speeds in (ROLLING, WheelSpeeds(-10.0, -10.0, -10.0, -10.0)):
+        bench.reply = bench.codec.encode(speeds)
+        for _ in range(100):
+            bench.step()
+    assert bench.robot.travelled == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_link_that_was_lost_while_no_step_came_is_counted_as_late() -> None:
+    bench = Bench().linked()
+    bench.reply = None
+    bench.step(ms=400)
+    assert bench.link() == "stale"
+    assert bench.counters()["link_lost"] == 1
+    assert bench.counters()["link_lost_late"] == 1
+
+
+def test_a_link_that_was_lost_in_time_is_not_counted_as_late() -> None:
+    bench = Bench().linked()
+    bench.reply = None
+    for _ in range(40):
+        bench.step()
+    assert bench.counters()["link_lost"] == 1
+    assert "link_lost_late" not in bench.counters()
+
+
+def test_wheels_that_turn_against_their_command_are_a_fault() -> None:
+    bench = Bench(fault_time=0.3).driving(steps=1)
+    bench.reply = bench.codec.encode(WheelSpeeds(-10.0, -10.0, -10.0, -10.0))
+    for _ in range(100):
+        bench.step(GO)
+    assert bench.mode() == "fault"
+
+
+def test_wheels_that_turn_without_a_command_are_told_and_counted() -> None:
+    bench = Bench(fault_time=0.3).linked()
+    bench.reply = bench.codec.encode(WheelSpeeds(5.0, 5.0, 5.0, 5.0))
+    told = [one.name for _ in range(100) for one in bench.step().events]
+    assert "wheels_turned" in told
+    assert bench.counters()["wheels_turned"] >= 1
+    assert bench.mode() == "ready"
+
+
+def test_a_wheel_that_stands_while_the_others_roll_is_told_and_counted() -> None:
+    bench = Bench().driving()
+    bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
+    told = [one.name for _ in range(200) for one in bench.step(GO).events]
+    assert "wheels_doubted" in told
+    assert bench.counters()["wheels_doubted"] >= 1
+
+
+def test_a_setting_that_cannot_be_is_refused_and_changes_nothing() -> None:
+    bench = Bench().linked()
+    before = bench.robot.config
+    settings: dict[str, Plain] = {"limits.linear_speed": -1.0}
+    request = Request("set", 7, settings=settings)
+    outputs = bench.robot.step(Inputs(bench.now, True, True, bench.opened, requests=(request,)))
+    assert not outputs.answers[0].success
+    assert "limits.linear_speed" in outputs.answers[0].message
+    assert bench.robot.config is before
+
+
+def test_a_timeout_that_is_set_applies_and_each_sender_must_be_neutral_again() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.set({"commands.sources.app.timeout": 0.5})
+    bench.step(GO)
+    assert bench.robot.snapshot(bench.now_ns).sources[1].waits_for.what == "neutral"
+    bench.step(REST)
+    bench.step(GO)
+    for _ in range(45):
+        bench.step()
+    assert bench.mode() == "driving"
+
+
+def test_a_message_that_was_refused_ends_the_wait_of_a_shared_zero() -> None:
+    bench = Bench().linked()
+    refusal = Refusal("malformed", "it cannot be read", "app", "", bench.now_ns)
+    for number in range(150):
+        bench.now_ns += 10 * MS
+        inputs = Inputs(
+            bench.now, True, True, bench.opened,
+            received=(Received(bench.now, bench.codec.stop),),
+            commands=(Command("app", REST, bench.now_ns, shared=True),) if number == 0 else (),
+            refusals=(replace(refusal, arrived_ns=bench.now_ns),) if number == 50 else (),
+        )  # fmt: skip
+        bench.out = bench.robot.step(inputs)
+    bench.now_ns += 10 * MS
+    command = Command("app", GO, bench.now_ns, shared=True)
+    bench.out = bench.robot.step(
+        Inputs(bench.now, True, True, bench.opened, commands=(command,),
+               received=(Received(bench.now, bench.codec.stop),))
+    )  # fmt: skip
+    assert bench.mode() == "ready"
+
+
+def test_the_first_commands_of_a_clock_are_counted_apart_from_those_refused() -> None:
+    bench = Bench().linked()
+    bench.step(REST, late_ms=0.0)
+    counters = bench.counters()
+    assert counters["commands_first_contact"] == 1
+    assert not [name for name in counters if name.startswith("command_")]
+
+
+def test_what_foreign_clocks_were_forgiven_is_counted_in_ms() -> None:
+    bench = Bench().linked()
+    for number in range(300):
+        bench.step(REST, late_ms=min(max(0.0, 10.0 * (number - 100)), 300.0), ms=50)
+    assert "clocks_forgiven_ms" in bench.counters()
+
+
+def test_the_latches_of_a_robot_are_those_of_its_last_step() -> None:
+    bench = Bench().linked()
+    bench.answer("stop")
+    assert bench.robot.latches is bench.out.latches
+    assert bench.robot.latches.stop
+
+
+def test_lines_that_are_not_answered_are_told() -> None:
+    bench = Bench().linked()
+    told: list[str] = []
+    for number in range(1100):
+        bench.robot.counters["lines_sent"] += 1
+        bench.reply = None if number % 5 == 0 else bench.codec.stop
+        told += [one.name for one in bench.step().events]
+    assert told.count("lines_lost") == 1
+
+
+def test_stamps_that_a_router_replaced_are_counted() -> None:
+    bench = Bench().linked()
+    command = Command("app", REST, bench.now_ns, stamp_replaced=True)
+    bench.robot.step(Inputs(bench.now, True, True, bench.opened, commands=(command,)))
+    assert bench.counters()["stamps_replaced"] == 1

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from acsard.config.settings import Source
+from acsard.config.settings import CommandsConfig, Source
 from acsard.drive.arbiter import Choice
 from acsard.values import REST, Command, SourceStatus, Twist, Wait
 from tests.unit.drive.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
@@ -84,6 +84,12 @@ def test_an_unknown_source_is_refused_and_never_listed() -> None:
     assert bench.send("stranger") == "unknown_source"
     assert bench.driver() == ""
     assert [s.name for s in bench.arbiter.sources(bench.now_ns)] == ["high"]
+
+
+def test_a_stale_command_adds_no_sender_to_its_source() -> None:
+    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "clock", "a")
+    assert bench.stamped(LOW, 5000.0, "clock", sender="a") == "stale"
+    assert bench.status(LOW).waits_for == Wait("command")
 
 
 def test_a_huge_command_is_accepted_for_the_limits_to_clamp() -> None:
@@ -546,3 +552,23 @@ def test_an_equal_source_is_told_who_came_first() -> None:
     bench.wait(10).send(LEFT)
     bench.choice()
     assert bench.status(LEFT).waits_for == Wait("equal", "right")
+
+
+# settings that change
+
+
+def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(300)
+    assert bench.driver() == ""
+    bench.arbiter.use(CommandsConfig(True, 1.0, (Source("high", 100, timeout=0.5),)))
+    assert bench.driver() == "high"
+
+
+def test_clocks_that_were_set_are_counted_by_how_much_later_they_were_believed() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH)
+    assert bench.arbiter.forgiven_ns == 0
+    for number in range(60):
+        bench.wait(50).stamped(HIGH, min(10.0 * number, 300.0), twist=REST)
+    assert bench.arbiter.forgiven_ns == pytest.approx(300 * MS, rel=0.1)

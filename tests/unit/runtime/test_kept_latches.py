@@ -8,8 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.runtime.kept_latches import MAX_BYTES, LatchFileError, decode, encode, stopped
-from acsard.values import Instant, Latch, Latches
+from acsard.runtime.kept_latches import (
+    ANSWER_NS,
+    MAX_BYTES,
+    Handover,
+    LatchFileError,
+    decode,
+    encode,
+    stopped,
+)
+from acsard.values import NS_PER_S, Event, Instant, Latch, Latches
 
 NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
 
@@ -122,3 +130,81 @@ def test_the_number_of_a_stop_by_the_daemon_is_the_wall_time_in_ms() -> None:
 
 def test_a_stop_that_is_latched_already_stays() -> None:
     assert stopped(ALL, "the file cannot be read", NOW) is ALL
+
+
+class Keeper:
+    """A keeper of latches that holds what it was given when it is told to."""
+
+    def __init__(self) -> None:
+        self.given: list[Latches] = []
+        self.waits: list[tuple[Latches, float]] = []
+        self.held: Latches | None = None
+        self.trouble = "the disk is full"
+
+    def keep(self, latches: Latches) -> None:
+        self.given.append(latches)
+
+    def holds(self, latches: Latches) -> bool:
+        return self.held is latches
+
+    def wait(self, latches: Latches, seconds: float) -> None:
+        self.waits.append((latches, seconds))
+
+    def news(self) -> list[Event]:
+        return [Event("latch_file", "the disk is full", "warning")]
+
+
+def test_only_latches_that_changed_are_handed_over() -> None:
+    keeper, first = Keeper(), Latches()
+    handover = Handover(first, keeper)
+    handover.take(first)
+    assert keeper.given == []
+    handover.take(ALL)
+    handover.take(ALL)
+    assert keeper.given == [ALL]
+    assert handover.latches is ALL
+
+
+def test_latches_are_held_once_the_keeper_holds_these() -> None:
+    keeper = Keeper()
+    handover = Handover(Latches(), keeper)
+    handover.take(ALL)
+    assert not handover.held
+    keeper.held = ALL
+    assert handover.held
+
+
+def test_a_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> None:
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(Latches(), ["joe", "page"], NOW)
+    (latches,) = keeper.given
+    assert latches.stop == Latch(NOW.wall_ns // 1_000_000, NOW.wall_ns, "joe", "stopped by joe")
+
+
+def test_a_stop_without_a_name_is_stopped_by_a_request() -> None:
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(Latches(), [""], NOW)
+    assert keeper.given[0].stop
+    assert keeper.given[0].stop.why == "stopped by request"
+
+
+def test_on_the_way_down_the_keeper_has_the_time_in_which_a_stop_is_answered() -> None:
+    keeper = Keeper()
+    handover = Handover(ALL, keeper)
+    handover.wait()
+    assert keeper.waits == [(ALL, ANSWER_NS / NS_PER_S)]
+
+
+def test_the_events_and_the_trouble_are_those_of_the_keeper() -> None:
+    handover = Handover(Latches(), keeper := Keeper())
+    assert handover.news() == keeper.news()
+    assert handover.trouble == keeper.trouble
+
+
+def test_without_a_keeper_nothing_waits_and_nothing_is_in_trouble() -> None:
+    handover = Handover(Latches(), None)
+    handover.take(ALL)
+    handover.wait()
+    assert handover.held
+    assert handover.news() == []
+    assert handover.trouble is None

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config
 from acsard.host.errors import InUseError
 from acsard.host.files import replace as replace_file
+from acsard.host.files import sync as sync_file
 from acsard.runtime import latch_file as module
 from acsard.runtime.kept_latches import MAX_BYTES, encode
 from acsard.runtime.latch_file import LatchFile, place
@@ -175,6 +176,14 @@ def test_a_user_without_a_home_is_told_so_and_the_robot_starts_stopped(
     file.close()
 
 
+def test_a_directory_of_an_unknown_user_is_told_and_the_robot_starts_stopped() -> None:
+    file = LatchFile(config(Path("~nobody-has-this-name/acsard")), {})
+    latches = asyncio.run(file.start(NOW))
+    file.close()
+    assert latches.stop
+    assert "control.state_directory: " in latches.stop.why
+
+
 def test_each_place_goes_before_the_next_one() -> None:
     service, user = {"STATE_DIRECTORY": "/var/lib/acsard:/var/lib/b"}, {"XDG_STATE_HOME": "/u"}
     assert place(config(Path("/mine")), service | user) == Path("/mine") / NAME
@@ -192,6 +201,27 @@ def test_two_robots_in_one_directory_keep_apart(tmp_path: Path, started: Started
     other = LatchFile(two, {})
     assert asyncio.run(other.start(NOW)) == Latches()
     end(other)
+
+
+def test_a_file_that_another_daemon_keeps_is_not_overwritten_after_a_slow_start(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _ = started(tmp_path)
+    first.keep(STOP)
+    until(lambda: first.holds(STOP))
+    goes, usual = threading.Event(), LatchFile._read
+
+    def late(self: LatchFile, now: Instant) -> Latches:
+        assert goes.wait(10.0)
+        return usual(self, now)
+
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(LatchFile, "_read", late)
+    second, latches = started(tmp_path)
+    assert latches.stop
+    goes.set()
+    until(lambda: "another daemon keeps the stop" in second.trouble)
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
 def test_a_second_daemon_of_the_same_robot_does_not_start(tmp_path: Path, started: Started) -> None:
@@ -297,6 +327,37 @@ def test_latches_are_held_from_the_rename_on(
     syncs.set()
 
 
+def test_to_wait_ends_once_the_latches_are_held(tmp_path: Path, started: Started) -> None:
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    file.wait(STOP, 10.0)
+    assert file.holds(STOP)
+
+
+def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(STOP)
+    began = time.monotonic()
+    file.wait(STOP, 0.05)
+    assert 0.05 <= time.monotonic() - began < 5.0
+    assert not file.holds(STOP)
+
+
+def test_to_wait_for_a_disk_that_fails_is_over_at_once(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", full)
+    file.keep(STOP)
+    until(lambda: file.trouble)
+    began = time.monotonic()
+    file.wait(STOP, 10.0)
+    assert time.monotonic() - began < 5.0
+
+
 def test_the_end_waits_for_a_stuck_disk_only_for_its_time(
     tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,6 +420,64 @@ def test_a_first_sync_that_hangs_is_reported_when_a_stop_waits_for_it(
     until(lambda: file.trouble == "")
 
 
+def fails_to_sync(path: Path) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def test_a_first_sync_that_fails_is_reported_and_tried_again(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "sync", fails_to_sync)
+    file, _ = started(tmp_path)
+    until(lambda: "Input/output error" in file.trouble)
+    monkeypatch.setattr(module, "sync", sync_file)
+    until(lambda: file.trouble == "")
+
+
+def test_a_first_sync_that_fails_does_not_undo_a_stop_that_came_meanwhile(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def fails_late(path: Path) -> None:
+        assert goes.wait(10.0)
+        fails_to_sync(path)
+
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "sync", fails_late)
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    goes.set()
+    until(lambda: "Input/output error" in file.trouble)
+    monkeypatch.setattr(module, "sync", sync_file)
+    until(lambda: file.trouble == "")
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = threading.Thread.start
+
+    def start(self: threading.Thread) -> None:
+        if self.name == "latches":
+            raise RuntimeError("can't start new thread")
+        usual(self)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    file, latches = started(tmp_path)
+    assert latches.stop
+    assert "no room for another thread" in latches.stop.why
+    assert "no room for another thread" in file.trouble
+
+
+def test_a_thread_that_has_ended_is_told(tmp_path: Path, started: Started) -> None:
+    file, _ = started(tmp_path)
+    file.close()
+    assert file.trouble.startswith("the thread that keeps a stop over a restart has ended")
+
+
 def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -381,9 +500,29 @@ def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
     file.keep(cleared := Latches(lowered={"limits.angular_speed": 1.0}))
     until(lambda: file.holds(cleared))
     end(file)
+    monkeypatch.undo()
     _, after = started(tmp_path)
     both = {"limits.linear_speed": 0.4, "limits.angular_speed": 1.0}
     assert after == replace(OFF, fault=FAULT.fault, lowered=both).after_restart()
+
+
+def test_a_first_look_that_begins_after_the_start_gave_up_changes_nothing(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", OFF))
+    works: list[Callable[[], object]] = []
+
+    async def never(work: Callable[[], object], seconds: float) -> None:
+        works.append(work)
+        raise TimeoutError
+
+    monkeypatch.setattr(module, "in_thread", never)
+    file, latches = started(tmp_path)
+    until(lambda: file.holds(latches))
+    written = (tmp_path / NAME).read_bytes()
+    works[0]()
+    assert file.holds(latches)
+    assert (tmp_path / NAME).read_bytes() == written
 
 
 @pytest.mark.parametrize("number", [errno.ESTALE, errno.EACCES])
@@ -423,6 +562,29 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     stuck.goes.set()
     until(lambda: file.trouble == "")
     assert file.news() == [Event("latch_file", f"a stop is kept again in {path}")]
+
+
+def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def fails_late(*words: object, **more: object) -> None:
+        assert goes.wait(10.0)
+        full()
+
+    file, first = started(tmp_path)
+    until(lambda: file.holds(first))
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "replace", fails_late)
+    file.keep(STOP)
+    until(lambda: file.trouble)
+    assert [event.level for event in file.news()] == ["warning"]
+    goes.set()
+    until(lambda: "No space left" in file.trouble)
+    (event,) = file.news()
+    assert event.level == "warning"
+    assert "No space left" in event.text
 
 
 def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
