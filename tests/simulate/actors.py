@@ -380,6 +380,7 @@ class Run:
         self._fed_ns, self._linked = true_ns, True
 
     def _disarmed(self, true_ns: int) -> None:
+        self.liveness.event()
         if self._linked:
             self.witness.arming(true_ns)
 
